@@ -14,10 +14,15 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.control.found import found
 from femsense.control.goal import Goal, Target, make_goal
-from femsense.control.limits import make_limits
+from femsense.control.limits import make_limits, true_input
 from femsense.control.motion import CONVERGING, REACHED, Motion
-from femsense.control.search import ReachOptions, Search
+from femsense.control.search import Pace, ReachOptions, Search
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.model.robot import Robot
+
+PACE = Pace(farthest=0.02, sure_gain=1e-3, faithful=0.5, tolerance=1e-4, least_m=1e-5)
+"""Of steps while a hand drags. Steps of 0.05 take twice the processor time on the four-leg robot, since they need stiffnesses
+of their own (24 and 47 ms). Without `least_m` the gripper pulls its other finger to the limit for micrometres."""
 
 
 class Follower:
@@ -47,9 +52,31 @@ class Follower:
         self.robot, self.control, self.calibration = robot, control, calibration
         self.options = options or ReachOptions()
         self._bounds = make_limits(robot, control, limits or {}, calibration)
+        self._start: Equilibrium | None = None
         self._search: Search | None = None
         self._other: Search | None = None
         self._compared = False  # with what a search from rest finds
+
+    def begin(self, inputs: Mapping[str, float]) -> None:
+        """Begin anew where inputs bring the robot: commands of all cables [N or m] and chambers [Pa].
+
+        Where they bring it nowhere, nothing changes.
+        """
+        body = self.robot.body
+        true = {
+            name: max(true_input(self.robot, self.control, i, inputs[name], self.calibration), 0.0)
+            for i, name in enumerate(body.cable_names)
+        }
+        zeros = {} if self.calibration is None else self.calibration.chamber_pressure_pa
+        state = solve_equilibrium(
+            body,
+            tension=true if self.control == "tension" else None,
+            shortening=true if self.control == "displacement" else None,
+            pressure={name: inputs[name] + zeros.get(name, 0.0) for name in body.chamber_names},
+            start=None if self._search is None else self._search.state,
+        )
+        if state.converged:
+            self._start, self._search = state, None
 
     @property
     def resting(self) -> bool:
@@ -87,8 +114,8 @@ class Follower:
                 last.aim(goal)
                 self._other, self._compared = None, False
             return last
-        start = last.state if last is not None and last.state.converged else None
-        self._search = Search(self.robot.body, goal, self._bounds, start, self.options)
+        start = last.state if last is not None and last.state.converged else self._start
+        self._search = Search(self.robot.body, goal, self._bounds, start, self.options, pace=PACE)
         self._other, self._compared = None, start is None
         return self._search
 
@@ -99,7 +126,7 @@ class Follower:
             return search
         if self.resting:
             return search
-        other = self._other = self._other or Search(self.robot.body, search.goal, self._bounds, None, self.options)
+        other = self._other = self._other or Search(self.robot.body, search.goal, self._bounds, None, self.options, pace=PACE)
         other.advance()
         self._compared = bool(other.status)
         nearer = search.goal.error(search.state.positions) - search.goal.error(other.state.positions)

@@ -51,11 +51,37 @@ class ReachOptions:
     """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
 
 
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How much a single step is worth."""
+
+    farthest: float = np.inf
+    """A step of one input moves no node farther than this share of the body's reach [1]."""
+    sure_gain: float = SURE_GAIN
+    """Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
+    faithful: float = np.inf
+    """Slopes serve for another step, too, where the last one took this share of what they had promised."""
+    tolerance: float = COARSE
+    """Relative tolerance of the equilibrium after a step that gains more than the tolerance of the search."""
+    least_m: float = 0.0
+    """The search ends where a step comes nearer by less than this [m]."""
+
+
 class Search:
     """Goes step by step to inputs: each step is taken if the error falls, else the trust region shrinks."""
 
-    def __init__(self, body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | None, options: ReachOptions) -> None:
+    def __init__(
+        self,
+        body: BodyModel,
+        goal: Goal,
+        bounds: Limits,
+        start: Equilibrium | None,
+        options: ReachOptions,
+        *,
+        pace: Pace | None = None,
+    ) -> None:
         """Begin at an equilibrium, within the limits of efforts; without one at rest."""
+        self.pace = pace or Pace()
         self.body, self.goal, self.bounds, self.options = body, goal, bounds, options
         self.state = _begin(body, goal, bounds, start)
         self.before = self.state.segment_tensions
@@ -64,7 +90,7 @@ class Search:
         self.status = "" if self.state.converged else STOPPED
         """How it ended; empty while it goes on."""
         self.last, self.beyond = Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
-        self._radius, self._settled = FIRST_RADIUS, False
+        self._radius, self._settled = min(FIRST_RADIUS, self.pace.farthest), False
         self._slopes = lent_slopes(body, goal, self.state) if self.state.converged else None
         self._curvature: FloatArray = np.zeros((len(bounds.low),) * 2)
         self._seen: tuple[Seen, FloatArray] | None = None  # and the positions there
@@ -78,7 +104,7 @@ class Search:
         moved = float(np.abs(goal.wanted - self.goal.wanted).max(initial=0.0))
         self.goal, self.count, self._settled = goal, 0, False
         self.before, self.status, self.beyond = self.state.segment_tensions, "" if self.state.converged else STOPPED, ""
-        self._radius = min(max(self._radius, 2.0 * moved / self.body.reach), FIRST_RADIUS)
+        self._radius = min(max(self._radius, 2.0 * moved / self.body.reach), FIRST_RADIUS, self.pace.farthest)
         if self._seen is not None:
             seen, positions = self._seen
             self._seen = replace(seen, miss=goal.miss(positions)), positions
@@ -98,31 +124,52 @@ class Search:
         fine = bool(end) or error < NEAR
         change = 0.0 if end else self.last.change
         effort = np.clip(efforts_of(self.state) + change, self.bounds.low, self.bounds.high)
-        tried = _solved(self.body, self.goal, effort, self.state, self.before, fine=fine, tried=True)
+        tried = _solved(self.body, self.goal, effort, self.state, self.before, self._fineness(fine), tried=True)
         self.count += 1
         if end:
             self.state, self._settled = tried if tried.converged else self.state, True
         elif tried.converged and _is_better(self.body, self.goal, self.bounds, tried, self.state):
-            serves = self.goal.error(tried.positions) <= KEPT * error
-            self._slopes = _learned(self.body, self.goal, slopes, self.state, tried) if serves else None
-            self.state, self._radius, self.beyond, self._settled = tried, 4.0 * self._radius, "", fine
+            learns = self._serve(tried)
+            self._slopes = _learned(self.body, self.goal, slopes, self.state, tried) if learns else None
+            self._radius = min(4.0 * self._radius, self.pace.farthest)
+            self.state, self.beyond, self._settled = tried, "", fine
         elif not slopes.exact:
             self._slopes = None
         else:
             self._fall_back(tried, within)
+
+    def _fineness(self, fine: bool) -> float:
+        """Return the relative tolerance of the next equilibrium."""
+        if fine:
+            return FINE
+        return self.pace.tolerance if self._gained() > self.options.tolerance_m else COARSE
+
+    def _gained(self) -> float:
+        """Return by how much the last step was to come nearer [m]."""
+        miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
+        return float(np.sqrt(miss2) - np.sqrt(max(miss2 - self.last.gain, 0.0)))
+
+    def _serve(self, tried: Equilibrium) -> bool:
+        """Return whether the slopes are good for another step after this one."""
+        before, after = (self.goal.miss(state.positions) for state in (self.state, tried))
+        took = float((before**2).sum() - (after**2).sum())
+        near = self.goal.error(tried.positions) <= KEPT * self.goal.error(self.state.positions)
+        return near or took >= self.pace.faithful * self.last.gain
 
     def _plan(self, end: str, within: bool) -> tuple[Slopes, str]:
         """Return the slopes that serve here, and how the search ends if it does; the step stands in `last`."""
         miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
         if self._slopes is not None and not end:
             self._step(self._slopes)
-            if not self._slopes.exact and (self.last.size < SMALLEST_STEP or self.last.gain <= SURE_GAIN * miss2):
+            doubtful = self.last.gain <= self.pace.sure_gain * miss2 or self._gained() <= self.pace.least_m
+            if not self._slopes.exact and (self.last.size < SMALLEST_STEP or doubtful):
                 self._slopes = None
         if self._slopes is None:
             self._slopes = self._exact()
             if not end:
                 self._step(self._slopes)
-        if not end and within and self.last.gain <= self.options.least_gain * miss2:
+        over = self.last.gain <= self.options.least_gain * miss2 or self._gained() <= self.pace.least_m
+        if not end and within and over:
             end = NEAREST
         return self._slopes, end
 
@@ -178,8 +225,7 @@ def _best_step(
     """Return the best step of the linearised problem, with what is known of its curvature, in a trust region."""
     u, miss = efforts_of(state), goal.miss(state.positions)
     J, W = slopes.points, slopes.wound
-    moved = np.linalg.norm(J, axis=0)
-    unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
+    unit = body.reach / np.maximum(slopes.body, WEAKEST * max(float(slopes.body.max(initial=0.0)), 1e-300))
     scaled = J * unit
     top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
     low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)
@@ -230,13 +276,13 @@ def _solved(
     effort: FloatArray,
     start: Equilibrium | None,
     before: tuple[FloatArray, ...] | None,
+    tolerance: float = COARSE,
     *,
-    fine: bool = False,
     tried: bool = False,
 ) -> Equilibrium:
     """Return the equilibrium under efforts (a + c,);
     `before` are the tensions along the cables before the robot began to move."""
-    a, lent = len(body.cables), start is not None and may_be_lent(body, start)
+    a, fine, lent = len(body.cables), tolerance <= FINE, start is not None and may_be_lent(body, start)
     return solve_equilibrium(
         body,
         tension=dict(zip(body.cable_names, effort[:a].tolist())),
@@ -246,7 +292,7 @@ def _solved(
         bilateral=True,
         options=SolveOptions(
             before=before,
-            relative_tolerance=FINE if fine else COARSE,
+            relative_tolerance=tolerance,
             rough=tried and not fine,
             single=fine,
             reuse_factor=lent,

@@ -23,6 +23,8 @@ class Slopes:
     """W_pa, the rows' change by unit efforts [m/N, m/Pa], shape (r, a + c)."""
     wound: FloatArray
     """W_aa, that of what the cables wind up, shape (a, a + c)."""
+    body: FloatArray
+    """How far the farthest node moves by unit efforts [m/N, m/Pa], shape (a + c,)."""
     exact: bool
     """Whether they are of the exact tangent at this state."""
 
@@ -40,7 +42,8 @@ class Slopes:
             return replace(self, exact=False)
         share = share / work
         points = self.points + np.outer(moved - self.points @ change, share)
-        return Slopes(points, self.wound + np.outer(wound - self.wound @ change, share), exact=False)
+        wound_up = self.wound + np.outer(wound - self.wound @ change, share)
+        return replace(self, points=points, wound=wound_up, exact=False)
 
 
 def exact_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[Slopes, Equilibrium]:
@@ -71,4 +74,5 @@ def _slopes(body: BodyModel, goal: Goal, state: Equilibrium, factor: Factorizati
     wound = pull_rows(body, state.positions) @ moves.T
     stretch = np.array([1.0 / cable.stretch_stiffness for cable in body.cables])
     wound[:, : len(stretch)] += np.diag(stretch)
-    return Slopes(goal.rows(moves.reshape(len(moves), -1, 3)), wound, exact)
+    shapes = moves.reshape(len(moves), -1, 3)
+    return Slopes(goal.rows(shapes), wound, np.linalg.norm(shapes, axis=2).max(axis=1, initial=0.0), exact)

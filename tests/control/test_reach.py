@@ -91,7 +91,7 @@ def test_slopes_are_those_of_the_states_near_by() -> None:
 
 def test_slopes_that_a_step_has_shown_give_that_step_and_leave_others() -> None:
     rng = np.random.default_rng(3)
-    before = Slopes(rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), exact=True)
+    before = Slopes(rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), np.ones(3), exact=True)
     change, moved, wound = rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
     after = before.learned(change, moved, wound)
     np.testing.assert_allclose(after.points @ change, moved, atol=1e-12)

@@ -1,4 +1,7 @@
-"""Answers a dragged point: inputs by `fs.reach`, the shape that the robot can take, and commands while armed and held."""
+"""Answers a dragged point: inputs by a `Follower`, the shape that the robot can take, and commands while armed and held.
+
+Each wish is answered with where the way to it stands; while a wish stays, answers go on until nothing comes nearer.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.control.motion import REACHED, STOPPED, Motion
-from femsense.control.reach import ReachOptions, reach
+from femsense.control.follow import Follower
+from femsense.control.motion import CONVERGING, REACHED, STOPPED, Motion
+from femsense.control.search import ReachOptions
 from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import embed_points
 from femsense.model.robot import Robot
@@ -51,8 +55,8 @@ class DragOptions:
     gate: GateOptions = field(default_factory=GateOptions)
     tolerance_m: float = 1e-4
     """A target is reached that is missed by less [m]: finer than a hand drags."""
-    equilibria: int = 8
-    """At most so many for one answer; the next wish goes on from there."""
+    answer_s: float = 0.02
+    """No further equilibrium is begun for an answer after so long [s]; the next answer goes on from there."""
     command_hz: float = 50.0
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
     """How what is measured corrects the inputs."""
@@ -105,13 +109,20 @@ class DragServer:
             options: of answers and commands.
         """
         self.hub, self.robot, self.options = hub, robot, options or DragOptions()
-        self.name, self.calibration = name or robot.name, calibration
+        self.name = name or robot.name
         self.gate = CommandGate(drive_inputs(robot), self.options.gate)
+        self._follower = Follower(
+            robot,
+            limits={one.name: (one.low, one.high) for one in self.gate.inputs},
+            calibration=calibration,
+            options=ReachOptions(tolerance_m=self.options.tolerance_m),
+        )
         self._skin, self._fit = embed_points(robot.body.mesh, skin.rest), prepare_poses(skin)
         self._size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None
+        self._grabbed = False  # a point, since the last answer
         self._driver, self._driver_at = "", float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
@@ -161,6 +172,7 @@ class DragServer:
             self.gate.hold(now, armed=wish.armed and wish.held)
             if not wish.held or wish.handle != self._handle:
                 self.feedback.forget()
+                self._grabbed = wish.held
             self._handle = wish.handle if wish.held else ""
             self._wish = wish if wish.held else None
         self._fresh.set()
@@ -186,33 +198,29 @@ class DragServer:
 
     def _answer_all(self) -> None:
         while not self._stop.is_set():
-            self._fresh.wait()
+            if self._wish is None or self._follower.resting:
+                self._fresh.wait()
             self._fresh.clear()
             with self._lock:
-                wish, self._wish = self._wish, None
-            if wish is not None and wish.target_m is not None:
+                wish = self._wish
+            if wish is not None and wish.target_m is not None and not self._stop.is_set():
                 self.answer(wish.handle, wish.target_m)
 
     def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
-        """Find inputs for one wish, publish what was found, and set it as what the gate moves to.
+        """Come nearer to one wish, publish what was found, and set it as what the gate moves to.
 
         What is measured of the point while the robot stands still moves the model's target (see `tip_feedback`).
         """
         begun = time.perf_counter()
         with self._lock:
+            grabbed, self._grabbed, current = self._grabbed, False, self._current()
             last = self._motion
             reached = None if last is None or last.status == REACHED else last.reached_m.get(handle)
             since = self._settled()
             wanted = self.feedback.target(time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached)
-        own = ReachOptions(tolerance_m=self.options.tolerance_m, max_iterations=self.options.equilibria)
-        motion = reach(
-            self.robot,
-            {handle: wanted},
-            limits={one.name: (one.low, one.high) for one in self.gate.inputs},
-            start=self._motion,
-            calibration=self.calibration,
-            options=own,
-        )
+        if grabbed and len(current) == len(self.gate.inputs):
+            self._follower.begin(current)
+        motion = self._follower.step({handle: wanted}, seconds=self.options.answer_s)
         if motion.equilibrium.converged:
             self._motion = motion
             with self._lock:
@@ -226,7 +234,7 @@ class DragServer:
 
     def _settled(self) -> float | None:
         """Return since when the commanded inputs are those of the newest answer, or None."""
-        if self._motion is None or self._motion.status == STOPPED or not self.gate.arrived:
+        if self._motion is None or self._motion.status in (STOPPED, CONVERGING) or not self.gate.arrived:
             self._settled_since = None
         elif self._settled_since is None:
             self._settled_since = time.monotonic()
@@ -279,11 +287,12 @@ class DragServer:
         self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
 
     def _current(self) -> dict[str, float]:
-        """Return the inputs that the robot has now, as far as it says so."""
+        """Return the inputs that the robot has now, as far as it says so in the units of commands."""
         message = self.hub.newest().get(topic(self.name, INPUTS))
         told = None if message is None else read_document(message.payload)
         rows: list[dict[str, Any]] = [] if told is None else told.get("inputs", [])
-        return {row["name"]: float(row["value"]) for row in rows if "value" in row}
+        units = {one.name: one.unit for one in self.gate.inputs}
+        return {row["name"]: float(row["value"]) for row in rows if "value" in row and row.get("unit") == units.get(row["name"])}
 
 
 def _place(told: object) -> tuple[float, float, float] | None:
