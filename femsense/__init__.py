@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from femsense.calib.calibration import Calibration
     from femsense.calib.files import read_calibration, write_calibration
     from femsense.control.motion import Motion, WallContact
+    from femsense.control.follow import Follower
     from femsense.control.reach import reach
     from femsense.control.search import ReachOptions
     from femsense.core.errors import DataError, FemsenseError, InputError, MissingDependency
@@ -83,6 +84,7 @@ __all__ = [
     "Effect",
     "Equilibrium",
     "FemsenseError",
+    "Follower",
     "ImproveOptions",
     "InputError",
     "LearnOptions",
@@ -162,6 +164,7 @@ _HOMES = {
         "Motion",
         "WallContact",
     ),
+    "control.follow": ("Follower",),
     "control.reach": ("reach",),
     "control.search": ("ReachOptions",),
     "core.errors": (

@@ -12,7 +12,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from femsense.core.errors import InputError
-from femsense.xr.stream.access import Access, read_password
+from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
@@ -62,6 +62,8 @@ class LiveStream:
     closers: list[Callable[[], None]] = field(default_factory=list)
     links: dict[str, Callable[[], str]] = field(default_factory=dict)
     """Connections to elsewhere: what says why there is none."""
+    sources: dict[str, Callable[[], str]] = field(default_factory=dict)
+    """Where readings come from: what says why there are none."""
 
     @property
     def url(self) -> str:
@@ -70,9 +72,9 @@ class LiveStream:
 
     @property
     def trouble(self) -> str:
-        """Which connections there are none of, and why; empty where all is well."""
-        told = {where: why() for where, why in self.links.items()}
-        return "; ".join(f"no connection to {where} ({why}), trying again" for where, why in told.items() if why)
+        """Which connections and readings there are none of, and why; empty where all is well."""
+        links = [f"no connection to {where} ({why()}), trying again" for where, why in self.links.items() if why()]
+        return "; ".join(links + [f"no readings of {where} ({why()}), waiting" for where, why in self.sources.items() if why()])
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
@@ -82,7 +84,7 @@ class LiveStream:
             living[0].join(0.5) if living else self.stop.wait(0.5)
             trouble = self.trouble
             if say is not None and trouble != known and time.monotonic() > patient:
-                say(trouble or "connected again")
+                say(trouble or ("readings come" if "no readings" in known else "connected again"))
                 known = trouble
 
     def close(self) -> None:
@@ -136,6 +138,7 @@ def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, nam
     stop = Event()
     readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
     live = _serve(options, twin.name, stop)
+    live.sources[without_password(source)] = lambda: readings.trouble
     _play(live, twin, frames_of_sensors(readings, model), options, at_once=True)
     return live
 
@@ -178,6 +181,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
             hint="learn from columns that are named as the markers in robot.toml",
         )
     readings = readings_of(source, model.channels, live.stop)
+    live.sources[without_password(source)] = lambda: readings.trouble
 
     def run() -> None:
         for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
@@ -202,7 +206,7 @@ def show_stream(
     except BaseException:
         bridge.close()
         raise
-    return LiveStream(hub, server, closers=[bridge.close], links={url: lambda: bridge.trouble})
+    return LiveStream(hub, server, closers=[bridge.close], links={without_password(url): lambda: bridge.trouble})
 
 
 def stream_document(live: LiveStream) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -28,12 +29,14 @@ from femsense.app.stream_command import (
     show_stream,
     stream_document,
     stream_runs,
+    stream_sensors,
     stream_text,
 )
 from femsense.core.errors import InputError
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.sensing.run_files import run_inputs, write_run
+from femsense.xr.armature import make_armature
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.model_file import save_model
@@ -92,6 +95,32 @@ def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, 
         assert within(5.0, lambda: shown.trouble == "")
 
 
+def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, page: Path) -> None:
+    rest, said = np.outer(np.arange(5.0), [0.0, 0.0, 0.02]), []
+    network = linear_network(np.zeros(1), np.ones(1), np.ones((15, 1)), rest.ravel())
+    domain = learn_domain(np.random.default_rng(0).uniform(-2.0, 2.0, (300, 1)))
+    chain = ProprioceptiveModel(("bend",), tuple("abcde"), network, (), domain, make_armature(rest))
+    model = save_model(chain, tmp_path / "m.onnx")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with stream_sensors("mqtt://me:secret@127.0.0.1:1/arm", model, StreamOptions(page=page)) as live:
+        assert within(3.0, lambda: "no connection" in live.trouble)
+        assert live.trouble == "no readings of mqtt://127.0.0.1:1/arm (no connection, no answer), waiting"
+    with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=page)) as live:
+        assert live.trouble == f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting"
+
+        def send() -> None:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.sendto(b"0.5", ("127.0.0.1", port))
+            within(3.0, lambda: len(said) == 2)
+            live.stop.set()
+
+        Timer(3.7, send).start()
+        live.wait(said.append)
+    assert said == [f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting", "readings come"]
+
+
 def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FEMSENSE_PASSWORD", "secret")
     with stream_runs([write_run_with_mesh(tmp_path / "bar")], StreamOptions(page=page)) as live:
@@ -110,7 +139,10 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
     marker = made.robot.glued_names[0]
     place = dict(zip("xyz", map(float, made.robot.marker_points[0] + [0.0, 0.0, 0.002])))
     with stream_runs([run], StreamOptions()) as live:  # kernels that are compiled here are there for the command too
-        answered = let_drag(live, run, DragOptions()).answer(marker, (place["x"], place["y"], place["z"]))
+        server = let_drag(live, run, DragOptions())
+        answered = server.answer(marker, (place["x"], place["y"], place["z"]))
+        while answered.status == "converging":
+            answered = server.answer(marker, (place["x"], place["y"], place["z"]))
     assert answered.status in ("reached", "nearest")
     wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": True}).encode()
     for commands in ((), ("--commands",)):
@@ -121,8 +153,8 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
             heard: dict[str, dict[str, object]] = {}
             with connect(f"{again.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
                 end = time.monotonic() + 30.0
-                while time.monotonic() < end and not ("reach" in heard and heard.get("command", {}).get("armed")):
-                    if "reach" in heard and not commands:
+                while time.monotonic() < end and not (is_found(heard) and heard.get("command", {}).get("armed")):
+                    if is_found(heard) and not commands:
                         end = min(end, time.monotonic() + 0.5)
                     viewer.send(pack([Message(f"femsense/{made.robot.name}/drag", wish)]))
                     for message in unpack(viewer.recv(5)):
@@ -130,9 +162,14 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
                             heard[message.topic.rpartition("/")[2]] = json.loads(message.payload)
             assert heard["model"]["commands"] is bool(commands)
             assert [handle["name"] for handle in heard["model"]["handles"]] == list(made.robot.glued_names)
-            assert heard["reach"]["status"] in ("reached", "nearest") and ("command" in heard) == bool(commands)
+            assert is_found(heard) and ("command" in heard) == bool(commands)
             if commands:
                 assert {row["name"] for row in heard["command"]["inputs"]} == set(made.robot.body.cable_names)
+
+
+def is_found(heard: dict[str, dict[str, object]]) -> bool:
+    """Whether inputs for the wish are found: answers before that say that they converge."""
+    return heard.get("reach", {}).get("status") in ("reached", "nearest")
 
 
 def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> None:

@@ -52,6 +52,16 @@ say(await page.evaluate(() => {
     field: Array.from(skin.geometry.getAttribute('paintField').array), mode: body.painter.mode.value, scale: document.querySelector('#scale-top').textContent };
 }));
 await told();
+await page.waitForFunction(() => femsense.shown.robots.get('bar').shown?.frame === 1000, null, { timeout: 60000 });
+await page.waitForTimeout(1000);
+await page.screenshot({ path: shot.replace('stale', 'far') });
+say(await page.evaluate(() => [...femsense.shown.robots.values()].flatMap(({ body, shown }) => {
+  const box = body.extent(shown.contacts).translate(body.group.position), corner = box.min.clone();
+  return [0, 1, 2, 3, 4, 5, 6, 7].map((i) => corner
+    .set(box[i & 1 ? 'max' : 'min'].x, box[i & 2 ? 'max' : 'min'].y, box[i & 4 ? 'max' : 'min'].z)
+    .project(femsense.shown.stage.camera).toArray());
+})));
+await told();
 await page.waitForFunction(() => femsense.shown.robots.get('bar').body.isDoubtful, null, { timeout: 60000 });
 await page.waitForTimeout(300);
 say(await page.evaluate(() => ({
@@ -116,11 +126,10 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
     browser = start_browser(request.config, WATCH, source.server.url, str(tmp_path / "stale.png"))
     assert browser.stdin is not None and browser.stdout is not None
 
-    def said() -> dict[str, Any]:
+    def said() -> Any:
         line = browser.stdout.readline()
         assert line, browser.stderr.read() if browser.stderr else ""
-        found: dict[str, Any] = json.loads(line)
-        return found
+        return json.loads(line)
 
     try:
         seen = said()
@@ -135,6 +144,13 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
         scene = said()
         check_scene(scene, run, source.last)
         assert scene["field"] == run.field[11].tolist() and scene["mode"] == 2 and scene["scale"].endswith("% strain")
+        away = frame.bones + np.array([0.0, 0.15, 0.25, 0, 0, 0, 0])
+        source.last = replace(source.last, frame=1000, bones=away)
+        browser.stdin.write("go\n")
+        browser.stdin.flush()
+        corners = np.array(said())
+        assert np.abs(corners[:, :2]).max() < 1.0  # all of it is still in the picture
+        assert np.abs(corners[:, 1]).max() > 0.1
         source.last = replace(source.last, contacts=None, status="light = 9 is outside 0 … 1")
         browser.stdin.write("go\n")
         browser.stdin.flush()

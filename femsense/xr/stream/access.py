@@ -9,6 +9,7 @@ import secrets
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from femsense.core.errors import InputError
 
@@ -118,3 +119,9 @@ def _same(given: str, wanted: str) -> bool:
 def _name_of(host: str) -> str:
     """Return the name in a Host header without its port."""
     return host.partition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]
+
+
+def without_password(address: str) -> str:
+    """Return an address as it may be shown: without the name and password before its host."""
+    parts = urlsplit(address)
+    return address.replace(parts.netloc, parts.netloc.rpartition("@")[2], 1) if "@" in parts.netloc else address

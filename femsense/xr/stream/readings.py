@@ -9,8 +9,9 @@ import os
 import queue
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, TextIO
@@ -34,7 +35,40 @@ Reading = tuple[float, FloatArray]
 """Time [s], and one value for each channel, nan where there is none."""
 
 
-def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+class Readings(Iterator[Reading]):
+    """Readings as they come, and what is the matter where none do."""
+
+    def __init__(
+        self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: ""
+    ) -> None:
+        """Read items; `away` says why the source is not there, or nothing."""
+        self._items, self._read, self._away = items, read, away
+        self._came = False
+        self._passed = 0
+
+    def __next__(self) -> Reading:
+        for item in self._items:
+            found = self._read(item)
+            if found is not None:
+                self._came = True
+                return found
+            self._passed += 1
+        raise StopIteration
+
+    @property
+    def trouble(self) -> str:
+        """Why no readings come; empty once they do and the source is there."""
+        if self._away() or self._came:
+            return self._away()
+        return f"lines that came: {self._passed}, none a reading of its channels" if self._passed else "nothing has come yet"
+
+    def close(self) -> None:
+        """Let go of the source."""
+        if isinstance(self._items, Generator):
+            self._items.close()
+
+
+def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
     """Open a source and return what yields its readings until `stop` is set; lines that are none are passed over.
 
     Arguments:
@@ -49,12 +83,16 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[R
         MissingDependency: the package for it is not installed.
     """
     parts = urlsplit(source)
+    read = partial(read_line, channels=channels)
     if parts.scheme == "udp":
-        return _parsed(_datagrams(source, stop), channels)
+        return Readings(_datagrams(source, stop), read)
     if parts.scheme in ("mqtt", "mqtts"):
-        return _parsed(_topic(source, stop), channels)
+        waiting: queue.Queue[bytes] = queue.Queue(1)
+        broker = _topic(source, waiting)
+        return Readings(_newest(broker, waiting, stop), read, lambda: broker.trouble and f"no connection, {broker.trouble}")
     if parts.scheme == "serial":
-        return _parsed(_serial(source, stop), channels)
+        line = _serial(source)
+        return Readings(_lines(line, stop), read, lambda: "" if line.is_open else "unplugged")
     if not Path(source).is_file():
         raise InputError(
             "no such source",
@@ -62,14 +100,7 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[R
             found=source,
             expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC or serial:PORT?baud=115200",
         )
-    return _grown(Path(source), channels, stop)
-
-
-def _parsed(lines: Iterator[bytes], channels: Sequence[str]) -> Iterator[Reading]:
-    for line in lines:
-        found = read_line(line, channels)
-        if found is not None:
-            yield found
+    return Readings(_grown(Path(source), channels, stop), lambda row: _of_object(row, channels))
 
 
 def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
@@ -106,7 +137,7 @@ def _number(value: Any) -> float:
 # Sources
 
 
-def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[dict[str, str]]:
     """Open a CSV file; yield its last row, then those that are written to it.
 
     A file that starts anew, or is replaced, is read anew.
@@ -117,10 +148,10 @@ def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[Reading
     if missing:
         stream.close()
         raise InputError("channels are missing", where=file, found=", ".join(columns), expected=", ".join(missing))
-    return _rows(file, stream, columns, channels, stop)
+    return _rows(file, stream, columns, stop)
 
 
-def _rows(file: Path, stream: TextIO, columns: list[str], channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+def _rows(file: Path, stream: TextIO, columns: list[str], stop: Event) -> Iterator[dict[str, str]]:
     newest, rest = "", ""
     while not stop.is_set():
         text = rest + stream.read(1 << 20)
@@ -129,10 +160,7 @@ def _rows(file: Path, stream: TextIO, columns: list[str], channels: Sequence[str
             lines = lines[-1:]  # what is old is not shown
         for line in lines:
             newest = line
-            row = dict(zip(columns, next(csv.reader([line]), [])))
-            found = _of_object(row, channels)
-            if found is not None:
-                yield found
+            yield dict(zip(columns, next(csv.reader([line]), [])))
         if not lines:
             stop.wait(POLL_S)
             if _began_anew(file, stream):
@@ -172,13 +200,12 @@ def _received(endpoint: socket.socket, stop: Event) -> Iterator[bytes]:
                 yield endpoint.recv(LONGEST_LINE)
 
 
-def _topic(source: str, stop: Event) -> Iterator[bytes]:
-    """Yield messages of a topic; while one is being worked on only the newest waits."""
+def _topic(source: str, waiting: queue.Queue[bytes]) -> MqttSource:
+    """Put messages of a topic into a queue of one place: only the newest waits."""
     parts = urlsplit(source)
     name = parts.path.lstrip("/")
     if not name:
         raise InputError("a topic is missing", where=source, expected="mqtt://HOST/TOPIC")
-    waiting: queue.Queue[bytes] = queue.Queue(1)
 
     def take(payload: bytes) -> None:
         with suppress(queue.Empty):
@@ -187,7 +214,7 @@ def _topic(source: str, stop: Event) -> Iterator[bytes]:
             waiting.put_nowait(payload)
 
     address = broker_address(f"{parts.scheme}://{parts.netloc}")
-    return _newest(MqttSource(address, lambda message: take(message.payload), topics=(name,)), waiting, stop)
+    return MqttSource(address, lambda message: take(message.payload), topics=(name,))
 
 
 def _newest(source: MqttSource, waiting: queue.Queue[bytes], stop: Event) -> Iterator[bytes]:
@@ -197,7 +224,7 @@ def _newest(source: MqttSource, waiting: queue.Queue[bytes], stop: Event) -> Ite
                 yield waiting.get(timeout=WAIT_S)
 
 
-def _serial(source: str, stop: Event) -> Iterator[bytes]:
+def _serial(source: str) -> Serial:
     try:
         import serial
     except ImportError:
@@ -205,12 +232,12 @@ def _serial(source: str, stop: Event) -> Iterator[bytes]:
     port, _, more = source.removeprefix("serial:").partition("?")
     baud = parse_qs(more).get("baud", ["115200"])[0]
     try:
-        line = serial.serial_for_url(port, baudrate=int(baud), timeout=WAIT_S)
+        line: Serial = serial.serial_for_url(port, baudrate=int(baud), timeout=WAIT_S)
     except (OSError, ValueError) as error:
         raise InputError(
             "the serial line cannot be opened", where=source, found=error, expected="serial:PORT?baud=115200"
         ) from None
-    return _lines(line, stop)
+    return line
 
 
 def _lines(line: Serial, stop: Event) -> Iterator[bytes]:

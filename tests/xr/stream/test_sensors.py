@@ -13,6 +13,7 @@ from threading import Event, Thread
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from streams import within
 
 from femsense.core.errors import InputError
 from femsense.xr.armature import ArmatureOptions, make_armature
@@ -231,3 +232,25 @@ def test_triangles_of_the_tube_look_outward(model: ProprioceptiveModel) -> None:
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
     n = 20
     assert volume == pytest.approx(0.5 * n * np.sin(2 * np.pi / n) * np.linalg.norm(skin.rest[0, :2]) ** 2 * 0.1, rel=1e-6)
+
+
+def test_a_source_without_readings_says_why() -> None:
+    stop = Event()
+    nowhere = readings_of("mqtt://me:secret@127.0.0.1:1/arm", CHANNELS, stop)
+    assert within(3.0, lambda: "no connection" in nowhere.trouble) and "secret" not in nowhere.trouble
+    stop.set()
+    assert list(nowhere) == []
+
+
+def test_lines_that_are_no_readings_are_counted_until_one_is() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    readings, found = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, Event()), []
+    assert readings.trouble == "nothing has come yet"
+    Thread(target=lambda: found.append(next(readings)), daemon=True).start()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for line, said in ((b"1,2,3,4,5,6,7,8,9", "lines that came: 1, none a reading of its channels"), (b"1,2", "")):
+            sender.sendto(line, ("127.0.0.1", port))
+            assert within(3.0, lambda said=said: readings.trouble == said)
+    assert within(3.0, lambda: bool(found)) and found[0][1].tolist() == [1.0, 2.0]

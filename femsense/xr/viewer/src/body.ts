@@ -21,6 +21,7 @@ import { ForceArrows } from "./arrows";
 import type { Contact } from "./data";
 import { Painter, type Paint } from "./paint";
 
+const SAMPLED = 600; // vertices that tell about where a body is
 const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
 
 export async function loadMesh(url: string): Promise<GLTF> {
@@ -76,6 +77,19 @@ export class Body {
     for (const skin of this.skins) {
       skin.computeBoundingBox();
       if (skin.boundingBox) box.union(skin.boundingBox);
+    }
+    return box;
+  }
+
+  /** Returns about what body and arrows take now, in glTF's frame; quick enough to be asked again and again. */
+  extent(contacts: Contact[]): Box3 {
+    const box = new Box3().setFromPoints(this.arrows.group.visible ? this.arrows.ends(contacts) : []);
+    this.gltf.scene.updateMatrixWorld(true);
+    const place = new Vector3();
+    for (const skin of this.skins) {
+      const count = skin.geometry.getAttribute("position")?.count ?? 0;
+      const every = Math.max(1, Math.ceil(count / SAMPLED));
+      for (let i = 0; i < count; i += every) box.expandByPoint(skin.getVertexPosition(i, place));
     }
     return box;
   }

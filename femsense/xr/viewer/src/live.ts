@@ -17,6 +17,7 @@ import { landmarksOf } from "./ties";
 const STALE_S = 0.4; // what is older is greyed out: within half a second, the picture included
 const KEPT_S = 60;
 const PLOTTED_S = 30;
+const FRAMED_MS = 300; // how often it is asked whether all is in the picture
 const RATE_MS = 2000; // over which the rate is counted
 
 interface Moment extends Frame {
@@ -39,6 +40,7 @@ class Streams {
   private paused = false;
   private at = 0; // time that is shown while paused [s]
   private drawn = 0;
+  private framed = 0;
 
   constructor(private readonly stage: Stage) {
     this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
@@ -136,6 +138,15 @@ class Streams {
     if (now - this.drawn < 100) return;
     this.drawn = now;
     this.read(now);
+    if (now - this.framed > FRAMED_MS) this.frame(now);
+  }
+
+  /** Keeps all robots and their arrows in the picture. */
+  private frame(now: number): void {
+    this.framed = now;
+    for (const { body, shown } of this.robots.values()) {
+      if (body) this.stage.include(body.extent(shown?.contacts ?? []).translate(body.group.position));
+    }
   }
 
   /** Brings the panel, the badge and the time line up to date. */

@@ -24,6 +24,7 @@ import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
 import { Headset } from "./headset";
 
 const FIELD_OF_VIEW = 38; // on a screen [deg]
+const WIDEST = 10; // times as wide as what was in view: what is still farther away is no robot
 const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stands at first
 
 /** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
@@ -96,6 +97,14 @@ export class Stage {
     this.controls.maxDistance = 8 * size;
     this.scene.fog = this.headset.presenting ? null : new Fog(0x111823, 3.5 * size, 9 * size);
     this.lookFromStart();
+  }
+
+  /** Steps back where something stands outside of what was fitted, unless the person who looks has chosen the view. */
+  include(box: Box3): void {
+    if (this.moved || this.headset.presenting || box.isEmpty() || this.box.containsBox(box)) return;
+    const wider = this.box.clone().union(box);
+    const size = wider.getSize(new Vector3()).length();
+    if (size < WIDEST * this.box.getSize(new Vector3()).length()) this.fit(wider.expandByScalar(0.03 * size)); // not soon too small again
   }
 
   lookFromStart(): void {
