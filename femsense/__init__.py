@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from femsense.calib.calibrate import calibrate
     from femsense.calib.calibration import Calibration
     from femsense.calib.files import read_calibration, write_calibration
-    from femsense.control.motion import Motion, WallContact
     from femsense.control.follow import Follower
+    from femsense.control.motion import Motion, WallContact
     from femsense.control.reach import reach
     from femsense.control.search import ReachOptions
     from femsense.core.errors import DataError, FemsenseError, InputError, MissingDependency

@@ -79,20 +79,24 @@ class Follower:
             self._start, self._search = state, None
 
     @property
+    def ended(self) -> bool:
+        """Whether the way has ended: further steps change nothing, unless the target stays and is sought from rest."""
+        return self._search is not None and bool(self._search.status)
+
+    @property
     def resting(self) -> bool:
-        """Whether further steps towards the same target change nothing."""
+        """Whether further steps towards the same target change nothing at all."""
         search = self._search
         return search is not None and bool(search.status) and (search.status == REACHED or self._compared)
 
-    def step(self, target: Target, *, seconds: float = 0.0) -> Motion:
+    def step(self, target: Target, *, seconds: float = 0.0, stays: bool = False) -> Motion:
         """Go on towards a target, and return where that has led so far.
-
-        Where the way has ended elsewhere than at the target, and the target stays, further steps seek it from rest too;
-        what they find is taken where it is nearer.
 
         Arguments:
             target: as `reach` takes it.
             seconds: no further equilibrium is begun after so long [s]; one is solved in any case.
+            stays: the target is not about to move. Where the way has ended elsewhere, further steps seek it from rest too;
+                what they find is taken where it is nearer.
 
         Returns:
             the motion; "converging" where more steps come nearer.
@@ -101,9 +105,9 @@ class Follower:
             InputError: an unknown marker, or a target that is no place.
         """
         end = time.perf_counter() + seconds
-        search = self._advanced(self._aimed(make_goal(self.robot, target, (), ())))
-        while not self.resting and time.perf_counter() < end:
-            search = self._advanced(search)
+        search = self._advanced(self._aimed(make_goal(self.robot, target, (), ())), stays)
+        while not (self.resting if stays else self.ended) and time.perf_counter() < end:
+            search = self._advanced(search, stays)
         return found(self.robot, self.control, search, search.status or CONVERGING, self.calibration)
 
     def _aimed(self, goal: Goal) -> Search:
@@ -119,12 +123,12 @@ class Follower:
         self._other, self._compared = None, start is None
         return self._search
 
-    def _advanced(self, search: Search) -> Search:
-        """Solve one equilibrium further on, from rest where the search itself is over."""
+    def _advanced(self, search: Search, stays: bool) -> Search:
+        """Solve one equilibrium further on, for a target that stays from rest where the search itself is over."""
         if not search.status:
             search.advance()
             return search
-        if self.resting:
+        if self.resting or not stays:
             return search
         other = self._other = self._other or Search(self.robot.body, search.goal, self._bounds, None, self.options, pace=PACE)
         other.advance()

@@ -38,7 +38,7 @@ def path(robot: Robot, steps: int) -> list[np.ndarray]:
 def rested(follower: Follower, target: dict[str, np.ndarray], most: int = 100) -> fs.Motion:
     """The answer after which nothing changes."""
     for _ in range(most):
-        motion = follower.step(target)
+        motion = follower.step(target, stays=True)
         if follower.resting:
             return motion
     raise AssertionError("never rests")
@@ -84,7 +84,7 @@ def test_with_time_an_answer_takes_more_equilibria() -> None:
     robot = bar()
     target = {"tip": path(robot, 1)[0]}
     follower = Follower(robot, options=HAND)
-    assert follower.step(target, seconds=60.0).status == "reached" and follower.resting
+    assert follower.step(target, seconds=60.0).status == "reached" and follower.ended and follower.resting
 
 
 def test_it_begins_where_inputs_have_brought_the_robot() -> None:
@@ -101,6 +101,8 @@ def test_from_a_place_that_leads_nowhere_the_end_from_rest_is_taken() -> None:
     target, follower = {"tip": TIP[0] + [0.0, 0.0, 0.01]}, Follower(robot, options=HAND)
     bent = fs.reach(robot, {"tip": path(robot, 1)[0] + [-0.04, 0.0, 0.03]})
     follower.begin(bent.inputs)
+    here = follower.step(target, seconds=60.0)
+    assert follower.ended and not follower.resting and here.error_m > 1e-3
     assert rested(follower, target, 300).error_m <= fs.reach(robot, target).error_m + 2e-4
 
 

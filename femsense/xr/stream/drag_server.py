@@ -57,6 +57,8 @@ class DragOptions:
     """A target is reached that is missed by less [m]: finer than a hand drags."""
     answer_s: float = 0.02
     """No further equilibrium is begun for an answer after so long [s]; the next answer goes on from there."""
+    rest_s: float = 0.3
+    """A hand that has not moved for so long rests: its target is sought from rest too where it is not reached [s]."""
     command_hz: float = 50.0
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
     """How what is measured corrects the inputs."""
@@ -123,6 +125,8 @@ class DragServer:
         self._motion: Motion | None = None
         self._wish: Wish | None = None
         self._grabbed = False  # a point, since the last answer
+        self._wanted: tuple[str, tuple[float, float, float]] | None = None
+        self._still_since = 0.0
         self._driver, self._driver_at = "", float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
@@ -200,6 +204,8 @@ class DragServer:
         while not self._stop.is_set():
             if self._wish is None or self._follower.resting:
                 self._fresh.wait()
+            elif self._follower.ended:
+                self._fresh.wait(self.options.rest_s)  # then it is sought from rest
             self._fresh.clear()
             with self._lock:
                 wish = self._wish
@@ -220,7 +226,10 @@ class DragServer:
             wanted = self.feedback.target(time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached)
         if grabbed and len(current) == len(self.gate.inputs):
             self._follower.begin(current)
-        motion = self._follower.step({handle: wanted}, seconds=self.options.answer_s)
+        if (handle, target_m) != self._wanted:
+            self._wanted, self._still_since = (handle, target_m), begun
+        stays = begun - self._still_since >= self.options.rest_s
+        motion = self._follower.step({handle: wanted}, seconds=self.options.answer_s, stays=stays)
         if motion.equilibrium.converged:
             self._motion = motion
             with self._lock:

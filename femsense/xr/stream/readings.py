@@ -38,9 +38,7 @@ Reading = tuple[float, FloatArray]
 class Readings(Iterator[Reading]):
     """Readings as they come, and what is the matter where none do."""
 
-    def __init__(
-        self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: ""
-    ) -> None:
+    def __init__(self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: "") -> None:
         """Read items; `away` says why the source is not there, or nothing."""
         self._items, self._read, self._away = items, read, away
         self._came = False

@@ -101,6 +101,21 @@ def reach_of(hub: Hub) -> dict[str, Any]:
     return {} if message is None else json.loads(message.payload)
 
 
+def answers(hub: Hub) -> list[dict[str, Any]]:
+    """A list that fills with what is answered."""
+    told: list[dict[str, Any]] = []
+
+    class Sink:
+        def send(self, messages: tuple[Message, ...]) -> None:
+            told.extend(json.loads(message.payload) for message in messages if message.topic == "femsense/bar/reach")
+
+        def close(self) -> None:
+            pass
+
+    hub.attach(Sink())
+    return told
+
+
 def target_of(robot: Robot, tension: dict[str, float]) -> np.ndarray:
     return robot.markers.positions(fs.solve_equilibrium(robot.body, tension=tension).positions)[0]
 
@@ -179,6 +194,27 @@ def test_without_arming_the_ghost_moves_and_the_robot_does_not(served: tuple[Hub
     drag(hub, np.add(wanted, [0.0, 0.0, 0.05]), armed=False)
     assert within(5.0, lambda: reach_of(hub).get("status") != "reached")
     assert "mm off" in reach_of(hub)["text"] and not there.heard
+
+
+def test_a_drag_begins_where_the_robot_is(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
+    hub, server, there = served
+    told, inputs = answers(hub), dict(zip(server.robot.body.cable_names, (1.2, 0.5)))
+    there.inputs = inputs
+    there.obey({"armed": False})  # says where it is
+    drag(hub, target_of(server.robot, inputs), armed=False)
+    assert within(5.0, lambda: bool(told))
+    assert told[0]["error_m"] < 1e-6
+    assert {row["name"]: row["value"] for row in told[0]["inputs"]} == pytest.approx(inputs, abs=1e-6)
+
+
+def test_answers_go_on_by_themselves_until_nothing_comes_nearer(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
+    hub, server, _ = served
+    told = answers(hub)
+    drag(hub, target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6)))), armed=False)  # said once
+    assert within(10.0, lambda: bool(told) and told[-1]["status"] == "reached")
+    assert len(told) > 2 and {one["status"] for one in told[:-1]} == {"converging"}
+    errors = [one["error_m"] for one in told]
+    assert errors == sorted(errors, reverse=True) and told[0]["text"].startswith("converging: ")
 
 
 def test_one_hand_at_a_time_and_wishes_that_cannot_be_meant_do_nothing(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
