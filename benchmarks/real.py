@@ -26,7 +26,6 @@ from real.weights import fitted_by_weights
 
 from femsense import FemsenseError, calibrate, estimate, load_recording, load_robot, solve_equilibrium
 from femsense.core.pose import transform_points
-from femsense.model.effects import EFFECT_NAMES
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HEADING = (
@@ -61,22 +60,25 @@ def tentacle_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
 
 
 def trunk_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
-    """Return the trunk without a weight, with one, and the run with it judged by what the run without it taught."""
+    """Return the trunk without a weight and with one; then each with the run without it as its reference, without it half a second later."""
     robot, made = trunk.make(out, data)
     free = ["cable_gain", "cable_offset", "cable_stretch", "density", "stiffness"]
+    loads = ["payload", "tip_mass"]
+    twin = ["--reference", str(made["none"]), str(made["none-held"])]
     rows = [
-        ("nothing hung on", [made["none"]], [made["none-held"]], free),
-        ("100 g hung on", [made["load"]], [made["load-held"]], [*free, "payload", "tip_mass"]),
-        ("nothing hung on, payload offered", [made["none"]], [made["none-held"]], [*free, "payload", "tip_mass"]),
+        ("nothing hung on", "none", free, []),
+        ("100 g hung on", "load", [*free, *loads], []),
+        ("nothing hung on, payload offered", "none", [*free, *loads], []),
+        ("100 g hung on, the run without as the reference", "load", loads, twin),
+        ("nothing hung on, half a second later, the run without as the reference", "later", loads, twin),
     ]
     asked = []
-    for i, (name, train, held, effects) in enumerate(rows, 1):
+    for i, (name, run, effects, options) in enumerate(rows, 1):
         if ways and i not in ways:
             continue
-        known = [e for e in effects if e in EFFECT_NAMES]
         own = out / f"way-{i}" / "robot"
         shutil.copytree(robot, own, dirs_exist_ok=True)
-        asked.append(Asked(name, own, train, held, ["--effects", *known]))
+        asked.append(Asked(name, own, [made[run]], [made[f"{run}-held"]], ["--effects", *effects, *options]))
     return asked
 
 
@@ -179,8 +181,8 @@ def print_pairs(out: Path, data: Path) -> None:
     model = load_robot(robot)
     bare, heavy = (trunk.read_run(data, loaded=loaded) for loaded in (False, True))
     frames = trunk.still_frames([bare, heavy], 48)[1::2]
-    later = trunk.Run(np.roll(bare.angles, -50, axis=0), np.roll(bare.discs, -50, axis=0))
-    for name, other, true in (("with the weight", heavy, -trunk.WEIGHT_N), ("half a second later", later, 0.0)):
+    pairs = ("with the weight", heavy, -trunk.WEIGHT_N), ("half a second later", trunk.later(bare), 0.0)
+    for name, other, true in pairs:
         force, std, frame_std = trunk.force_between(model, bare, other, frames)
         seen = ", ".join(f"{f:+.2f} ± {s:.2f}" for f, s in zip(force, std))
         print(
@@ -236,12 +238,14 @@ def improved(asked: Asked, minutes: float) -> dict[str, Any] | str:
 
 
 def named(document: Mapping[str, Any]) -> str:
-    """Return the effects of loop.json with their values."""
-    parts = []
-    for effect in document["effects"]:
-        values = [f"{key} {_value(p)}" for key, p in effect["parameters"].items()]
-        parts.append(f"{effect['name']} ({'; '.join(values)})")
-    return ", ".join(parts) or "nothing"
+    """Return the effects of loop.json with their values, and what was fitted along with them."""
+    parts = [_with_values(effect["name"], effect["parameters"]) for effect in document["effects"]]
+    along = [_with_values(*item) for item in document.get("fitted_along", {}).items()]
+    return (", ".join(parts) or "nothing") + (f"; fitted along: {', '.join(along)}" if along else "")
+
+
+def _with_values(name: str, parameters: Mapping[str, Any]) -> str:
+    return f"{name} ({'; '.join(f'{key} {_value(p)}' for key, p in parameters.items())})"
 
 
 def _value(parameter: Any) -> str:

@@ -137,6 +137,11 @@ def first_pose() -> FloatArray:
     return T
 
 
+def later(run: Run) -> Run:
+    """Return a run half a second later: a twin in which nothing was hung on."""
+    return Run(np.roll(run.angles, -50, axis=0), np.roll(run.discs, -50, axis=0))
+
+
 def force_between(
     robot: Robot, first: Run, second: Run, frames: IntArray, *, step: float = 0.1
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -181,9 +186,10 @@ def drawn(robot: Robot, angles: FloatArray) -> dict[str, float]:
 
 
 def make(folder: Path, data: Path, *, count: int = 48) -> tuple[Path, dict[str, Path]]:
-    """Write the robot and four recordings: without and with the weight, frames to fit and frames that are held out."""
+    """Write the robot and recordings: without and with the weight, and without it half a second later; of each frames to fit and frames that are held out."""
     runs = {"none": read_run(data, loaded=False), "load": read_run(data, loaded=True)}
     frames = still_frames(list(runs.values()), count)
+    runs["later"] = later(runs["none"])
     parts = {"": frames[::2], "-held": frames[1::2]}
     made = {
         name + end: write_recording(folder / (name + end), run, some) for name, run in runs.items() for end, some in parts.items()

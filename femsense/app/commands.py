@@ -17,7 +17,7 @@ from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import file_hash
-from femsense.io.provenance import finished
+from femsense.io.provenance import finished, recording_input
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import check_loop_folder, loop_inputs, read_loop, write_loop
@@ -132,7 +132,8 @@ def improve_into(
     own = {str(file): file_hash(Path(file)) for file in how.user_effects if Path(file).is_file()}
     inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=how.measured)
     inputs["options"] |= {"correct": True} if how.correct else {}
-    _require_different([*inputs["recordings"], *inputs["validation"]])
+    inputs |= {"references": [recording_input(twin) for twin in how.references]} if how.references else {}
+    _require_different([*inputs["recordings"], *inputs["validation"], *inputs.get("references", [])])
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return read_loop(folder)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from femsense.calib.reference import less_reference
 from femsense.core.errors import FemsenseError, InputError
 from femsense.core.parallel import beside, one_blas_thread
 from femsense.io.checkpoint import Checkpoint
@@ -56,6 +57,9 @@ class ImproveOptions:
     """"markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none."""
     correct: bool = False
     """Also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect."""
+    references: Sequence[Recording] = ()
+    """The same inputs without what is asked for, a weight, say: what the model misses there is taken off all other recordings
+    (`femsense/calib/reference.py`)."""
     seed: int = 0
     """Of the permutation test and the bootstrap."""
     thresholds: Thresholds = DEFAULTS
@@ -94,6 +98,7 @@ def improve(
     """
     say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     names, forms = _asked(robot, recordings, effects, without, how)
+    recordings, validation = _less_references(robot, recordings, validation, how, say)
     rng = np.random.default_rng(how.seed)
     with Checkpoint(how.keep, forms) as checkpoint, say.watching():
         data, search = _search(robot, recordings, validation, (names, forms), how, checkpoint, say)
@@ -125,8 +130,20 @@ def search_recordings(
     """Return the data with what a search finds in them, before anything is concluded (`conclude`); arguments and errors as of `improve`."""
     how = options or ImproveOptions()
     names, forms = _asked(robot, recordings, effects, without, how)
+    recordings, validation = _less_references(robot, recordings, validation, how, lambda text: None)
     with Checkpoint(how.keep, forms) as checkpoint:
         return _search(robot, recordings, validation, (names, forms), how, checkpoint, WorkPlan(lambda text: None))
+
+
+def _less_references(
+    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions, say: Progress
+) -> tuple[Sequence[Recording], Sequence[Recording]]:
+    """Return the recordings less what the model misses of references; as they are where there is none."""
+    if not how.references:
+        return recordings, validation
+    say("comparing with the reference")
+    every = less_reference(robot, [*recordings, *validation], how.references)
+    return every[: len(recordings)], every[len(recordings) :]
 
 
 def _asked(
@@ -141,6 +158,9 @@ def _asked(
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
+    names = (
+        [name for name in names if name != MESH.name] if how.references else names
+    )  # what they leave holds for the declared mesh
     if not names:
         raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
     _require_one_that_acts(names if effects else [], own, robot, recordings)
@@ -169,7 +189,9 @@ def _search(
     def prepared(body: Robot) -> Data:
         say("reading and calibrating")
         every = prepare(body, recordings, validation, how.measured)
-        return replace(every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort)
+        return replace(
+            every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort, relative=bool(how.references)
+        )
 
     def ready(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
         elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)

@@ -380,6 +380,7 @@ def test_what_would_be_ignored_is_refused(run: Any, robot: Path, recording: Path
         (("--plan",), "recordings are not asked with --plan"),
         (("-o", tmp_path / "out", "--validation", recording), "a recording is fitted and judged on"),
         (("-o", tmp_path / "out", recording), "the same recording is given twice"),
+        (("-o", tmp_path / "out", "--reference", recording), "the same recording is given twice"),
         (("-o", tmp_path / "out", "--effects", "creep", "--without", "creep"), "no effect is left to try"),
         (("-o", tmp_path / "out", "--effects", ""), "no name"),
         (("-o", tmp_path / "out", "--effects", "cable_slack"), "none of these effects can act here"),

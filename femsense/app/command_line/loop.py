@@ -28,6 +28,15 @@ def improve(
         list[Path] | None,
         typer.Option("--validation", metavar="RECORDING …", help="What they are tested on.", show_default=False),
     ] = None,
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--reference",
+            metavar="RECORDING …",
+            help="The same inputs without what is asked for (a weight, say): what the model misses there is taken off.",
+            show_default=False,
+        ),
+    ] = None,
     effects: Annotated[
         list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)
     ] = None,
@@ -78,6 +87,7 @@ def improve(
     """Find what the model lacks and write the better robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
+    from femsense.io.recording_folder import load_recording
     from femsense.loop.improve import ImproveOptions
     from femsense.report.loop.document import Loop
     from femsense.report.loop.text import loop_text
@@ -106,7 +116,12 @@ def improve(
             validation=validation or [],
             effects=split_names(effects),
             without=split_names(without),
-            options=ImproveOptions(user_effects=user_effect or [], measured=measured, correct=correct),
+            options=ImproveOptions(
+                user_effects=user_effect or [],
+                measured=measured,
+                correct=correct,
+                references=[load_recording(path) for path in reference or []],
+            ),
             again=again,
             say=say,
             progress=progress,

@@ -13,7 +13,7 @@ from typer.exceptions import TyperException
 from femsense.core.errors import InputError
 
 T = TypeVar("T")
-SEVERAL = ("--at", "--validation", "--effects", "--without", "--target", "--force", "--topic", "--map")
+SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
 RobotPath = Annotated[
     str,

@@ -72,6 +72,8 @@ class Data:
     """Why the discretisation error is not known; empty where it is."""
     mesh_as_shown: bool = False
     """Whether the discretisation error counts by how much of it the data show, since they have shown that the declared mesh suffices."""
+    relative: bool = False
+    """Whether markers are less what the model misses of a reference, which holds for the modulus and the inputs that it was computed with: these stay."""
     thresholds: Thresholds = DEFAULTS
     """What decides."""
     effort: Effort = EFFORT

@@ -77,7 +77,9 @@ class _Part:
 
 def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
     """Return the data with the error of the mesh at a fitted model; with a note why not where the mesh is huge, or linear and `discretisation` among
-    the effects that are tried, or where no state settles on a finer one."""
+    the effects that are tried, or where no state settles on a finer one; and beside a reference, which shares it."""
+    if data.relative:
+        return replace(data, mesh_note="beside a reference it drops out")
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     alike: dict[int, list[_Part]] = {}
     for part in _parts(data, fitted):

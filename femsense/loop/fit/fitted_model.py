@@ -19,7 +19,7 @@ from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.robot import Robot
 
 ROUGHLY = 3
-"""Steps of a fit that only has to come near."""
+"""Steps of a fit that only has to come near: one that tells the noise by its residual, or part of a model."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,10 +46,11 @@ class FittedModel:
 
 
 def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
-    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the input offsets."""
+    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the input offsets. Beside a
+    reference it is nothing."""
     terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
     std: list[float] = []
-    for name in NUISANCE:
+    for name in () if data.relative else NUISANCE:
         effect, seed = by_session(find_effect(name), [t.scene.recording for t in data.train])
         parameters = effect.parameters(data.robot, data.control)
         unknown_zero = any(t.initial is not None for t in data.train)
