@@ -47,6 +47,15 @@ class Scan:
     """Camera of each, shape (o,)."""
     segmented: bool = True
     """Whether colour separated the robot from the rest; else all points stand among those that may be of the robot."""
+    count: FloatArray | None = None
+    """How many measured points each point of the robot is the mean of, shape (k,); None: each is one (see `condensed_scan`)."""
+    scatter: FloatArray | None = None
+    """Mean square of the distances of these along the surface's normal from their mean [m²], shape (k,)."""
+
+    @property
+    def measured(self) -> FloatArray:
+        """How many measured points each point of the robot stands for, shape (k,)."""
+        return np.ones(len(self.view)) if self.count is None else self.count
 
     def points(self, poses: Sequence[FloatArray]) -> FloatArray:
         """Return the robot's points in the robot frame [m], shape (k, 3)."""
@@ -61,7 +70,7 @@ class Scan:
         return np.array([T[:3, 3] for T in poses])[self.view]
 
     def ray_std(self, noises: Sequence[CameraNoise]) -> FloatArray:
-        """Return the noise of each point along its ray [m], shape (k,)."""
+        """Return the noise of a measured point along its ray, where each point lies [m], shape (k,)."""
         z = self.camera_points[:, 2]
         std = np.empty(len(z))
         for view, noise in enumerate(noises):

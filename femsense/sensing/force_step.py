@@ -6,7 +6,7 @@ Unknown are the forces (three components each), their places (two along the surf
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -70,18 +70,14 @@ class Linearisation:
 
     def cost(self, here: Iterate) -> float:
         """Return the misfit of the state, priors included."""
-        off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
-        roots = _prior_roots(here.touches, self.normals, here.sizes)
-        prior = sum(float(((root @ f) ** 2).sum()) for root, f in zip(roots, here.forces))
-        return self.misfit + off + prior
+        return self.misfit + prior_cost(here, self.normals)
 
     def cost_beside(self, sensor: Sensor, there: Iterate) -> float:
         """Return about what a state near by costs, before it is linearised: its rows with the nuisance of this one.
 
         The two differed by less than a twentieth of what the cost had changed, but for steps that were ten times too long.
         """
-        columns, known = nuisance_columns(sensor.knowledge, there.rows, self.sag)
-        return replace(self, misfit=misfit_of(there.rows.residual - known, columns, there.rows)[0]).cost(there)
+        return misfit_beside(sensor, there.rows, self.sag) + prior_cost(there, self.normals)
 
     def step(self, sensor: Sensor, here: Iterate, trust: float = 1.0, *, firm: bool = False) -> ForceStep:
         """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.
@@ -101,7 +97,7 @@ class Linearisation:
         covariance = normal.covariance(block_diag(*_prior_roots(here.touches, self.normals, WIDER * sizes)))
         place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
         places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])
-        scale = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
+        scale = max(1.0, here.rows.spread(self.residual)) ** 2
         limit = sensor.surface.edge
         return ForceStep(
             forces,
@@ -231,6 +227,19 @@ def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray]
         sag,
         misfit_of(here.rows.residual - known, columns, here.rows)[0],
     )
+
+
+def prior_cost(here: Iterate, normals: FloatArray) -> float:
+    """Return what forces (about outward normals, (m, 3)) and places of an iterate cost beforehand."""
+    off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
+    roots = _prior_roots(here.touches, normals, here.sizes)
+    return off + sum(float(((root @ f) ** 2).sum()) for root, f in zip(roots, here.forces))
+
+
+def misfit_beside(sensor: Sensor, rows: Rows, sag: FloatArray) -> float:
+    """Return about the misfit of the rows of a state whose moves with modulus and pulls are not known, with those of a state near by."""
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag)
+    return misfit_of(rows.residual - known, columns, rows)[0]
 
 
 def _prior_roots(touches: Sequence[Touch], normals: FloatArray, sizes: FloatArray) -> list[FloatArray]:

@@ -15,11 +15,11 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise
+from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise, misfit_beside, prior_cost
 from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, sag_at
 from femsense.sensing.states import solve_with
-from femsense.sensing.touches import make_touch, within_cones
+from femsense.sensing.touches import make_touch, touch_normal, within_cones
 from femsense.sensing.types import Fit, Sensor, Touch
 
 TRIES = 4
@@ -88,11 +88,25 @@ class _Frame:
         """Return the free state, or the given start where that explains the frame better. Raises DataError."""
         m, sensor = len(touches), self.sensor
         here = Iterate(tuple(touches), np.zeros((m, 3)), free.state, free.rows, np.full(m, sensor.options.force_std_n))
-        linear = linearise(sensor, here, None if free.tangent is None or free.sag is None else (free.tangent, free.sag))
-        if start is None or len(start[1]) != m:
-            return here, linear
-        forces = within_cones(sensor, here.touches, start[1], start[0])
-        return self._where_it_costs_less(replace(here, forces=forces, state=start[0]), here, linear) or (here, linear)
+        warm = None if start is None or len(start[1]) != m else self._from_start(here, free, start)
+        if warm is not None:
+            return warm
+        return here, linearise(sensor, here, None if free.tangent is None or free.sag is None else (free.tangent, free.sag))
+
+    def _from_start(
+        self, here: Iterate, free: Fit, start: tuple[Equilibrium, FloatArray]
+    ) -> tuple[Iterate, Linearisation] | None:
+        """Return a given start where it costs less than the free state, which need not be linearised then."""
+        forces = within_cones(self.sensor, here.touches, start[1], start[0])
+        there = self._settled(replace(here, forces=forces, state=start[0]))
+        if there is None:
+            return None
+        cost = free.cost + prior_cost(here, np.zeros((len(forces), 3)))
+        normals = np.array([touch_normal(self.sensor, touch, there.state) for touch in there.touches])
+        if free.sag is not None and misfit_beside(self.sensor, there.rows, free.sag) + prior_cost(there, normals) >= cost:
+            return None
+        linear = linearise(self.sensor, there)
+        return (there, linear) if linear.cost(there) < cost else None
 
     def settle(self, here: Iterate, linear: Linearisation, firm: bool) -> tuple[Iterate, Linearisation, ForceStep, bool]:
         """Return where steps lead that lower the cost, the step from there, and whether they had become small (`firm`: see `robust_std`)."""
@@ -126,16 +140,19 @@ class _Frame:
 
     def _where_it_costs_less(self, there: Iterate, here: Iterate, at: Linearisation) -> tuple[Iterate, Linearisation] | None:
         """Return an iterate with its equilibrium, rows and linearisation; None where it has none or costs more than one that was linearised."""
-        cost = at.cost(here)
+        cost, settled = at.cost(here), self._settled(there)
+        if settled is None or at.cost_beside(self.sensor, settled) >= cost:
+            return None
+        linear = linearise(self.sensor, settled)
+        return (settled, linear) if linear.cost(settled) < cost else None
+
+    def _settled(self, there: Iterate) -> Iterate | None:
+        """Return an iterate with its equilibrium and rows; None where it has none."""
         try:
             state = solve_with(self.sensor, self.k, there.touches, there.forces, there.state, before=self.before, tried=True)
-            there = replace(there, state=state, rows=rows_at(self.sensor, self.k, self.scan, state))
+            return replace(there, state=state, rows=rows_at(self.sensor, self.k, self.scan, state))
         except DataError:
             return None
-        if at.cost_beside(self.sensor, there) >= cost:
-            return None
-        linear = linearise(self.sensor, there)
-        return (there, linear) if linear.cost(there) < cost else None
 
     def fit_of(self, here: Iterate, linear: Linearisation, step: ForceStep, converged: bool) -> Fit:
         """Return an iterate as a fit, its state exact. Raises DataError."""

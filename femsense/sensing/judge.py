@@ -102,6 +102,11 @@ def chi_squared(fit: Fit) -> FloatArray:
     return np.array([float(f @ np.linalg.pinv(block) @ f) for f, block in zip(fit.forces, blocks)])
 
 
+def sure_forces(fit: Fit) -> tuple[bool, ...]:
+    """Return whether each force of a fit is more than noise gives once in 1000."""
+    return tuple(bool(v >= SURE) for v in chi_squared(fit))
+
+
 def unspoken(fit: Fit, i: int) -> bool:
     """Return whether contact i is in the fit and not reported: an object touches there whose force may be none, beside a sure one."""
     if fit.touches[i].source != "cloud":
@@ -112,15 +117,18 @@ def unspoken(fit: Fit, i: int) -> bool:
 
 def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
-    sag = sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)) if fit.sag is None else fit.sag
-    return misfit(sensor.knowledge, fit.rows, sag)
+    return misfit(sensor.knowledge, fit.rows, _sag_of(sensor, fit))
 
 
 def shared_errors(sensor: Sensor, fit: Fit) -> float:
     """Return χ² of the smooth errors that a fit needs over what is to be expected (see `nuisance_excess`)."""
     if not fit.rows.of_clouds:
         return 0.0
-    return nuisance_excess(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+    return nuisance_excess(sensor.knowledge, fit.rows, _sag_of(sensor, fit))
+
+
+def _sag_of(sensor: Sensor, fit: Fit) -> FloatArray:
+    return sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)) if fit.sag is None else fit.sag
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:

@@ -34,17 +34,20 @@ def rows_at(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> Ro
 def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
     surface = Surface(state.positions, sensor.surface.triangles)
     poses, noises, reach = sensor.calibration.poses, sensor.knowledge.noises, REACH * sensor.size
-    rows = ray_rows(scan, surface, poses, noises, reach=reach)
-    if len(rows.residual) < MANY * len(scan.view):
+    rows, measured = ray_rows(scan, surface, poses, noises, reach=reach), scan.measured
+    if measured[rows.hits.index].sum() < MANY * measured.sum():
         rows = ray_rows(scan, surface, poses, noises, reach=reach, catch=CATCH * sensor.size)
-    if len(rows.residual) < FEWEST:
-        raise DataError(
-            f"only {len(rows.residual)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
-        )
+    number = measured[rows.hits.index]
+    met = int(number.sum())
+    if met < FEWEST:
+        raise DataError(f"only {met} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees")
     nodes = sensor.robot.body.mesh.nodes
     move = rows.operator(len(nodes))
     rest = rows.hits.place(nodes)
-    missed = np.setdiff1d(np.arange(len(scan.view)), rows.hits.index, assume_unique=True)
+    missed = np.ones(len(measured), dtype=bool)
+    missed[rows.hits.index] = False
+    scatter = None if scan.scatter is None else scan.scatter[rows.hits.index]
+    square = rows.residual**2 + (0.0 if scatter is None else scatter)
     return Rows(
         functional=lambda u: np.asarray(move @ u.reshape(len(u), -1).T),
         residual=rows.residual,
@@ -52,12 +55,15 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
         by_pose=rows.by_pose(sensor.pivot, len(poses)),
         place=rest,
         way=np.linalg.norm(rows.hits.place(state.positions) - rest, axis=1),
-        count=len(rows.residual),
-        rms=float(np.sqrt((rows.residual**2).mean())),
+        count=met,
+        rms=float(np.sqrt(number @ square / met)),
         missed=surface.gap(scan.points(poses)[missed]) / (sensor.knowledge.rough * scan.ray_std(noises)[missed]),
         of_clouds=True,
         together=sensor.knowledge.together,
         operator=move,
+        number=None if scan.count is None else number,
+        scatter=scatter,
+        missed_number=None if scan.count is None else measured[missed],
     )
 
 
@@ -74,7 +80,7 @@ def seen_through(sensor: Sensor, scan: Scan, state: Equilibrium) -> float:
     depth = np.linalg.norm(points - origins, axis=1)[hits.index]
     std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[hits.index], depth)])
     behind = hits.distance < -np.maximum(OFF * std * hits.cosine, BEHIND * sensor.size)
-    return float(behind.sum() / (len(scan.view) + behind.sum()))
+    return float(behind.sum() / (scan.measured.sum() + behind.sum()))
 
 
 def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:

@@ -144,18 +144,20 @@ def robust_std(rows: Rows, residual: FloatArray, *, firm: bool = False) -> Float
     `firm`: outliers tell nothing, and theirs are infinite. That is for states near the answer (MM-estimate, Yohai 1987): those that mix
     two depths lie all on one side, and many small pulls move a small contact.
     """
-    std, z = rows.std * np.sqrt(rows.together), np.abs(residual / rows.std)
-    cut = cut_of(z)
+    std, z = rows.std * np.sqrt(rows.together / rows.weight), rows.sizes(residual)
+    cut = cut_of(rows, residual)
     wider = np.sqrt(np.maximum(z / cut, 1.0))
     return np.asarray(std * np.where(firm & rows.of_clouds & (z > OUTLIER / HUBER * cut), np.inf, wider))
 
 
-def cut_of(z: FloatArray) -> float:
+def cut_of(rows: Rows, residual: FloatArray) -> float:
     """Return from which size on a whitened residual stands out [1]."""
-    return HUBER * max(1.483 * float(np.median(np.abs(z))), 1.0)
+    return HUBER * max(rows.spread(residual), 1.0)
 
 
-def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowledge:
+def learn(
+    knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]], judged: list[tuple[Rows, FloatArray]] | None = None
+) -> Knowledge:
     """Return what free frames teach.
 
     How many neighbouring points err together and how rough they are; pose, modulus and pulls, and the shared errors: what all frames have of
@@ -164,6 +166,7 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     Arguments:
         knowledge: what was known before.
         frames: rows of each free frame, of its cloud and of its markers, each with the moves of `sag_at`.
+        judged: rows of their clouds as frames are judged by, where these are others (means of points).
     """
     if not frames:
         return knowledge
@@ -176,7 +179,7 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
         rough = knowledge.rough * max(1.0, _scatter(knowledge, weighed))
         knowledge = replace(knowledge, together=_together(knowledge, weighed), rough=rough)
     knowledge = _alike(knowledge, [_gram(knowledge, _weighed(knowledge, rows), sag) for rows, sag in frames])
-    clouds = [(_weighed(knowledge, rows), sag) for rows, sag in frames if rows.of_clouds]
+    clouds = [(_weighed(knowledge, rows), sag) for rows, sag in judged or frames if rows.of_clouds]
     if not clouds:
         return knowledge
     misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in clouds])
@@ -217,8 +220,8 @@ def misfit(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> float:
 
     A row counts as OUTLIER at most: flying pixels, which are many standard deviations off, would else say what a frame leaves.
     """
-    left = np.abs(whitened_rest(knowledge, rows, sag))
-    return float(huber(np.minimum(left, OUTLIER), HUBER).sum() / max(len(left), 1))
+    left = rows.sizes(rows.std * whitened_rest(knowledge, rows, sag))
+    return float(rows.weight @ huber(np.minimum(left, OUTLIER), HUBER) / max(rows.weight.sum(), 1.0))
 
 
 def whitened_rest(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
@@ -241,10 +244,12 @@ def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[fl
     std = robust_std(rows, residual)
     A = columns / std[:, None]
     fitted = np.linalg.solve(A.T @ A + np.eye(columns.shape[1]), A.T @ (residual / std))
-    z = np.abs(residual - columns @ fitted) / rows.std
-    cut = cut_of(residual / rows.std)
+    z, cut = rows.sizes(residual - columns @ fitted), cut_of(rows, residual)
     far = OUTLIER / HUBER * cut if rows.of_clouds else np.inf
-    total = huber(np.minimum(z, far), cut).sum() + huber(np.minimum(rows.missed, far), cut).sum()
+    beside = huber(np.minimum(rows.missed, far), cut)
+    total = rows.weight @ huber(np.minimum(z, far), cut) + (
+        beside.sum() if rows.missed_number is None else rows.missed_number @ beside
+    )
     return float(total / rows.together + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
 
 

@@ -24,13 +24,12 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.model.drive import has_history
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.sensing.forces import no_forces
-from femsense.sensing.judge import OK, behind_body, beside_markers, status_of, trusted
+from femsense.sensing.judge import OK, behind_body, beside_markers, status_of, sure_forces, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, segmented
-from femsense.sensing.states import free_state
+from femsense.sensing.states import foretold, free_state
 from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import (
     ContactForce,
@@ -120,10 +119,10 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     before = previous.state.segment_tensions if previous is not None and has_history(sensor.robot) else None
     alone = free_state(sensor, k, None if previous is None else previous.free_state, before)
     clock.lap("equilibrium")
-    scan = scan_of(sensor, k, alone if previous is None else previous.state)
+    near = foretold(previous, alone)
+    scan = scan_of(sensor, k, near)
     clock.lap("scan")
-    free = no_forces(sensor, k, scan, alone)
-    scan, free = segmented(sensor, k, scan, free, before)
+    scan, free = segmented(sensor, k, scan, alone, near, before)
     clock.lap("rows")
     shapes = seen_objects(sensor, k, scan, free.state)
     touches = find_touches(sensor, shapes, free)
@@ -150,7 +149,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         dict(fit.state.pressure),
         clock.stages,
     )
-    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts)
+    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts, sure_forces(fit))
 
 
 class _Clock:
@@ -187,7 +186,7 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
 
 def _under_inputs(frame: SensedFrame) -> SensedFrame:
     """Return a frame as the inputs alone have it: what the next one starts from where its forces are not trusted (friction remembers it)."""
-    return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=())
+    return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), sure=())
 
 
 PREDICTED = "no marker and no cloud: the model's prediction under the inputs"

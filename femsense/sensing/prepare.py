@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
+from femsense.calib.condensed_scan import condensed
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, Scan, parted, read_scan
@@ -85,11 +86,11 @@ def make_sensor(
         Answers(),
         correction_std,
     )
-    learned = learn(knowledge, _free_rows(sensor))
+    learned = learn(knowledge, *_free_rows(sensor))
     if not pulls_are_modelled:
         return replace(sensor, knowledge=learned)
     sensor = _better_posed(sensor, learned)
-    return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
+    return replace(sensor, knowledge=learn(sensor.knowledge, *_free_rows(sensor)))
 
 
 def _corrected(
@@ -144,6 +145,12 @@ def scan_of(sensor: Sensor, k: int, state: Equilibrium) -> Scan | None:
     return read_scan(sensor.robot, sensor.recording, k, sensor.calibration.poses, state.positions)
 
 
+def condensed_at(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
+    """Return a scan whose neighbouring points on a state are averaged (see `condensed`)."""
+    surface = Surface(state.positions, sensor.surface.triangles)
+    return condensed(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+
+
 def _with_placements(robot: Robot, calibration: Calibration) -> Robot:
     if not calibration.placements_m:
         return robot
@@ -182,21 +189,22 @@ def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
         return []
 
 
-def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
-    """Return rows and sag of the free frames with clouds; a frame that gives nothing is left out."""
-    result = []
+def _free_rows(sensor: Sensor) -> tuple[list[tuple[Rows, FloatArray]], list[tuple[Rows, FloatArray]]]:
+    """Return rows and sag of the free frames with clouds, and the same of the means of their points; a frame that gives nothing is left out."""
+    result, means = [], []
     for k, state in free_path(sensor.driven, free_clouds(sensor.recording)):
         try:
             scan = scan_of(sensor, k, state)
-            if scan is not None and not scan.segmented:
+            if scan is None:
+                continue
+            if not scan.segmented:
                 shape = Surface(state.positions, sensor.surface.triangles)
                 scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
-            rows = None if scan is None else rows_at(sensor, k, scan, state)
-            if rows is not None and scan is not None and not scan.segmented:
-                rows = replace(rows, through=seen_through(sensor, scan, state))
+            through = 0.0 if scan.segmented else seen_through(sensor, scan, state)
+            rows, few = (rows_at(sensor, k, one, state) for one in (scan, condensed_at(sensor, scan, state)))
         except FemsenseError:
             continue
-        if rows is not None:
-            moves = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
-            result += [(rows, moves), *((own, moves) for own in _marked(sensor, k, state))]
-    return result
+        moves = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
+        result += [(replace(rows, through=through), moves), *((own, moves) for own in _marked(sensor, k, state))]
+        means.append((replace(few, through=through), moves))
+    return result, means

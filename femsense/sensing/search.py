@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.calib.scan import REACH, Scan, parted
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
@@ -19,6 +19,8 @@ from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
 from femsense.sensing.places import object_touches, said_free
+from femsense.sensing.prepare import condensed_at
+from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
@@ -59,25 +61,36 @@ def explain(
 
 
 def segmented(
-    sensor: Sensor, k: int, scan: Scan | None, free: Fit, before: tuple[FloatArray, ...] | None
+    sensor: Sensor, k: int, scan: Scan | None, alone: Equilibrium, near: Equilibrium, before: tuple[FloatArray, ...] | None
 ) -> tuple[Scan | None, Fit]:
-    """Return the scan with robot and surroundings apart, and the fit without forces to what is the robot's.
+    """Return the scan with robot and surroundings apart, neighbouring points averaged, and the fit without forces to what is the robot's.
 
     Where colour has not separated them, the shape is explained first, with all points; what then lies off the surface is something else.
+
+    Arguments:
+        alone: the state without forces.
+        near: a state on which most points lie.
     """
-    if scan is None or scan.segmented:
-        return scan, free
-    every, state = scan, free.state
+    if scan is None:
+        return None, no_forces(sensor, k, None, alone)
+    states = (
+        [alone] if near is alone else [near, alone]
+    )  # what touched in the frame before may be gone: then few points agree on its state
+    few = min((condensed_at(sensor, scan, state) for state in states), key=lambda means: len(means.view))
+    free = no_forces(sensor, k, few, alone)
+    if scan.segmented:
+        return few, free
+    state = alone
     touched = not said_free(sensor, k) and not len(sensor.places)
     for _ in range(ROUNDS if touched else 0):  # what is taken for the robot at first still holds some of what touches it
-        fit = _with_hidden(sensor, k, scan, free, free, before)
+        fit = _with_hidden(sensor, k, few, free, free, before)
         state = fit.state
         if not fit.touches:
             break
-        scan = _parted(sensor, every, state)
-        free = no_forces(sensor, k, scan, free.state, free)
-    scan = _parted(sensor, every, state)
-    return scan, no_forces(sensor, k, scan, free.state, free)
+        few = condensed_at(sensor, _parted(sensor, scan, state), state)
+        free = no_forces(sensor, k, few, alone, free)
+    few = condensed_at(sensor, _parted(sensor, scan, state), state)
+    return few, no_forces(sensor, k, few, alone, free)
 
 
 def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
@@ -183,31 +196,112 @@ def _with_objects(
     before: tuple[FloatArray, ...] | None,
 ) -> Fit:
     """Return the fit with what objects touch, their places found again in the state that the forces make."""
-    fit = free
-    held = () if previous is None else tuple(t for t in previous.touches if shapes or t.source == "shape")
-    if previous is not None and held:  # what held in the frame before is a start; an object that is gone touches no more
-        start = (previous.state, previous.forces) if len(held) == len(previous.touches) else None
-        again = _try(sensor, k, scan, held, free, start, before)
-        fit = fit if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit else _better(fit, again)
+    again = _held(sensor, k, scan, shapes, free, previous, before)
+    if again is not None and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
+        return again
+    fit = free if again is None else again
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
-        if _same(sensor, found, fit.touches):
+        if _same(sensor, found, fit):
             break
-        start = _start_of(fit, found)
         own = [
             t
             for t in fit.touches
             if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)
         ]
+        start = _start_of(sensor, fit, [*found, *own])
         fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
     return _significant(sensor, k, scan, fit, free, before)
 
 
-def _same(sensor: Sensor, found: Sequence[Touch], touches: Sequence[Touch]) -> bool:
-    """Return whether objects touch where the fit has contacts already."""
+def _held(
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    shapes: list[Shape],
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit | None:
+    """Return the fit of what held in the frame before; None where that does not explain this one."""
+    if previous is None or not previous.touches:
+        return None
+    near = foretold(previous, free.state)
+    held, kept = held_on(sensor, previous.touches, object_touches(sensor, shapes, near), previous.sure, gone=not shapes)
+    forces = np.vstack([previous.forces, np.zeros((1, 3))])[kept]
+    again = _try(sensor, k, scan, held, free, (near, forces), before) if held else None
+    if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit or again.cost >= free.cost:
+        return None
+    return again
+
+
+def nothing_new(sensor: Sensor, fit: Fit, found: Sequence[Touch]) -> bool:
+    """Return whether a fit leaves nothing to be explained by another contact: objects touch where it has contacts, each of its contacts is sure,
+    and nowhere on the surface another one gains enough.
+
+    Arguments:
+        found: where objects touch in the state of the fit.
+    """
+    if any(v < SURE and not unspoken(fit, i) for i, v in enumerate(chi_squared(fit))):
+        return False
+    if any(t.source != "cloud" and _near(sensor, t, found) for t in fit.touches):
+        return False
+    if not all(_near(sensor, f, fit.touches) for f in found):
+        return False
+    return not find_hidden(sensor, fit)
+
+
+def _near(sensor: Sensor, touch: Touch, others: Sequence[Touch]) -> bool:
+    return any(float(np.linalg.norm(touch.place - other.expected)) < APART * sensor.size for other in others)
+
+
+def held_on(
+    sensor: Sensor, touches: Sequence[Touch], found: Sequence[Touch], sure: Sequence[bool], *, gone: bool = False
+) -> tuple[list[Touch], IntArray]:
+    """Return the touches of the frame before, each moved on with the nearest one that is found now, then those that are new; and which they are.
+
+    New ones have the number −1: what they may carry, the others may seem to carry, whether the shape shows it or not.
+
+    Arguments:
+        touches: of the frame before.
+        found: where objects touch now.
+        sure: of each touch whether it carried a force. Of one that did not, the place is as it is seen, since the shape says nothing of it; where
+            it is not seen any more, it is left out.
+        gone: no object is seen any more: none touches.
+    """
+    result, kept = [], []
+    gap = np.array([[np.linalg.norm(touch.expected - f.place) for f in found] for touch in touches]).reshape(
+        len(touches), len(found)
+    )
+    for i, touch in enumerate(touches):
+        j = int(gap[i].argmin()) if touch.source == "cloud" and len(found) else -1
+        seen = j >= 0 and gap[i, j] < APART * sensor.size and i == int(gap[:, j].argmin())
+        if seen:
+            result.append(_moved_on(sensor, touch, found[j]) if sure[i] else replace(found[j], std_m=0.0))
+        elif sure[i] and not (gone and touch.source == "cloud"):
+            result.append(touch)
+        kept += [i] * (len(result) - len(kept))
+    new = [f for j, f in enumerate(found) if not len(touches) or gap[:, j].min() >= APART * sensor.size]
+    return [*result, *new], np.array([*kept, *(-1 for _ in new)], dtype=np.int64)
+
+
+def _moved_on(sensor: Sensor, touch: Touch, found: Touch) -> Touch:
+    """Return where an object is found to touch, with what the shape said of the place in the frame before."""
+    place = found.place + touch.place - touch.expected
+    moved = make_touch(sensor, place, source="cloud", std_m=found.std_m, radius=found.object_radius_m, spread=found.spread_m)
+    return replace(moved, expected=found.place)
+
+
+def _same(sensor: Sensor, found: Sequence[Touch], fit: Fit) -> bool:
+    """Return whether objects touch where the fit has contacts already; where it has one that carries nothing, it does not matter as much."""
+    touches = fit.touches
     if len(found) != len(touches) or any(t.source != "cloud" for t in touches):
         return False
-    return all(min(float(np.linalg.norm(f.place - t.expected)) for t in touches) < 0.3 * sensor.surface.edge for f in found)
+    if not touches:
+        return True
+    reach = np.where(chi_squared(fit) < 1.0, APART * sensor.size, 0.3 * sensor.surface.edge)
+    gap = np.linalg.norm([[f.place - t.expected for t in touches] for f in found], axis=2)
+    return bool((gap < reach).any(axis=1).all() and (gap < reach).any(axis=0).all())
 
 
 def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
@@ -255,6 +349,14 @@ def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equi
     return previous.state, previous.forces
 
 
-def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
-    """Return the state and forces of a fit as a start for as many touches."""
-    return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None
+def _start_of(sensor: Sensor, fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
+    """Return the state and forces of a fit as a start for some touches, each with the force of the nearest one; None where one has no place there."""
+    if not fit.touches or not touches:
+        return None
+    gap = np.linalg.norm([[t.place - old.place for t in touches] for old in fit.touches], axis=2)
+    nearest = gap.argmin(axis=1)
+    if gap.min(axis=1).max() > APART * sensor.size or len(set(nearest)) < len(nearest):
+        return None
+    forces = np.zeros((len(touches), 3))
+    forces[nearest] = fit.forces
+    return fit.state, forces

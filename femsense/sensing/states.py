@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.frame_state import solve_frame
 from femsense.sensing.touches import nodal_forces
-from femsense.sensing.types import Sensor, Touch
+from femsense.sensing.types import SensedFrame, Sensor, Touch
 
 EXACT = 1e-9
 """Unbalanced force, relative to all loads, of a state that is a result."""
@@ -20,6 +21,13 @@ ROUGH = 1e-6
 def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
     """Return the state under the inputs alone. Raises DataError."""
     return _solve(sensor, k, None, start, before, False)
+
+
+def foretold(previous: SensedFrame | None, alone: Equilibrium) -> Equilibrium:
+    """Return about the state of a frame: that of the frame before, moved as the inputs alone (`alone`) have moved since; for rays, not for forces."""
+    if previous is None or not previous.touches:
+        return alone
+    return replace(previous.state, positions=previous.state.positions + alone.positions - previous.free_state.positions)
 
 
 def solve_with(

@@ -23,6 +23,9 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing import run_arrays
 
+MEDIAN = 1.0 - 1.483 ** (-2.0 / 3.0)
+"""The median of the mean of n squares of normal numbers is about (1 − this / n)³, exact for n = 1 (Wilson & Hilferty 1931)."""
+
 
 @dataclass(frozen=True, slots=True)
 class SensingOptions:
@@ -224,6 +227,8 @@ class SensedFrame:
     """Under the inputs alone."""
     report: FrameReport
     contacts: tuple[ContactForce, ...]
+    sure: tuple[bool, ...] = ()
+    """Whether each force was more than noise."""
 
 
 @dataclass(eq=False, slots=True)
@@ -272,6 +277,26 @@ class Rows:
     """Share of the points that lie behind the body on their ray (see `seen_through`)."""
     operator: sp.csr_array | None = None
     """What `functional` does, as a matrix, shape (r, 3n); None for markers."""
+    number: FloatArray | None = None
+    """How many points each row is the mean of, shape (r,); `std` is that of one of them. None: each row is one."""
+    scatter: FloatArray | None = None
+    """Mean square of the residuals of these about their mean [m²], shape (r,)."""
+    missed_number: FloatArray | None = None
+    """How many points each of `missed` is, shape (q,); None: each is one."""
+
+    @property
+    def weight(self) -> FloatArray:
+        """How many points each row stands for, shape (r,)."""
+        return np.ones(len(self.std)) if self.number is None else self.number
+
+    def sizes(self, residual: FloatArray) -> FloatArray:
+        """Return the root mean square of the points of each row that has this residual [m], in standard deviations of a point, shape (r,)."""
+        square = residual**2 if self.scatter is None else residual**2 + self.scatter
+        return np.asarray(np.sqrt(square) / self.std)
+
+    def spread(self, residual: FloatArray) -> float:
+        """Return how widely points scatter, in their standard deviations (1 for noise alone): by the median, which outliers hardly move."""
+        return float(np.median(self.sizes(residual) * (1.0 - MEDIAN / self.weight) ** -1.5))
 
     def some(self, which: IntArray, columns: FloatArray) -> FloatArray:
         """Return the rows `which` (t,) of node displacements that stand in columns (3n, k), shape (t, k)."""

@@ -105,6 +105,18 @@ def test_flying_pixels_do_not_say_that_a_frame_is_not_explained():
     assert misfit(learned, replace(rows, residual=3.0 * rows.residual), SAG) > learned.misfit_limit
 
 
+def test_the_scatter_of_points_is_that_of_their_means() -> None:
+    """Noise alone, with and without outliers: groups of ten know the standard deviation of a point as well as the points do."""
+    noise = np.random.default_rng(0).normal(size=(2000, 10))
+    mean, ones = noise.mean(axis=1), np.ones(2000)
+    points = replace(plate_rows(1), residual=noise.ravel(), std=np.ones(noise.size))
+    means = replace(points, residual=mean, std=ones, number=10.0 * ones, scatter=noise.var(axis=1))
+    assert points.spread(points.residual) == pytest.approx(1.0, abs=0.03)
+    assert means.spread(means.residual) == pytest.approx(1.0, abs=0.03)
+    far = np.where(np.arange(2000) % 50 == 0, 30.0, mean)
+    assert means.spread(far) == pytest.approx(1.0, abs=0.05)
+
+
 def test_shared_errors_are_no_larger_than_what_free_frames_leave():
     """Waves too short for the field of shared errors, far above the noise: it must not grow beyond them to bend after them, or a touch is no news."""
 
