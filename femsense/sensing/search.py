@@ -269,7 +269,8 @@ def held_on(
             it is not seen any more, it is left out.
         gone: no object is seen any more: none touches.
     """
-    result, kept = [], []
+    result: list[Touch] = []
+    kept: list[int] = []
     gap = np.array([[np.linalg.norm(touch.expected - f.place) for f in found] for touch in touches]).reshape(
         len(touches), len(found)
     )
