@@ -112,7 +112,8 @@ def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
         return InputError("a required key is missing", where=where, found="nothing", expected=expected)
     if kind == "value_error":
         error = item["ctx"]["error"]
-        return InputError(str(error), where=where, found=short(item["input"]), expected=expected)
+        found = short(item["input"]) if location else ", ".join(item["input"])  # of the whole document its keys are enough
+        return InputError(str(error), where=where, found=found, expected=expected)
     what = str(item["msg"]).replace("Input should", "should").replace(", got inf or nan", "")
     what = what.replace("List should have", "should have").replace("String should", "should")
     return InputError(what, where=where, found=short(item["input"]), expected=expected)
