@@ -94,8 +94,7 @@ export class Stage {
     this.camera.near = size / 100;
     this.camera.far = size * 60;
     this.controls.minDistance = 0.15 * size;
-    this.controls.maxDistance = 8 * size;
-    this.scene.fog = this.headset.presenting ? null : new Fog(0x111823, 3.5 * size, 9 * size);
+    this.scene.fog = this.headset.presenting ? null : new Fog(0x111823);
     this.lookFromStart();
   }
 
@@ -111,8 +110,11 @@ export class Stage {
     this.moved = false;
     if (this.box.isEmpty()) return;
     const middle = this.box.getCenter(new Vector3());
+    const [size, away] = [this.box.getSize(new Vector3()).length() || 1, this.distance(middle)];
+    if (this.scene.fog instanceof Fog) [this.scene.fog.near, this.scene.fog.far] = [away + 1.5 * size, away + 7 * size]; // behind it all
+    this.controls.maxDistance = Math.max(8 * size, 2 * away);
     this.controls.target.copy(middle);
-    this.camera.position.copy(middle).addScaledVector(FROM, this.distance(middle));
+    this.camera.position.copy(middle).addScaledVector(FROM, away);
     this.camera.updateProjectionMatrix();
     this.controls.update();
     this.touch();
