@@ -1,11 +1,12 @@
 """From sensors to bones: how fast, and how far off, on real data and on the virtual rig.
 
-    python benchmarks/xr.py [--only speed arm actuator] [--data ../shared/data/arm] [--states FILE.npz] [--keep DIR] [--pieces NAME …]
+    python benchmarks/xr.py [--only speed arm actuator skin] [--data ../shared/data/arm] [--states FILE.npz] [--keep DIR] [--pieces NAME …]
 
 speed     the steps of the paper's table (Borges et al. 2022): network, spline and bones, end-to-end network, whole pose
 arm       a two-segment pneumatic arm, real: held-out errors by sensors, other days, correction, inputs outside what was learnt
           With --keep each piece of it is kept as it is done: a run that was cut off goes on there, and --pieces does some of them.
 actuator  a pneumatic finger with colour sensors and obstacles on the rig: surface error by how extreme the deformation is
+skin      how far skinned surfaces are off the finite elements in states that they were not fitted to, by number of bones
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from scipy.spatial.transform import Rotation
 import femsense as fs
 from femsense import Armature, embed_points
 from femsense.core.arrays import FloatArray
+from femsense.fem.mesh import surface_triangles
 from femsense.rig.sensors import SensorTable, sensor_readings
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.drift import adapt, drift
@@ -34,6 +36,8 @@ from femsense.xr.proprioception.labelled import Labelled, joined
 from femsense.xr.proprioception.model import bones_from_numbers
 from femsense.xr.proprioception.selection import marker_rms
 from femsense.xr.skinning import INFLUENCES, Skin, fit_poses, fit_skin, skin_vertices
+from femsense.xr.stream.drag_server import drive_inputs
+from femsense.xr.stream.payloads import Input
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "arm"
 PRESSURES, ENCODERS = (4, 5, 6, 10, 11, 12), (13, 14, 15, 16)
@@ -42,6 +46,8 @@ README_MM = {"draw wires": 5.4, "pressures": 36.8, "both": 9.6}
 FEW = 40
 BACK = np.stack([np.zeros(6), np.zeros(6), -np.linspace(0.012, 0.0745, 6)], axis=1)
 """Markers on the flat side of the finger, its layer that stretches least [m]."""
+PARTS = ("speed", "arm", "actuator", "skin")
+ROBOTS, COUNTS = ("finger", "arm", "four-leg", "gripper", "pneu-finger"), (8, 12, 24, 32)
 STATES = 240
 BONES = 8
 
@@ -313,9 +319,57 @@ def chain_skin(rest: FloatArray, chain: Armature) -> Skin:
     return Skin(skeleton, rest, joints, weights)
 
 
+# ---- skin -----------------------------------------------------------------------------------------------------------
+
+
+def skin(diamond: Path) -> None:
+    """Print held-out errors of skinned surfaces by number of bones: 40 random states to fit, 20 to test."""
+    robots = [fs.load_robot(name) for name in ROBOTS]
+    robots += [fs.load_robot(diamond)] if diamond.is_dir() else []
+    print(
+        "robot                 vertices  motion [mm]  "
+        + "".join(f"{count:>7} bones" for count in COUNTS)
+        + "   RMS (largest) [mm]"
+    )
+    for robot in robots:
+        mesh = robot.body.mesh
+        surface = np.unique(surface_triangles(mesh))
+        rest, states = mesh.nodes[surface], random_states(robot)[:, surface]
+        motion = rms_mm(np.linalg.norm(states - rest, axis=2))
+        cells = []
+        for count in COUNTS:
+            found = fit_skin(rest, states[:40], bones=count)
+            off = np.linalg.norm(skin_vertices(found, fit_poses(found, states[40:])) - states[40:], axis=2)
+            cells.append(f"{rms_mm(off):.3f} ({1e3 * off.max():.2f})")
+        print(f"{robot.name:<22}{len(rest):>8}{motion:>13.1f}  " + "".join(f"{cell:>13}" for cell in cells), flush=True)
+
+
+def random_states(robot: fs.Robot) -> FloatArray:
+    """Return nodes under 60 random inputs within limits, of about 10 mm motion where these allow it [m], shape (60, n, 3)."""
+    body, rng = robot.body, np.random.default_rng(11)
+    inputs = drive_inputs(robot)
+    shares = rng.uniform(size=(60, len(inputs)))
+    scale = 1.0
+    for _ in range(3):  # so much of the limits as moves the nodes by 10 mm on average
+        rms = rms_mm(
+            np.linalg.norm(np.array([state_of(body, inputs, scale * row) for row in shares[:6]]) - body.mesh.nodes, axis=2)
+        )
+        scale = min(1.0, scale * 10.0 / rms)
+    return np.array([state_of(body, inputs, scale * row) for row in shares])
+
+
+def state_of(body: fs.BodyModel, inputs: tuple[Input, ...], share: FloatArray) -> FloatArray:
+    """Return nodes under shares of the ranges of the inputs [m], shape (n, 3)."""
+    values = {one.name: one.low + s * (one.high - one.low) for one, s in zip(inputs, share)}
+    tension = {name: values[name] for name in body.cable_names}
+    found = fs.solve_equilibrium(body, tension=tension, pressure={name: values[name] for name in body.chamber_names})
+    assert found.converged, found.status
+    return found.positions
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", choices=("speed", "arm", "actuator"), default=("speed", "arm", "actuator"))
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--states", type=Path, help="keep the states of the finger here")
     parser.add_argument("--keep", type=Path, help="keep the pieces of the arm here, and go on from them")
@@ -327,6 +381,8 @@ def main() -> None:
         arm(arguments.data, arguments.keep, arguments.pieces)
     if "actuator" in arguments.only:
         actuator(arguments.states)
+    if "skin" in arguments.only:
+        skin(arguments.data.parent / "diamond")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,9 @@ class Shown:
         self.server, self.height = server, height
         self._scratch = scratch
 
+    def __repr__(self) -> str:
+        return f"Shown({self.url})"
+
     @property
     def url(self) -> str:
         """Where the page is."""
