@@ -38,7 +38,7 @@ def tracks_of(run: RunLike) -> tuple[int, ...]:
 
     These are their tracks; their numbers in the frame where two of a frame have one track.
     """
-    return tuple(sorted(set(_identities(run))))
+    return tuple(sorted(set(identities_of(run))))
 
 
 def data_frame_of(run: RunLike) -> Any:
@@ -66,12 +66,12 @@ def _filled(run: RunLike, field: str) -> FloatArray:
     rows = {frame.frame: i for i, frame in enumerate(run.frames)}
     columns = {track: j for j, track in enumerate(tracks_of(run))}
     values = np.full((len(rows), len(columns), 3), np.nan)
-    for contact, track in zip(run.contacts, _identities(run)):
+    for contact, track in zip(run.contacts, identities_of(run)):
         values[rows[contact.frame], columns[track]] = getattr(contact, field)
     return values
 
 
-def _identities(run: RunLike) -> list[int]:
+def identities_of(run: RunLike) -> list[int]:
     """Return the identity of each contact of a run."""
     distinct = len({(contact.frame, contact.track) for contact in run.contacts}) == len(run.contacts)
     return [contact.track if distinct else contact.contact for contact in run.contacts]

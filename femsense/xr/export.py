@@ -13,8 +13,10 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
-from femsense.io.files import check_target
+from femsense.io.files import check_target, write_beside
 from femsense.model.robot import Robot
+from femsense.sensing.types import ContactForce, FrameReport
+from femsense.xr.glb_arrows import with_arrows
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.run_contents import export_run
 from femsense.xr.usdz_export import write_usdz
@@ -42,6 +44,10 @@ class RunLike(Protocol):
     def states(self) -> _States: ...
     @property
     def robot(self) -> Robot: ...
+    @property
+    def contacts(self) -> tuple[ContactForce, ...]: ...
+    @property
+    def frames(self) -> tuple[FrameReport, ...]: ...
 
 
 def export_glb(
@@ -51,6 +57,7 @@ def export_glb(
     bones: int | None = None,
     color_rgb: npt.ArrayLike | None = None,
     skin: UserSkin | None = None,
+    arrows: bool = False,
 ) -> ExportReport:
     """Write a run as a skinned, animated mesh (binary glTF 2.0), or as `.usdz` where the path ends so.
 
@@ -60,6 +67,7 @@ def export_glb(
         bones: how many; chosen on held-out frames if None.
         color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's where the run knows it.
         skin: a surface of your own that the body carries (`read_skin`).
+        arrows: the contact forces too, as nodes that move with them (`glb_arrows`); in `.glb` alone.
 
     Returns:
         what was written, with the distance to the finite-element surface.
@@ -73,6 +81,10 @@ def export_glb(
         raise InputError("the ending names no format that is written", where=target, expected=" or ".join(ENDINGS), hint=hint)
     check_target(target, folder=False)
     target.parent.mkdir(parents=True, exist_ok=True)
+    if arrows:
+        if target.suffix.lower() != ".glb":
+            raise InputError("arrows are not written there", where=target, expected="a .glb file")
+        return _with_arrows(run, export_glb(run, target, bones=bones, color_rgb=color_rgb, skin=skin))
     if target.suffix.lower() == ".usdz":
         with tempfile.TemporaryDirectory(prefix="femsense-export-") as folder:
             report = export_glb(run, Path(folder, "robot.glb"), bones=bones, color_rgb=color_rgb, skin=skin)
@@ -87,3 +99,14 @@ def export_glb(
     return export_states(
         states.rest_nodes_m, states.tets, states.time_s, states.nodes_m, target, bones=bones, color_rgb=color, name=robot.name
     )
+
+
+def _with_arrows(run: RunLike | str | Path, report: ExportReport) -> ExportReport:
+    """Add the contact forces of a run to a file that was written of it."""
+    from femsense.sensing.run_files import read_run
+
+    whole = read_run(run) if isinstance(run, str | Path) else run
+    data = with_arrows(report.path.read_bytes(), whole)
+    with write_beside(report.path) as part:
+        part.write_bytes(data)
+    return report

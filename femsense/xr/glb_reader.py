@@ -58,13 +58,13 @@ class Surface:
 def read_glb(data: bytes) -> AnimatedSkin:
     """Return the skin and animation in the content of a file that femsense wrote. Raises InputError for any other."""
     with _ours():
-        return _skin(*_parts(data))
+        return _skin(*parts_of(data))
 
 
 def read_surface(data: bytes) -> Surface:
     """Return what the same content shows. Raises InputError as `read_glb`."""
     with _ours():
-        return _surface(*_parts(data))
+        return _surface(*parts_of(data))
 
 
 @contextmanager
@@ -77,7 +77,8 @@ def _ours() -> Iterator[None]:
         ) from None
 
 
-def _parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+def parts_of(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the document and the binary part of a file. Raises ValueError where it is no binary glTF."""
     magic, _, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if magic != b"glTF" or kind != b"JSON" or length != len(data):
         raise ValueError("not binary glTF")
@@ -123,6 +124,8 @@ def _skin(document: dict[str, Any], binary: bytes) -> AnimatedSkin:
     rows = np.zeros((len(times), len(nodes), 7), dtype=np.float32)
     place = {"translation": slice(0, 3), "rotation": slice(3, 7)}
     for channel in animation["channels"]:
+        if channel["target"]["node"] not in joints:
+            continue  # an arrow
         bone = joints.index(channel["target"]["node"])
         rows[:, bone, place[channel["target"]["path"]]] = _array(
             document, binary, animation["samplers"][channel["sampler"]]["output"]

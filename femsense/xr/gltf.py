@@ -169,7 +169,7 @@ def glb_bytes(
     times = _as_times(time_s, len(T_robot_bone))
     vertex_color, base_color = _colors(color_rgb, len(points))
 
-    buffer = _Buffer()
+    buffer = Buffer()
     primitive = _add_mesh(buffer, points, corners, skin, vertex_color)
     paint: dict[str, Any] = {"baseColorFactor": base_color, "metallicFactor": 0.0, "roughnessFactor": 0.55}
     images = {} if texture is None else _add_texture(buffer, primitive, texture, paint, len(points))
@@ -197,7 +197,7 @@ def glb_bytes(
         "animations": [{"name": "run", "samplers": samplers, "channels": channels}],
         **buffer.description(),
     }
-    return _container(gltf, bytes(buffer.content))
+    return container(gltf, bytes(buffer.content))
 
 
 def quaternions(rotations: FloatArray) -> FloatArray:
@@ -216,13 +216,18 @@ def quaternions(rotations: FloatArray) -> FloatArray:
 # ---- parts of the file ---------------------------------------------------------------------------------------------------
 
 
-class _Buffer:
+class Buffer:
     """The binary part of a file, and the accessors that describe it."""
 
-    def __init__(self) -> None:
-        self.content = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+    def __init__(
+        self,
+        content: bytearray | None = None,
+        views: list[dict[str, Any]] | None = None,
+        accessors: list[dict[str, Any]] | None = None,
+    ) -> None:
+        """Begin with nothing, or with what a file has."""
+        self.content = bytearray() if content is None else content
+        self.views, self.accessors = views or [], accessors or []
 
     def add(self, array: npt.NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
         """Append an array (count, …) and return the number of its accessor."""
@@ -256,7 +261,7 @@ class _Buffer:
         return {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.content)}]}
 
 
-def _add_mesh(buffer: _Buffer, rest: FloatArray, triangles: IntArray, skin: Skin, colors: FloatArray | None) -> dict[str, Any]:
+def _add_mesh(buffer: Buffer, rest: FloatArray, triangles: IntArray, skin: Skin, colors: FloatArray | None) -> dict[str, Any]:
     """Return the primitive: vertices at rest in glTF's frame, since that is where the bones at rest put them."""
     R = T_GLTF_ROBOT[:3, :3]
     normals = vertex_normals(rest, triangles)
@@ -274,7 +279,7 @@ def _add_mesh(buffer: _Buffer, rest: FloatArray, triangles: IntArray, skin: Skin
 
 
 def _add_texture(
-    buffer: _Buffer, primitive: dict[str, Any], texture: Texture, paint: dict[str, Any], vertices: int
+    buffer: Buffer, primitive: dict[str, Any], texture: Texture, paint: dict[str, Any], vertices: int
 ) -> dict[str, Any]:
     """Add an image and its places; the material shows it as it is. Returns the parts of the file that describe it."""
     if len(texture.uv) != vertices:
@@ -289,7 +294,7 @@ def _add_texture(
     }
 
 
-def _add_animation(buffer: _Buffer, times: FloatArray, poses: FloatArray) -> tuple[list[Any], list[Any]]:
+def _add_animation(buffer: Buffer, times: FloatArray, poses: FloatArray) -> tuple[list[Any], list[Any]]:
     """Return samplers and channels: a translation and a rotation for each bone."""
     keys = buffer.add(times.astype(np.float32), bounds=True)
     rotations = quaternions(poses[..., :3, :3])
@@ -302,7 +307,7 @@ def _add_animation(buffer: _Buffer, times: FloatArray, poses: FloatArray) -> tup
     return samplers, channels
 
 
-def _container(gltf: dict[str, Any], binary: bytes) -> bytes:
+def container(gltf: dict[str, Any], binary: bytes) -> bytes:
     """Return a GLB: header, JSON chunk padded with spaces, binary chunk padded with zeros."""
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)

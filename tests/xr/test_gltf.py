@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from glb import Glb, build_hook, in_gltf, npm_folder
+from helpers import write_block_robot
+from scipy.spatial.transform import Rotation
+from small_run import make_run
 from xr_bar import bar_mesh, bar_states, bar_surface
 
 from femsense.core.errors import InputError
 from femsense.fem.mesh import surface_triangles, to_quadratic, triangle_normals
+from femsense.io.robot_toml import load_robot
+from femsense.xr.export import export_glb
+from femsense.xr.glb_reader import parts_of, read_glb
 from femsense.xr.gltf import ExportReport, export_states, quaternions, write_glb
 from femsense.xr.skinning import fit_poses, fit_skin
 
@@ -152,6 +159,48 @@ def test_refusals_leave_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+# ---- forces ------------------------------------------------------------------------------------------------------------------
+
+
+def test_arrows_end_where_forces_act_point_along_them_and_are_gone_where_there_is_none(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    sure = replace(run.contacts[2], force_std_n_xyz=np.array([0.1, 0.2, 0.3]), position_std_m=np.array([1e-3, 2e-3, 3e-3]))
+    run = replace(run, contacts=(*run.contacts[:2], sure))
+    export_glb(run, tmp_path / "forces.glb", bones=3, arrows=True)
+    file = (tmp_path / "forces.glb").read_bytes()
+    document, binary = parts_of(file)
+    nodes, animation = document["nodes"], document["animations"][0]
+    assert nodes[1]["children"][-1] == nodes.index(next(n for n in nodes if n["name"] == "forces"))
+
+    def keys(name: str, path: str) -> np.ndarray:
+        (channel,) = (
+            c for c in animation["channels"] if nodes[c["target"]["node"]]["name"] == name and c["target"]["path"] == path
+        )
+        accessor = document["accessors"][animation["samplers"][channel["sampler"]]["output"]]
+        begin = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        return np.frombuffer(binary, "<f4", 3 * (3 + (path == "rotation")), begin).reshape(3, -1)
+
+    largest = max(np.linalg.norm(one.force_n_xyz) for one in run.contacts)
+    size = np.linalg.norm(np.ptp(run.states.rest_nodes_m, axis=0))
+    for name, index, there in (("contact_1", 0, [0, 1, 1]), ("contact_2", 1, [0, 1, 0])):
+        one = run.contacts[index]
+        length = 0.42 * size * np.linalg.norm(one.force_n_xyz) / largest
+        np.testing.assert_allclose(keys(f"{name}_arrow", "translation")[1], one.position_m, atol=1e-6)
+        way = Rotation.from_quat(keys(f"{name}_arrow", "rotation")[1]).apply([0.0, 1.0, 0.0])
+        np.testing.assert_allclose(way * np.linalg.norm(one.force_n_xyz), one.force_n_xyz, atol=1e-5)
+        scale = keys(f"{name}_arrow", "scale")
+        np.testing.assert_allclose(scale[1], length, rtol=1e-5)
+        assert (scale.any(axis=1) == np.array(there, dtype=bool)).all()
+    np.testing.assert_allclose(keys("contact_1_place", "scale")[2], sure.position_std_m, rtol=1e-5)
+    way = sure.force_n_xyz / np.linalg.norm(sure.force_n_xyz)
+    across = np.linalg.norm(sure.force_std_n_xyz) ** 2 - np.linalg.norm(sure.force_std_n_xyz * way) ** 2
+    np.testing.assert_allclose(keys("contact_1_direction", "scale")[2, 0], 0.42 * size / largest * np.sqrt(across / 2), rtol=1e-5)
+    export_glb(run, tmp_path / "plain.glb", bones=3)
+    np.testing.assert_array_equal(read_glb(file).bones, read_glb((tmp_path / "plain.glb").read_bytes()).bones)
+    with pytest.raises(InputError, match="arrows are not written there"):
+        export_glb(run, tmp_path / "forces.usdz", arrows=True)
+
+
 # ---- Khronos' validator --------------------------------------------------------------------------------------------------------
 
 SCRIPT = """
@@ -174,7 +223,9 @@ def test_khronos_validator_finds_nothing(request: pytest.FixtureRequest, tmp_pat
     write_glb(
         tmp_path / "colours.glb", rest, triangles, skin, fit_poses(skin, surface), [0, 1, 2], color_rgb=0.5 * np.ones_like(rest)
     )
-    for name in ("many", "one", "colours"):
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    export_glb(run, tmp_path / "forces.glb", bones=3, arrows=True)
+    for name in ("many", "one", "colours", "forces"):
         command = [*build_hook().node_command(), str(script), str(tmp_path / f"{name}.glb")]
         said = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
         issues = json.loads(said)

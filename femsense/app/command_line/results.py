@@ -41,6 +41,7 @@ def export(
         str | None, typer.Option("--skin-unit", metavar="UNIT", help="Of its coordinates: m, cm or mm.", show_default=False)
     ] = None,
     vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
+    arrows: Annotated[bool, typer.Option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF, USDZ)."""
@@ -64,7 +65,7 @@ def export(
     from femsense.xr.run_contents import skin_for_run
 
     worn = None if skin is None else skin_for_run(run, skin, unit=skin_unit, budget=vertices)
-    report = export_glb(run, output, bones=bones, skin=worn)
+    report = export_glb(run, output, bones=bones, skin=worn, arrows=arrows)
     document = {name: getattr(report, name) for name in ("bones", "vertices", "frames", "rms_m", "max_m")}
     text = (
         f"{report.frames} frames, {report.bones} bones, {report.vertices} vertices; {1e3 * report.rms_m:.3f} mm rms from the "

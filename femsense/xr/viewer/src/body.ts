@@ -49,6 +49,7 @@ export class Body {
   private cloudSeen = false;
 
   constructor(readonly gltf: GLTF) {
+    gltf.scene.getObjectByName("forces")?.removeFromParent(); // arrows for viewers that have none of their own
     this.skins = skinned(gltf.scene);
     this.bones = this.skins.flatMap((skin) => skin.skeleton.bones);
     const rest = new Box3().setFromObject(gltf.scene);
