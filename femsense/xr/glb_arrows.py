@@ -14,11 +14,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.fem.mesh import vertex_normals
 from femsense.model.robot import Robot
 from femsense.sensing.run_arrays import identities_of, tracks_of
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.glb_reader import parts_of
-from femsense.xr.gltf import INDEX_DATA, VERTEX_DATA, Buffer, container, vertex_normals
+from femsense.xr.gltf import INDEX_DATA, VERTEX_DATA, Buffer, container
 
 LONGEST = 0.42
 """Of the body's size: the arrow of the largest force."""
