@@ -26,7 +26,8 @@ from femsense.loop.fit.discretisation_error import mesh_errors, with_mesh_errors
 from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.model.observation import Hypothesis, evaluate_scene
+from femsense.model.as_it_is import evaluate_robot
+from femsense.model.observation import Hypothesis
 
 
 def rms_mm(field: FloatArray) -> float:
@@ -76,16 +77,7 @@ def model(fit: JointFit, robot: Robot, data: Data) -> FloatArray:
     """Return the declared robot's markers in the rows of the first trial [m], robot frame, (k, 3)."""
     trial = data.train[0]
     poses, initial = trial.place(fit.fit.theta[: fit.own], data.robot.marker_points.mean(axis=0))
-    states = evaluate_scene(
-        Hypothesis(robot),
-        trial.scene,
-        np.zeros(0),
-        poses,
-        initial,
-        derivative=False,
-        vary_initial=False,
-        pivot=robot.marker_points.mean(axis=0),
-    ).states
+    states = evaluate_robot(robot, trial.scene, poses, initial).states
     return np.array([robot.markers.positions(states[int(f)].positions)[m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
 
 

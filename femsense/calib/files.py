@@ -12,7 +12,7 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
 from femsense.io.files import plain, write_json
-from femsense.io.result_folder import _number, _numbers, _of, _read_document, _table
+from femsense.io.result_folder import number_of, numbers_of, read_document, table_of, value_of
 
 CALIBRATION_FORMAT = "femsense-calibration-1"
 
@@ -71,20 +71,20 @@ def read_calibration(path: str | Path) -> Calibration:
     """
     file = Path(path).expanduser()
     file = file / "calibration.json" if file.is_dir() else file
-    document = _read_document(file, CALIBRATION_FORMAT)
-    std = _table(document, "std", file)
-    T = check_pose(_of(document, "T_robot_camera", file), f"{file}: T_robot_camera")
+    document = read_document(file, CALIBRATION_FORMAT)
+    std = table_of(document, "std", file)
+    T = check_pose(value_of(document, "T_robot_camera", file), f"{file}: T_robot_camera")
     cameras = document.get("cameras") or [{"name": "", "T_robot_camera": T}]
     try:
         return Calibration(
             T_robot_camera=freeze(T),
             poses=tuple(freeze(check_pose(camera["T_robot_camera"], f"{file}: cameras")) for camera in cameras),
             camera_names=tuple(str(camera["name"]) for camera in cameras),
-            cable_tension_n=_numbers(document, "cable_tension_n", file),
-            cable_displacement_m=_numbers(document, "cable_displacement_m", file),
-            rms_m=_number(document.get("rms_m")),
-            marker_rms_m=_numbers(document, "marker_rms_m", file),
-            history=tuple(_number(entry["rms_m"]) for entry in document.get("history", [])),
+            cable_tension_n=numbers_of(document, "cable_tension_n", file),
+            cable_displacement_m=numbers_of(document, "cable_displacement_m", file),
+            rms_m=number_of(document.get("rms_m")),
+            marker_rms_m=numbers_of(document, "marker_rms_m", file),
+            history=tuple(number_of(entry["rms_m"]) for entry in document.get("history", [])),
             pose_std=_matrix(std.get("T_robot_camera"), 4),
             pose_covariance=_matrix(document.get("pose_covariance"), 6),
             tension_std_n=dict(std.get("cable_tension_n", {})),
@@ -94,8 +94,8 @@ def read_calibration(path: str | Path) -> Calibration:
             status=str(document.get("status", "")),
             placements_m={name: [float(x) for x in point] for name, point in document.get("placements_m", {}).items()},
             frames=tuple(int(frame) for frame in document.get("frames", [])),
-            normal_rms_m=_number(document.get("normal_rms_m")),
-            noise_m=_number(document.get("noise_m")),
+            normal_rms_m=number_of(document.get("normal_rms_m")),
+            noise_m=number_of(document.get("noise_m")),
             joint_covariance=_matrix(document.get("joint_covariance"), 6 * len(cameras)),
             is_corrected=bool(document.get("corrected", False)),
         )
@@ -112,5 +112,5 @@ def read_calibration(path: str | Path) -> Calibration:
 def _matrix(rows: Any, size: int) -> FloatArray:
     """Return a square matrix, zero where it is not given."""
     return freeze(
-        np.zeros((size, size)) if rows is None else np.array([[_number(x) for x in row] for row in rows]).reshape(size, size)
+        np.zeros((size, size)) if rows is None else np.array([[number_of(x) for x in row] for row in rows]).reshape(size, size)
     )

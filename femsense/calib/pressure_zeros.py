@@ -9,7 +9,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.least_squares import FitResult
-from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
+from femsense.model.as_it_is import evaluate_robot
+from femsense.model.observation import Scene, SceneJet
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -92,17 +93,7 @@ def _step(robot: Robot, fitted: Fitted, scale: FloatArray) -> tuple[FloatArray, 
     columns = [jet.by_pose[:, :, moving].reshape(rows, len(moving)), jet.by_initial.reshape(rows, -1)]
     for j, name in enumerate(robot.body.chamber_names):
         near = with_initial_pressures(robot, {name: DIFFERENCE * float(scale[j])})
-        there = evaluate_scene(
-            Hypothesis(near),
-            scene,
-            np.zeros(0),
-            poses,
-            initial,
-            derivative=False,
-            vary_initial=False,
-            pivot=robot.marker_points.mean(axis=0),
-            starts=dict(jet.states),
-        )
+        there = evaluate_robot(near, scene, poses, initial, dict(jet.states))
         columns.append(((there.residual - jet.residual) / DIFFERENCE).reshape(rows, 1))
     J, c = np.hstack(columns), len(scale)
     unit = np.maximum(np.linalg.norm(J, axis=0), 1e-300)

@@ -11,7 +11,7 @@ from pydantic import Field
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.io.files import write_json
-from femsense.io.result_folder import _read_document
+from femsense.io.result_folder import read_document
 from femsense.io.tables import Schema, validated
 from femsense.model.marker_correction import Correction
 
@@ -49,7 +49,7 @@ def write_correction(correction: Correction, folder: Path) -> str:
 
 def read_correction(path: Path) -> Correction:
     """Read correction.json. Raises InputError."""
-    t = validated(CorrectionTable, _read_document(path, FORMAT), path)
+    t = validated(CorrectionTable, read_document(path, FORMAT), path)
     n, a, q, m = len(t.states), len(t.inputs), len(t.weights_m), len(t.markers)
     return Correction(
         kernel=t.kernel,

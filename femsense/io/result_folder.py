@@ -17,7 +17,7 @@ from femsense.io.files import PART_PREFIX, check_target, write_beside
 
 
 @contextmanager
-def _results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
+def results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
     """Yield an empty folder; what the block writes there moves into `folder` at its end, `marker` last.
 
     A new folder appears in one step. In one that is there, the old marker goes first, so that a folder with a marker is always
@@ -36,7 +36,8 @@ def _results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
             os.replace(file, root / file.name)
 
 
-def _check_folder(root: Path, not_beside: Sequence[str]) -> None:
+def check_folder(root: Path, not_beside: Sequence[str]) -> None:
+    """Raise InputError where results cannot be written into a folder, or would mix with a file named in `not_beside`."""
     foreign = next((name for name in not_beside if (root / name).is_file()), None)
     if foreign is not None:
         raise InputError(
@@ -51,7 +52,7 @@ def _check_folder(root: Path, not_beside: Sequence[str]) -> None:
     check_target(root, folder=True)
 
 
-def _read_document(file: Path, expected: str) -> dict[str, Any]:
+def read_document(file: Path, expected: str) -> dict[str, Any]:
     """Return a JSON object of a format. Raises InputError."""
     try:
         document = json.loads(file.read_text(encoding="utf-8-sig"))
@@ -66,24 +67,27 @@ def _read_document(file: Path, expected: str) -> dict[str, Any]:
     return checked
 
 
-def _of(document: Mapping[str, Any], key: str, file: Path) -> Any:
+def value_of(document: Mapping[str, Any], key: str, file: Path) -> Any:
+    """Return the value of a key of a document. Raises InputError."""
     if key not in document:
         raise InputError("a key is missing", where=file, found=", ".join(document), expected=key)
     return document[key]
 
 
-def _table(document: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
-    value = _of(document, key, file)
+def table_of(document: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
+    """Return the object of a key of a document. Raises InputError."""
+    value = value_of(document, key, file)
     if not isinstance(value, dict):
         raise InputError("not a table", where=f"{file}: {key}", found=repr(value)[:80], expected="an object")
     return value
 
 
-def _numbers(document: Mapping[str, Any], key: str, file: Path) -> dict[str, float]:
-    return {str(name): _number(value) for name, value in _table(document, key, file).items()}
+def numbers_of(document: Mapping[str, Any], key: str, file: Path) -> dict[str, float]:
+    """Return the numbers of an object of a document, by name. Raises InputError."""
+    return {str(name): number_of(value) for name, value in table_of(document, key, file).items()}
 
 
-def _number(value: Any) -> float:
+def number_of(value: Any) -> float:
     """Return a number of JSON, where null stands for one that is not finite."""
     return float("nan") if value is None else float(value)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from femsense.io.files import plain, write_json
 from femsense.io.provenance import recording_input, robot_input, versions
-from femsense.io.result_folder import _check_folder, _read_document, _results_folder
+from femsense.io.result_folder import check_folder, read_document, results_folder
 
 if TYPE_CHECKING:
     from femsense.loop.result.loop_result import LoopResult
@@ -42,7 +42,7 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     from femsense.io.robot_toml import save_robot
 
     check_loop_folder(folder)
-    with _results_folder(folder, "loop.json") as part:
+    with results_folder(folder, "loop.json") as part:
         declared = (loop.declared.document or {}).get("effects", [])
         handed_back = replace(loop.declared, correction=loop.robot.correction)
         save_robot(handed_back, part, effects=[*declared, *loop.entries])
@@ -54,10 +54,10 @@ def check_loop_folder(folder: str | Path) -> None:
     """Raise InputError where a loop cannot be written: in a recording, a run or a robot that no loop wrote, or at a file."""
     root = Path(folder).expanduser()
     own = (root / "loop.json").is_file()
-    _check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"))
+    check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"))
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:
     """Return the content of loop.json (or of the one in a folder). Raises InputError."""
     file = Path(path).expanduser()
-    return _read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)
+    return read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)

@@ -20,7 +20,7 @@ from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
 from femsense.io.files import json_text, write_beside, write_csv, write_json
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
-from femsense.io.result_folder import RUN_FILES, _check_folder, _read_document, _results_folder, _table
+from femsense.io.result_folder import RUN_FILES, check_folder, read_document, results_folder, table_of
 from femsense.io.tables import read_csv
 from femsense.sensing.types import SensingOptions
 
@@ -115,7 +115,7 @@ def write_run(
         InputError: see `check_run_folder`.
     """
     check_run_folder(folder)
-    with _results_folder(folder, "run.json") as part:
+    with results_folder(folder, "run.json") as part:
         if calibration is not None:
             write_calibration(calibration, part / "calibration.json")
         write_csv(
@@ -131,7 +131,7 @@ def write_run(
 
 def check_run_folder(folder: str | Path) -> None:
     """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where a file stands."""
-    _check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"))
+    check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"))
 
 
 def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
@@ -156,9 +156,9 @@ def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
             expected="a folder that femsense estimate wrote",
             hint="femsense estimate … -o RUN",
         )
-    document = _read_document(root / "run.json", RUN_FORMAT)
+    document = read_document(root / "run.json", RUN_FORMAT)
     known = robot or _robot_of_run(document, root)
-    recording = _table(_table(document, "inputs", root / "run.json"), "recording", root / "run.json").get("path")
+    recording = table_of(table_of(document, "inputs", root / "run.json"), "recording", root / "run.json").get("path")
     return Run(
         contacts=_read_contacts(root / "contacts.csv"),
         frames=_read_frames(root / "frames.csv"),
@@ -228,7 +228,7 @@ def _run_document(run: Run, inputs: Mapping[str, Any], seconds: float | None) ->
 def _robot_of_run(document: Mapping[str, Any], root: Path) -> Robot:
     from femsense.io.robot_toml import load_robot
 
-    path = _table(_table(document, "inputs", root / "run.json"), "robot", root / "run.json").get("path")
+    path = table_of(table_of(document, "inputs", root / "run.json"), "robot", root / "run.json").get("path")
     if path is None or not Path(path).is_dir():
         raise InputError(
             "the robot of this run is not there",

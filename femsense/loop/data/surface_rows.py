@@ -23,9 +23,10 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.meshing.surface_queries import nearest_on
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.contact_patch import body_surface, flat_nodes
-from femsense.model.observation import Hypothesis, Scene, evaluate_scene
+from femsense.model.observation import Scene
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.cloud import PointCloud
@@ -177,17 +178,7 @@ def states_of(
     starts: dict[int, Equilibrium] | None = None,
 ) -> dict[int, Equilibrium]:
     """Return the equilibrium of each frame of a scene. Raises DataError where there is none."""
-    return evaluate_scene(
-        Hypothesis(robot),
-        scene,
-        np.zeros(0),
-        poses,
-        initial,
-        derivative=False,
-        vary_initial=False,
-        pivot=robot.marker_points.mean(axis=0),
-        starts=starts,
-    ).states
+    return evaluate_robot(robot, scene, poses, initial, starts).states
 
 
 # Rows

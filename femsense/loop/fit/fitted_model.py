@@ -13,9 +13,10 @@ from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
 from femsense.model.effects.base import range_units
-from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
+from femsense.model.observation import Hypothesis, SceneJet
 from femsense.model.robot import Robot
 
 ROUGHLY = 3
@@ -195,20 +196,9 @@ def own_of(fitted: FittedModel) -> FloatArray:
 def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
     """Return what a fit makes of each held-out trial; a recording of its own gets its own pose from its first frames."""
     robot = fit.hypothesis.robot_at(fit.coordinates)
-    plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
     result: list[HeldOut] = []
     for trial, (poses, initial) in zip(data.held, held_poses_and_inputs(data, fit, noise)):
-        jet = evaluate_scene(
-            plain,
-            trial.scene,
-            np.zeros(0),
-            poses,
-            initial,
-            derivative=False,
-            vary_initial=False,
-            pivot=pivot,
-            starts=trial.starts_on(robot.body.mesh),
-        )
+        jet = evaluate_robot(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
         result.append(HeldOut(jet, list(poses)))
     return result
 

@@ -26,8 +26,8 @@ from femsense.loop.search.acceptance import at_edge
 from femsense.loop.search.input_offset import OFFSETS, moved_nuisance, offsets_are_evident
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import Thresholds
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import OF_BODY, Effect, Entry, Parameter
-from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.robot import Robot
 
 (MODULUS,) = OF_BODY
@@ -181,24 +181,14 @@ def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) ->
     """
     unknown = any(t.initial is not None for t in data.held)
     inputs = [initial for _, initial in held_poses_and_inputs(data, back.fit, noise)] if unknown else [None] * len(data.held)
-    gaps, pivot = list[FloatArray](), data.robot.marker_points.mean(axis=0)
+    gaps = list[FloatArray]()
     for trial, held, initial in zip(data.held, back.held, inputs):
         if trial.scene.crossings is not None:
             continue
         frames = trial.scene.frames
         some = frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).round().astype(int))]
         scene, starts = trial.scene.pick(some), dict(held.jet.states)
-        jet = evaluate_scene(
-            Hypothesis(robot),
-            scene,
-            np.zeros(0),
-            held.poses,
-            initial,
-            derivative=False,
-            vary_initial=False,
-            pivot=pivot,
-            starts=starts,
-        )
+        jet = evaluate_robot(robot, scene, held.poses, initial, starts)
         gaps.append(jet.residual - held.jet.residual[np.isin(trial.scene.frame, some)])
     return rms_of(gaps) if gaps else 0.0
 
