@@ -122,7 +122,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     near = foretold(previous, alone)
     scan = scan_of(sensor, k, near)
     clock.lap("scan")
-    scan, free = segmented(sensor, k, scan, alone, near, before)
+    scan, free = segmented(sensor, k, scan, alone, near, previous, before)
     clock.lap("rows")
     shapes = seen_objects(sensor, k, scan, free.state)
     touches = find_touches(sensor, shapes, free)

@@ -18,7 +18,7 @@ from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
-from femsense.sensing.places import object_touches, said_free
+from femsense.sensing.places import find_touches, object_touches, said_free
 from femsense.sensing.prepare import condensed_at
 from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
@@ -32,6 +32,11 @@ ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
 """Contacts a frame at most."""
+GIVEN_ROUNDS = 5
+"""How often robot and surroundings are separated at most where the places are given: a weight that moves a tip by a tenth of the body's
+diagonal took two to three."""
+SETTLED = 0.005
+"""They are separated where the number of the robot's points changes by less than this share of it."""
 ROUNDS = 2
 """How often a place is looked for again with the state that its force makes."""
 NEARBY = 0.03
@@ -61,7 +66,13 @@ def explain(
 
 
 def segmented(
-    sensor: Sensor, k: int, scan: Scan | None, alone: Equilibrium, near: Equilibrium, before: tuple[FloatArray, ...] | None
+    sensor: Sensor,
+    k: int,
+    scan: Scan | None,
+    alone: Equilibrium,
+    near: Equilibrium,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
 ) -> tuple[Scan | None, Fit]:
     """Return the scan with robot and surroundings apart, neighbouring points averaged, and the fit without forces to what is the robot's.
 
@@ -80,17 +91,37 @@ def segmented(
     free = no_forces(sensor, k, few, alone)
     if scan.segmented:
         return few, free
-    state = alone
-    touched = not said_free(sensor, k) and not len(sensor.places)
-    for _ in range(ROUNDS if touched else 0):  # what is taken for the robot at first still holds some of what touches it
-        fit = _with_hidden(sensor, k, few, free, free, before)
+    state, last = alone, scan
+    # what is taken for the robot at first still holds some of what touches it, or lacks what moved far
+    rounds = GIVEN_ROUNDS if len(sensor.places) else ROUNDS
+    for _ in range(0 if said_free(sensor, k) else rounds):
+        fit = _by_shape(sensor, k, few, free, previous, before)
         state = fit.state
         if not fit.touches:
             break
-        few = condensed_at(sensor, _parted(sensor, scan, state), state)
+        own = _parted(sensor, scan, state)
+        few = condensed_at(sensor, own, state)
         free = no_forces(sensor, k, few, alone, free)
+        if len(sensor.places) and abs(len(own.view) - len(last.view)) < SETTLED * len(own.view):
+            return few, free
+        last = own
     few = condensed_at(sensor, _parted(sensor, scan, state), state)
     return few, no_forces(sensor, k, few, alone, free)
+
+
+def _by_shape(
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit:
+    """Return what explains the shape: forces at the given places, else hidden ones."""
+    if not len(sensor.places):
+        return _with_hidden(sensor, k, scan, free, free, before)
+    touches = find_touches(sensor, [], free)
+    return _better(free, _try(sensor, k, scan, touches, free, _start(previous, touches), before))
 
 
 def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
