@@ -81,7 +81,9 @@ def femsense(*arguments: object) -> None:
     """Run a command; its output is shown where it fails."""
     done = subprocess.run([sys.executable, "-m", "femsense", *map(str, arguments)], capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"femsense {' '.join(map(str, arguments))}: exit {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+        raise SystemExit(
+            f"femsense {' '.join(map(str, arguments))}: exit {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        )
 
 
 def robot_of(folder: Path, element: str) -> Path:

@@ -78,12 +78,20 @@ def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
     return f" Less the likeliest share of the discretisation error, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
-def on_linear(data: Data, back: FittedModel) -> str:
-    """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
+def on_linear(data: Data, back: FittedModel, names: Sequence[str], noise_m: float) -> str:
+    """Return a sentence on what is named on a linear mesh and may stand for its error; nothing elsewhere, or where that is an effect itself.
+
+    A modulus alone counts where the discretisation error is beyond the noise: it is the first to stand for it.
+    """
     mesh = mesh_error_rms(data)
-    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not has_effects(back.fit.hypothesis.names):
+    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic:
         return ""
-    return f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which other effects may stand for: try {MESH.name} too."
+    if not has_effects(back.fit.hypothesis.names) and (not names or mesh <= noise_m):
+        return ""
+    return (
+        f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which what is named may stand for:"
+        f' declare mesh.element = "tet10" and ask again, or try {MESH.name} too.'
+    )
 
 
 def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:

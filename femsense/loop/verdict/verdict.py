@@ -87,7 +87,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         + in_words(pairs, names)
         + by_noise(data, measured)
         + by_mesh(data, search, back)
-        + on_linear(data, back)
+        + on_linear(data, back, names, measured.total)
         + evidence_for(data, found, [n for n in added if n not in sure])
         + surprise
         + _by_prediction(data, robot, back, noise),

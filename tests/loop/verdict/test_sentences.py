@@ -89,4 +89,6 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(linear: b
     back = replace(fitted, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=settled)))
     trials = [replace(t, mesh_error=np.full((len(t.scene.frame), 3, 1), 1e-3)) for t in data.train]
     data = replace(data, train=trials)
-    assert ("try discretisation" in sentences.on_linear(data, back)) == (linear and named)
+    assert ("try discretisation" in sentences.on_linear(data, back, [], 0.1e-3)) == (linear and named)
+    assert ("try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1e-3)) == linear
+    assert ("try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1)) == (linear and named)
