@@ -22,6 +22,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.parallel import one_blas_thread
 from femsense.io.checkpoint import Checkpoint
 from femsense.model.drive import has_history
+from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.judge import OK, behind_body, beside_markers, status_of, sure_forces, trusted
@@ -83,6 +84,7 @@ def estimate(
             "the effect `softening` is not used in sensing: frames after a larger load come out as if nothing had softened",
             stacklevel=2,
         )
+    warn_of_linear_elements(robot.body, where=robot.name)
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
     sense = sense_as_published if sensor.options.method == "paper" else sense_frame
     count = len(recording.time_s)

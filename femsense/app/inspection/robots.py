@@ -22,6 +22,7 @@ from femsense.io.robot_body import read_declared_mesh
 from femsense.io.robot_tables import RobotTable, robot_problems
 from femsense.io.robot_toml import load_robot
 from femsense.io.tables import read_toml
+from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.robot import Robot
 from femsense.model.tie_spacing import warn_of_tie_spacing
 
@@ -94,6 +95,7 @@ def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:
     mesh = {"file": document["mesh"]["file"], "unit": document["mesh"]["unit"]} | _mesh_report(body.mesh, 1e3)
     _warn_of_quality(mesh["radius_ratio_min"], document["mesh"]["file"])
     warn_of_tie_spacing(body)
+    warn_of_linear_elements(body, where=document["mesh"]["file"])
     return {
         "mesh": mesh,
         "material": document["material"],
