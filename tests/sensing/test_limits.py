@@ -120,6 +120,16 @@ def test_no_camera_sees_through_the_body(tmp_path):
     assert "behind the body" in through[1]
 
 
+def test_a_body_without_colour_that_a_given_force_moves_far_is_seen_whole(tmp_path):
+    """Seen from the free state alone, what the force moved most is taken for something else, and the force comes out too small."""
+    seen = touched(tmp_path, np.array([0.0, 0, -0.5]), ball=False)
+    colourless = replace(arm(), color_rgb=None)
+    run = estimate(colourless, seen, calibrate(colourless, seen), at=PLACE)
+    assert run.frames[3].status == "ok"
+    assert run.frames[3].matched > 0.95 * run.frames[2].matched
+    assert run.contacts[-1].force_n == pytest.approx(0.5, rel=0.05)
+
+
 @pytest.mark.parametrize("nudge", [[0.0008, 0.0, 0.0], [0.0, 0.0006, 0.0]])
 def test_a_camera_that_was_nudged_is_not_ok(tmp_path, nudge):
     """Pose and shared errors take up the whole shift, so that nothing is left: only their own size tells."""
