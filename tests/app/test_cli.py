@@ -294,8 +294,10 @@ def test_a_broken_robot_in_a_process_of_its_own(robot: Path) -> None:
 
 
 def test_inspect(run: Any, robot: Path, tmp_path: Path) -> None:
-    said = run("inspect", robot)
+    said = run("inspect", "arm")
     assert said.status == 0 and "a robot" in said.out and "nothing is wrong with it" in said.out
+    said = run("inspect", robot)
+    assert said.status == 0 and "linear tetrahedra make this body too stiff" in said.out and "nothing is wrong" not in said.out
     assert run("inspect", tmp_path).status == 2
 
 
