@@ -517,7 +517,7 @@ def print_commands(folder: Path) -> None:
     """Print what a user gets by commands alone: a modulus from the sag, then the weights untold."""
     robot = load_robot(folder / "robot_gravity")
     better = improve(robot, [load_recording(folder / "recordings" / "gravity_a")]).robot
-    print("| weight | said | force | status |\n|---|---|---|---|")
+    print("| weight | said | without what noise adds | force | its deviations | status |\n|---|---|---|---|---|---|")
     for name, weight in (("load52_a", 0.51012), ("load101_a", 1.00062)):
         recording = load_recording(folder / "recordings" / name)
         none = np.zeros((0, 3))
@@ -525,7 +525,9 @@ def print_commands(folder: Path) -> None:
         run = estimate(better, untold, calibrate(better, untold), at=[[0.1, 0.0, 0.015]])
         first = run.contacts[0]
         size = f"{first.force_n:.3f} ± {first.std_n:.3f} N"
-        print(f"| {weight:.3f} N | {size} | {np.round(first.force_n_xyz, 3).tolist()} | {run.frames[0].status} |", flush=True)
+        unbiased = float(np.sqrt(max(first.force_n**2 - float((first.force_std_n_xyz**2).sum()), 0.0)))
+        force, std = (np.round(v, 3).tolist() for v in (first.force_n_xyz, first.force_std_n_xyz))
+        print(f"| {weight:.3f} N | {size} | {unbiased:.3f} N | {force} | {std} | {run.frames[0].status} |", flush=True)
 
 
 def main() -> None:

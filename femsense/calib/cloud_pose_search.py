@@ -112,6 +112,17 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
     return best
 
 
+def settle_cloud_pose(views: Sequence[View], T_robot_camera: FloatArray) -> CloudPose:
+    """Return the pose to which closest points of all views lead from a start, and how it fits.
+
+    Arguments:
+        views: one a frame.
+        T_robot_camera: off by a tenth of the body's diagonal at most, shape (4, 4).
+    """
+    size = _size(views[0].surface)
+    return _settled([_Fine(view, size) for view in views], T_robot_camera, size)
+
+
 def difference(T: FloatArray, other: FloatArray, surface: Surface) -> tuple[float, float]:
     """Return by which angle [rad] two poses are turned, and how far apart they place the body's middle [m]."""
     D = T @ invert_pose(other)

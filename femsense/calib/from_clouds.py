@@ -14,7 +14,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
@@ -30,6 +30,10 @@ FRAMES = 12
 """More free frames than this are thinned out evenly."""
 STEPS = 6
 """Gauss–Newton steps at most; rays and weights are new in each."""
+DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1)
+"""Of a step, in units of what the best known direction is held by."""
+LOST = 0.01
+"""A step may lose this share of the points that lie on the body: rays at a silhouette come and go."""
 HUBER = 2.5
 """Whitened residuals beyond this count linearly."""
 CELLS = 12.0
@@ -59,6 +63,8 @@ class RaySums:
     """Sums of Jᵀr over cells of the surface, shape (g, p)."""
     rms: float
     """Root mean square of the residual [m]."""
+    explained: float = 0.0
+    """How many points lie on the body: 1 for one on it, 0 for one that is REACH off [1]."""
 
 
 def pose_pivot(robot: Robot) -> FloatArray:
@@ -95,22 +101,16 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     if not frames or not moving:
         return calibration
     noises = measured_noises(robot, recording, calibration)
-    pivot, poses = pose_pivot(robot), list(calibration.poses)
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    pivot, size = pose_pivot(robot), float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
     prior = _prior(calibration.joint_covariance, which)
     share = 1.0
+    held = np.zeros(len(robot.body.mesh.nodes), dtype=bool)
+    held[robot.body.clamped] = True
+    equations = _Equations(frames, noises, pivot, size, which, held)
     for _ in range(2):  # the second time with what the clouds are worth beside the markers
-        poses, gone = list(calibration.poses), np.zeros(len(which))
-        for _ in range(STEPS):
-            sums = _normal_equations(frames, poses, noises, pivot, size, which)
-            normal, right, scores, rms = sums.normal, sums.right, sums.cells, sums.rms
-            step = -np.linalg.solve(share * normal + prior, share * right + prior @ gone)
-            full = np.zeros(6 * len(poses))
-            full[which] = step
-            poses, gone = moved_poses(poses, full, pivot), gone + step
-            if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
-                break
+        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, share)
+        normal, right, scores, rms = sums.normal, sums.right, sums.cells, sums.rms
         if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
             return calibration
         worth = _worth(normal, scores, prior, gone - np.linalg.solve(normal, right))
@@ -163,20 +163,58 @@ def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: Flo
     return low / counted
 
 
-def _normal_equations(
-    frames: list[_Seen],
-    poses: list[FloatArray],
-    noises: tuple[CameraNoise, ...],
-    pivot: FloatArray,
-    size: float,
-    which: FloatArray,
-) -> RaySums:
-    def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
-        for seen in frames:
-            rows = ray_rows(seen.scan, seen.surface, poses, noises, reach=REACH * size)
-            yield rows, rows.by_pose(pivot, len(poses))[:, which]
+@dataclass(frozen=True, eq=False, slots=True)
+class _Equations:
+    """The rays of all frames."""
 
-    return ray_sums(seen_rows(), len(which), size)
+    frames: list[_Seen]
+    noises: tuple[CameraNoise, ...]
+    pivot: FloatArray
+    size: float
+    which: FloatArray
+    """Of all coordinates of poses, those that move, shape (p,)."""
+    held: BoolArray
+    """Nodes that are clamped, shape (n,): what holds them hides them, and lies where they should be or before."""
+
+    def at(self, poses: list[FloatArray]) -> RaySums:
+        """Return the normal equations at poses."""
+
+        def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
+            for seen in self.frames:
+                rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * self.size).off(self.held)
+                yield rows, rows.by_pose(self.pivot, len(poses))[:, self.which]
+
+        return ray_sums(seen_rows(), len(self.which), self.size)
+
+
+def _nearer(
+    equations: _Equations, poses: list[FloatArray], prior: FloatArray, share: float
+) -> tuple[list[FloatArray], FloatArray, RaySums]:
+    """Return the poses to which Gauss–Newton leads, how far they went, shape (p,), and the equations there.
+
+    A flat side that faces the camera hardly says where it lies in its plane, and a step may leave it. Steps are damped until no
+    more points than a few are lost (Levenberg 1944), those directions first that are known least.
+    """
+    gone, sums = np.zeros(len(prior)), equations.at(poses)
+    unit = np.tile([1.0 / equations.size**2] * 3 + [1.0] * 3, len(prior) // 6)
+    for _ in range(STEPS):
+        root = np.sqrt(unit)
+        top = share * float(np.linalg.norm(sums.normal * np.outer(root, root), 2))
+        for damping in DAMPINGS if sums.explained > 0.0 else ():
+            matrix = share * sums.normal + prior + np.diag(damping * top / unit)
+            step = -np.linalg.lstsq(matrix, share * sums.right + prior @ gone, rcond=None)[0]
+            full = np.zeros(6 * len(poses))
+            full[equations.which] = step
+            tried = moved_poses(poses, full, equations.pivot)
+            there = equations.at(tried)
+            if there.explained >= (1.0 - LOST) * sums.explained:
+                break
+        else:
+            break
+        poses, gone, sums = tried, gone + step, there
+        if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
+            break
+    return poses, gone, sums
 
 
 def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) -> RaySums:
@@ -187,7 +225,7 @@ def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) 
         p: number of parameters.
         size: diagonal of the body [m]; cells are a share of it.
     """
-    normal, right, squares, count = np.zeros((p, p)), np.zeros(p), 0.0, 0
+    normal, right, squares, count, explained = np.zeros((p, p)), np.zeros(p), 0.0, 0, 0.0
     cells: dict[tuple[int, ...], FloatArray] = {}
     for rows, derivative in frames:
         J = derivative / rows.std[:, None]
@@ -196,12 +234,15 @@ def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) 
         normal += J.T @ (weight[:, None] * J)
         right += J.T @ (weight * z)
         squares, count = squares + float((rows.residual**2).sum()), count + len(z)
+        explained += float(np.maximum(1.0 - (rows.residual / (REACH * size)) ** 2, 0.0).sum())
         cell, group = np.unique(np.floor(rows.points / (size / CELLS)).astype(np.int64), axis=0, return_inverse=True)
         part = np.zeros((len(cell), p))
         np.add.at(part, group.ravel(), J * (weight * z)[:, None])
         for key, value in zip(map(tuple, cell.tolist()), part):
             cells[key] = cells.get(key, np.zeros(p)) + value
-    return RaySums(normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))))
+    return RaySums(
+        normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))), explained
+    )
 
 
 def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:

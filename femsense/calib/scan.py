@@ -93,6 +93,11 @@ class RayRows:
     std: FloatArray
     """[m], shape (r,)."""
 
+    def off(self, nodes: BoolArray) -> RayRows:
+        """Return the rows on triangles that do not lie on given nodes alone, shape (n,)."""
+        kept = np.asarray(~nodes[self.hits.nodes].all(axis=1))
+        return RayRows(self.hits.pick(kept), self.points[kept], self.view[kept], self.residual[kept], self.std[kept])
+
     def operator(self, node_count: int) -> sp.csr_array:
         """Return what maps node displacements to the rows, shape (r, 3n)."""
         r = len(self.residual)

@@ -49,7 +49,7 @@ class Motion:
     error_m: float
     """Largest distance of a point from its target, along the directions that are wanted [m]."""
     status: str
-    """"reached"; "nearest": the limits allow no better; "stopped": no equilibrium, or steps ran out on the way;
+    """"reached"; "nearest": the limits allow no better, or no equilibrium was found further on; "stopped": steps ran out on the way;
     "converging": more steps come nearer (`Follower`)."""
     limits: tuple[str, ...]
     """The limits that stop it, in words, those that cost most first."""

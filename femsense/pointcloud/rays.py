@@ -34,6 +34,17 @@ class SurfaceHits:
         """Return where the rays meet the surface when its nodes are at `positions` (n, 3) [m], shape (r, 3)."""
         return np.asarray(np.einsum("ri,ric->rc", self.weights, positions[self.nodes]))
 
+    def pick(self, which: BoolArray) -> SurfaceHits:
+        """Return some of the hits, which (r,)."""
+        return SurfaceHits(
+            self.index[which],
+            self.nodes[which],
+            self.weights[which],
+            self.normal[which],
+            self.distance[which],
+            self.cosine[which],
+        )
+
 
 class Surface:
     """A triangulated surface that rays can be cast on and closest points be found of."""
@@ -63,7 +74,7 @@ class Surface:
         hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
         triangle, uv = answer["primitive_ids"].numpy()[hit], answer["primitive_uvs"].numpy()[hit].astype(np.float64)
         hits = self._hits(hit, triangle.astype(np.int64), uv, points, ray)
-        return _select(hits, (np.abs(hits.distance) <= reach) & (hits.cosine >= GRAZING))
+        return hits.pick((np.abs(hits.distance) <= reach) & (hits.cosine >= GRAZING))
 
     def near(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
         """Return how measured points lie to the closest faces that look at their camera; arguments as for `cast`."""
@@ -74,7 +85,7 @@ class Surface:
         hits = self._hits(np.arange(len(points)), triangle, uv, points, ray)
         gap = np.linalg.norm(points - hits.place(self.positions), axis=1)
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
-        return _select(hits, (gap <= reach) & looking)
+        return hits.pick((gap <= reach) & looking)
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
@@ -110,12 +121,6 @@ def together(first: SurfaceHits, second: SurfaceHits) -> SurfaceHits:
             freeze(np.concatenate([getattr(first, name), getattr(second, name)])[order], getattr(first, name).dtype)
             for name in ("index", "nodes", "weights", "normal", "distance", "cosine")
         )
-    )
-
-
-def _select(hits: SurfaceHits, which: BoolArray) -> SurfaceHits:
-    return SurfaceHits(
-        hits.index[which], hits.nodes[which], hits.weights[which], hits.normal[which], hits.distance[which], hits.cosine[which]
     )
 
 

@@ -128,6 +128,16 @@ def test_a_far_target_beside_the_way_of_the_tip_ends_in_few_equilibria() -> None
     assert motion.error_m == pytest.approx(0.0903, abs=1e-4)
 
 
+def test_where_equilibria_end_the_search_ends_with_the_nearest_and_says_so() -> None:
+    motion = fs.reach(bar(), {"tip": [0.05, 0.0, -0.2]})  # without limits the bar buckles before it comes nearer
+    assert motion.status == "nearest" and motion.limits[-1].startswith("no equilibrium further on (")
+    assert (
+        motion.iterations <= 42
+    )  # 48 where the step grows as if none had failed, "stopped" after 60 where it shrinks to nothing
+    assert motion.error_m == pytest.approx(0.2262, abs=5e-4)
+    assert motion.certificate.equilibrium_n < 1e-6
+
+
 def test_limits_of_length_are_kept() -> None:
     robot = bar()
     name = robot.body.cable_names[0]
