@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from femsense.calib.scan import Scan
@@ -11,7 +13,7 @@ from femsense.fem.compliance import tangent_at
 from femsense.fem.mesh import TetMesh
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess, sag_at
-from femsense.sensing.types import Fit, SensedFrame, Sensor
+from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
 OK = "ok"
 SURE = 16.3
@@ -22,6 +24,9 @@ UNSETTLED = 0.5
 BESIDE, NEAR = 5.0, 0.01
 """Markers that are off by more than so many times the residual of the calibration, and this share of the body's diagonal, are not on the body.
 On a soft beam whose touch was lost they were off by 9 to 60 times; in frames with the right forces by at most 1.7 times."""
+
+UNKNOWN = "an object may touch whose force is not known"
+"""What a frame is said to be whose other forces hold."""
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -115,6 +120,19 @@ def unspoken(fit: Fit, i: int) -> bool:
     return bool(value[i] < SURE <= value.max())
 
 
+def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
+    """Return "ok", or in words that an object touches whose force may be none: beside a sure one, or where no contact is reported.
+
+    Arguments:
+        fit: of the frame.
+        touching: where completed objects touch the body.
+    """
+    most = [float(np.linalg.norm(f)) + 2.0 * _std_along(fit, i) for i, f in enumerate(fit.forces) if unspoken(fit, i)]
+    if most:
+        return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
+    return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK
+
+
 def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
     return misfit(sensor.knowledge, fit.rows, _sag_of(sensor, fit))
@@ -153,8 +171,8 @@ def limit_of(sensor: Sensor, fit: Fit) -> float:
 
 
 def trusted(frame: SensedFrame) -> bool:
-    """Return whether a frame may be the start of the next one."""
-    return frame.report.status == OK
+    """Return whether a frame may be the start of the next one: also where the force of one object beside sure ones is not known."""
+    return frame.report.status == OK or frame.report.status.startswith(UNKNOWN)
 
 
 def _std_along(fit: Fit, i: int) -> float:

@@ -10,7 +10,7 @@ from helpers import block_mesh
 
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import ContactPatch
-from femsense.sensing.judge import chi_squared, least_stretch, unspoken
+from femsense.sensing.judge import chi_squared, least_stretch, objects_known, unspoken
 from femsense.sensing.types import Fit, Rows, Touch
 
 MESH = block_mesh((2, 1, 1))
@@ -38,3 +38,13 @@ def test_an_object_that_touches_beside_a_sure_force_stays_in_the_fit_unspoken():
     assert [unspoken(fit, i) for i in range(2)] == [False, True]
     assert not unspoken(fit_of([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]], ["cloud", "cloud"]), 1)  # none is sure
     assert not unspoken(fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.02]], ["cloud", "shape"]), 1)  # no object is seen there
+
+
+def test_a_frame_with_a_force_that_is_not_known_is_not_ok():
+    sure = fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], ["cloud", "cloud"])
+    assert objects_known(sure, sure.touches) == "ok"
+    said = objects_known(fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.02]], ["cloud", "cloud"]), sure.touches)
+    assert said == "an object may touch whose force is not known, up to 0.04 N, beside those that are reported"
+    none = fit_of([], [])
+    assert objects_known(none, ()) == "ok"
+    assert "not known: too small" in objects_known(none, sure.touches)
