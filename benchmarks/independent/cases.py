@@ -70,7 +70,7 @@ CASES = (
     Case("slab-rod", "slab", (Touch("rod"),), "displacement", "tof", 0.3, declared_noise=True),
     Case("post-two", "post", (Touch(scale=0.6), Touch(first=4)), "displacement", "stereo", 0.3),
     Case("post-plate", "post", (Touch("plate", scale=1.4),), "tension", "stereo", 0.4, images=True, colors=False),
-    Case("bar-calm", "bar", (Touch(),), calm=200),
-    Case("arm-calm", "arm", (Touch("rod"),), "displacement", "tof", 0.5, images=True, calm=200),
-    Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=200),
+    Case("bar-calm", "bar", (Touch(),), calm=120),
+    Case("arm-calm", "arm", (Touch("rod"),), "displacement", "tof", 0.5, images=True, calm=120),
+    Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=120),
 )
