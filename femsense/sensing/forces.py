@@ -61,8 +61,10 @@ def fit_forces(
     """
     frame = _Frame(sensor, k, scan, before)
     here, linear = frame.best_start(touches, free, start)
-    for firm in (False, True) if here.rows.of_clouds else (False,):
-        here, linear, step, converged = frame.settle(here, linear, firm)
+    here, linear, step, converged = frame.settle(here, linear, firm=False)
+    if here.rows.of_clouds:
+        here, linear, step, again = frame.settle(here, linear, firm=True)
+        converged = converged or again
     return frame.fit_of(here, linear, step, converged)
 
 
