@@ -125,9 +125,10 @@ def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
 
     Arguments:
         fit: of the frame.
-        touching: where completed objects touch the body.
+        touching: those of its contacts, and of the places where completed objects touch the body, where nothing seems to touch in free frames.
     """
-    most = [float(np.linalg.norm(f)) + 2.0 * _std_along(fit, i) for i, f in enumerate(fit.forces) if unspoken(fit, i)]
+    silent = [i for i, touch in enumerate(fit.touches) if any(touch is one for one in touching) and unspoken(fit, i)]
+    most = [float(np.linalg.norm(fit.forces[i])) + 2.0 * _std_along(fit, i) for i in silent]
     if most:
         return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
     return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK

@@ -27,7 +27,7 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
 from femsense.sensing.paper import sense_as_published
-from femsense.sensing.places import find_touches, near_places, object_touches, seen_objects
+from femsense.sensing.places import away_from_scenery, find_touches, near_places, object_touches, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, segmented
 from femsense.sensing.states import foretold, free_state
@@ -139,7 +139,8 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     if status == OK and fit.rows.of_clouds:
         status = beside_markers(sensor, k, fit)
     if status == OK and not len(sensor.places):
-        status = objects_known(fit, object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state))
+        found = object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
+        status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *found]))
     report = FrameReport(
         number,
         stamp,

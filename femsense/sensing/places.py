@@ -51,8 +51,11 @@ def said_free(sensor: Sensor, k: int) -> bool:
 
 def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> list[Shape]:
     """Return what is seen near the body in frame k, completed; nothing where the places are given or nothing is said to touch."""
-    if scan is None or len(sensor.places) or said_free(sensor, k):
-        return []
+    return [] if scan is None or len(sensor.places) or said_free(sensor, k) else objects_near(sensor, scan, state)
+
+
+def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
+    """Return what a scan shows near the body in a state, completed."""
     poses = sensor.calibration.poses
     points = scan.surroundings(poses)
     if len(points) < 3:
@@ -109,6 +112,11 @@ def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> l
     """Return where completed objects touch a state, the nearest part of each."""
     found = [_touch(sensor, shape, state) for shape in shapes]
     return [touch for touch in found if touch is not None]
+
+
+def away_from_scenery(sensor: Sensor, touches: Sequence[Touch]) -> list[Touch]:
+    """Return the touches that are not where something seems to touch in a free frame too: a holder, the table."""
+    return [t for t in touches if not any(np.linalg.norm(t.place - place) < ZONE * sensor.size for place in sensor.scenery)]
 
 
 def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:

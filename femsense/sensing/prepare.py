@@ -28,7 +28,7 @@ from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
-from femsense.sensing.places import check_places, near_places
+from femsense.sensing.places import check_places, near_places, object_touches, objects_near
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
 MODULUS_STD = 0.01
@@ -86,6 +86,7 @@ def make_sensor(
         Answers(),
         correction_std,
     )
+    sensor = replace(sensor, scenery=_scenery(sensor))
     learned = learn(knowledge, *_free_rows(sensor))
     if not pulls_are_modelled:
         return replace(sensor, knowledge=learned)
@@ -187,6 +188,21 @@ def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
         return [rows_at(sensor, k, None, state)]
     except FemsenseError:
         return []
+
+
+def _scenery(sensor: Sensor) -> FloatArray:
+    """Return where something seems to touch in the first free frame with a cloud, on the body at rest [m], shape (s, 3)."""
+    for k, state in free_path(sensor.driven, free_clouds(sensor.recording)[:1]):
+        try:
+            scan = scan_of(sensor, k, state)
+            if scan is not None and not scan.segmented:
+                shape = Surface(state.positions, sensor.surface.triangles)
+                scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+            shapes = [] if scan is None else objects_near(sensor, scan, state)
+        except FemsenseError:
+            continue
+        return np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
+    return np.zeros((0, 3))
 
 
 def _free_rows(sensor: Sensor) -> tuple[list[tuple[Rows, FloatArray]], list[tuple[Rows, FloatArray]]]:

@@ -373,3 +373,5 @@ class Sensor:
     """How the body answers to forces at the candidates, kept from frame to frame."""
     correction_std: FloatArray
     """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""
+    scenery: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""

@@ -20,6 +20,7 @@ from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import no_forces
 from femsense.sensing.judge import behind_body, exceeding, status_of
 from femsense.sensing.pipeline import estimate
+from femsense.sensing.places import away_from_scenery, object_touches, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import evidence
 from femsense.sensing.states import free_state
@@ -163,6 +164,21 @@ def test_contacts_keep_their_track_and_know_how_well_they_are_placed(tmp_path):
     assert [c.track for c in run.contacts] == [0, 0]
     assert all(np.linalg.norm(c.position_std_m) > 1e-4 for c in run.contacts)
     assert not any(estimate(arm(), held, calibrate(arm(), seen), options=PAPER).contacts[0].position_std_m)
+
+
+def test_what_touches_in_a_free_frame_is_scenery(tmp_path):
+    seen = touched(tmp_path, np.zeros(3), ball=True)
+    free = replace(
+        seen, cloud_files=(*seen.cloud_files[:2], *2 * (seen.cloud_files[3],)), free=np.array([False, False, True, False])
+    )
+    sensor = make_sensor(arm(), free, calibrate(arm(), seen))
+    assert np.linalg.norm(sensor.scenery - PLACE, axis=1).max() < 0.006
+    state = free_state(sensor, 3, None, None)
+    scan = scan_of(sensor, 3, state)
+    touches = object_touches(sensor, seen_objects(sensor, 3, scan, state), state)
+    assert len(touches) == 1
+    assert not away_from_scenery(sensor, touches)
+    assert away_from_scenery(replace(sensor, scenery=np.zeros((0, 3))), touches) == touches
 
 
 def test_an_object_that_is_gone_touches_no_more(tmp_path):
