@@ -37,7 +37,7 @@ def fit_with(law: str, force_n: float) -> tuple[Sensor, Fit, Equilibrium]:
     """Return a sensor that sees the heights of the top, with a fit of so much force and the state without it."""
     body = pad(law)
     touch, state = pressed(body, force_n)
-    rows = SimpleNamespace(functional=lambda u: u[:, TOP, 2].T, std=np.full(len(TOP), 1e-4))
+    rows = SimpleNamespace(functional=lambda u: u[:, TOP, 2].T, std=np.full(len(TOP), 1e-4), weight=np.ones(len(TOP)))
     forces = np.array([[0.0, 0.0, -force_n]])
     fit = Fit((touch,), state, forces, np.zeros((3, 3)), np.zeros((1, 3, 3)), cast(Rows, rows), 1.0)
     return cast(Sensor, SimpleNamespace(robot=SimpleNamespace(body=body))), fit, solve_equilibrium(body)
