@@ -52,6 +52,7 @@ def test_gravity_of_a_sweep(robot: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "texts"),
     [
+        ({"camera": None}, ["script: either a table [camera]", "found:    format, "]),
         ({"sweeps__0__lable": "x"}, ["script: sweeps[0].lable", "unknown key", "did you mean 'label'"]),
         ({"sweeps__1__label": "a"}, ["script: sweeps[1].label", "stands twice", "'a'"]),
         ({"contacts__0__sweep": "bb"}, ["script: contacts[0].sweep", "no such sweep", "did you mean 'b'"]),
