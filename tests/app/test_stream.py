@@ -105,18 +105,18 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     with stream_sensors("mqtt://me:secret@127.0.0.1:1/arm", model, StreamOptions(page=page)) as live:
-        assert within(3.0, lambda: "no connection" in live.trouble)
         assert live.trouble == "no readings of mqtt://127.0.0.1:1/arm (no connection, no answer), waiting"
     with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=page)) as live:
         assert live.trouble == f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting"
 
         def send() -> None:
+            within(20.0, lambda: len(said) == 1)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.sendto(b"0.5", ("127.0.0.1", port))
-            within(3.0, lambda: len(said) == 2)
+            within(20.0, lambda: len(said) == 2)
             live.stop.set()
 
-        Timer(3.7, send).start()
+        Timer(0.1, send).start()
         live.wait(said.append)
     assert said == [f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting", "readings come"]
 
