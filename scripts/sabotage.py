@@ -32,7 +32,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = ("femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml")
+PARTS = ("docs", "femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml")
 MOST_S = 600.0
 """Tests that take longer than this [s] have noticed: what is broken does not end."""
 
