@@ -202,21 +202,15 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, 
     """Write the recording of a script; return its folder. A run that was stopped goes on where it stopped.
 
     Raises:
-        InputError: where the folder holds anything but a recording, which would be replaced. FemsenseError: as `simulate`.
+        InputError: where the folder holds anything but a simulated recording. FemsenseError: as `simulate`.
     """
     from femsense.io.provenance import robot_input
     from femsense.rig.script import read_script
     from femsense.rig.simulate import simulate
+    from femsense.rig.truth_files import check_place
 
     target = Path(folder).expanduser()
-    inside = {path.name for path in target.iterdir()} if target.is_dir() else {"a file"} if target.exists() else set()
-    if inside - {UNFINISHED} and "recording.toml" not in inside:
-        raise InputError(
-            "something else than a recording stands there, which would be replaced",
-            where=target,
-            expected="a new folder",
-            hint="another -o",
-        )
+    check_place(target)
     body, table = load_robot(robot), read_script(script)
     meshes = [Path(script).parent / item.mesh for item in table.objects if item.mesh is not None]
     inputs = {

@@ -75,6 +75,24 @@ def check_target(path: str | Path, *, folder: bool) -> None:
         _check_kind(final, folder=folder)
 
 
+def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
+    """Refuse to replace a folder that holds more than what `own` matches, as paths below it; `what` names that.
+
+    Unfinished files of femsense do not count; links do. Raises InputError.
+    """
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    foreign = sorted(name for name in names if PART_PREFIX not in name and not own.fullmatch(name))
+    if foreign:
+        more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
+        raise InputError(
+            "files stand there that would be deleted",
+            where=folder,
+            found=", ".join(foreign[:3]) + more,
+            expected=f"a new folder, or {what} and nothing beside",
+            hint="another -o",
+        )
+
+
 def writes_through(path: str | Path) -> bool:
     """Return whether a path is a device, a pipe or an open stream, which takes bytes and is not to be replaced by a file."""
     if str(Path(path).absolute()).startswith(("/dev/", "/proc/")):

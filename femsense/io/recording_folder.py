@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
-from femsense.io.files import check_target, write_beside, write_toml
+from femsense.io.files import check_own, check_target, followed, write_beside, write_toml
 from femsense.io.recording_tables import (
     read_frames,
     read_loads,
@@ -39,6 +40,12 @@ from femsense.io.tables import read_toml, validated
 from femsense.model.camera import Camera
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import About, Tool, Views
+
+OWN_FILES = re.compile(
+    rf"recording\.toml|(frames|markers|rest|loads|sensors)\.csv|tool-[^/]+|{re.escape(UNFINISHED)}"
+    r"|(clouds|depth|color)/([^/]+/)?\d{6,}\.\w+|truth/(truth\.json|(contacts|markers)\.csv|states\.npz)"
+)
+"""Names of the files that `save_recording` and the virtual rig write: only these are replaced."""
 
 # Loading
 
@@ -133,7 +140,7 @@ def _check_depth(clouds: Any, cameras: Sequence[Camera | None], views: Sequence[
 
 
 def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[Path], None] | None = None) -> Path:
-    """Write a recording folder; what stood there before is replaced as a whole, and only when all is written.
+    """Write a recording folder; a recording that stood there is replaced as a whole, and only when all is written.
 
     Arguments:
         recording: the recording; its cloud, depth and colour files are copied.
@@ -142,17 +149,13 @@ def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[
 
     Returns:
         the folder.
+
+    Raises:
+        InputError: a place that cannot be written, or files there that no recording has: an import is none of them.
     """
     final = Path(folder)
     check_target(final, folder=True)
-    inside = {path.name for path in final.iterdir()} - {UNFINISHED} if final.is_dir() else set()
-    if inside and "recording.toml" not in inside:
-        raise InputError(
-            "something else than a recording stands there, which would be replaced",
-            where=final,
-            expected="a new folder, or a recording",
-            hint="another -o",
-        )
+    check_own(followed(final), OWN_FILES, "a recording that femsense wrote")
     with write_beside(final) as part:
         part.mkdir()
         write_toml(part / "recording.toml", recording_document(recording))

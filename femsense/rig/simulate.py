@@ -24,7 +24,7 @@ from femsense.rig.script import ScriptTable, check_script, read_script
 from femsense.rig.sensors import sensor_readings, write_sensors
 from femsense.rig.true_path import Course, true_course
 from femsense.rig.truth import true_robot
-from femsense.rig.truth_files import write_truth
+from femsense.rig.truth_files import check_place, write_truth
 
 Progress = Callable[[int, int], None]
 Keep = tuple[str | Path, Mapping[str, Any]]
@@ -47,7 +47,7 @@ def simulate(
     Arguments:
         robot: as the estimator knows it; the truth gets the script's mesh, law and effects.
         script: a script, its plain tables, or the path of a TOML file.
-        out_folder: the recording; what stood there is replaced as a whole, and only when all is written.
+        out_folder: the recording; a simulated one that stood there is replaced, and only when all is written.
         progress: called with (frames done, frames in all).
         keep: a file that holds the frames that are done, so that a run that is stopped goes on there with the same result,
             and what it is made
@@ -57,8 +57,10 @@ def simulate(
         the folder.
 
     Raises:
-        InputError: where the script does not fit. DataError: where no frame has an equilibrium.
+        InputError: where the script does not fit, or other files stand in `out_folder`. DataError: where no frame has an
+            equilibrium.
     """
+    check_place(out_folder)
     where = Path(script) if isinstance(script, str | Path) else Path("script")
     with Checkpoint(keep) as checkpoint:
         experiment = run_experiment(robot, _script(script), where, progress=progress, checkpoint=checkpoint)
@@ -111,7 +113,8 @@ def run_experiment(
 
 
 def write_experiment(experiment: Experiment, out_folder: str | Path) -> Path:
-    """Write the recording of an experiment and its truth, and return the folder."""
+    """Write the recording of an experiment and its truth, and return the folder. Raises InputError: as `check_place`."""
+    check_place(out_folder)
 
     def fill(folder: Path) -> None:
         _write_clouds(experiment, folder)

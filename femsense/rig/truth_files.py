@@ -7,8 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from femsense.core.errors import InputError
 from femsense.fem.mesh import embed_points, to_linear
-from femsense.io.files import write_csv, write_json
+from femsense.io.checkpoint import UNFINISHED
+from femsense.io.files import check_own, check_target, followed, write_csv, write_json
+from femsense.io.recording_folder import OWN_FILES
+from femsense.io.result_folder import read_document
 from femsense.rig.experiment import DIGITS, Experiment
 from femsense.rig.recorded import chosen_markers
 
@@ -17,6 +21,26 @@ CONTACT_COLUMNS = (
     *("frame", "time_s", "contact", "x_m", "y_m", "z_m", "nx", "ny", "nz", "fx_n", "fy_n", "fz_n", "force_n"),
     *("rest_x_m", "rest_y_m", "rest_z_m", "radius_m", "object"),
 )
+
+
+def check_place(folder: str | Path) -> None:
+    """Refuse a place for a simulated recording unless it is new or holds what the rig wrote. Raises InputError."""
+    check_target(folder, folder=True)
+    final = followed(folder)
+    if not final.is_dir() or not {path.name for path in final.iterdir()} - {UNFINISHED}:
+        return
+    what = "a recording of femsense simulate"
+    check_own(final, OWN_FILES, what)
+    try:
+        read_document(final / "truth" / "truth.json", TRUTH_FORMAT)
+    except InputError:
+        raise InputError(
+            "the recording there is no simulated one and would be deleted",
+            where=final,
+            found="no truth/truth.json of the virtual rig",
+            expected=f"a new folder, or {what}",
+            hint="another -o",
+        ) from None
 
 
 def write_truth(experiment: Experiment, folder: Path) -> None:

@@ -363,6 +363,16 @@ def test_saving_over_its_own_folder(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
 
 
+def test_saving_deletes_no_foreign_file(tmp_path: Path) -> None:
+    r = load_recording(write_small_recording(tmp_path / "a"))
+    for name in ("import.json", "notes.txt"):
+        (tmp_path / "a" / name).write_text("mine")
+        with pytest.raises(InputError, match=rf"would be deleted\n  found:    {name}"):
+            save_recording(r, tmp_path / "a")
+        assert (tmp_path / "a" / name).read_text() == "mine"
+        (tmp_path / "a" / name).unlink()
+
+
 def test_filling_writes_further_files_and_a_failure_leaves_nothing(tmp_path: Path) -> None:
     r = load_recording(write_small_recording(tmp_path / "a"))
     save_recording(r, tmp_path / "b", fill=lambda folder: write_ply(folder / "clouds" / "000004.ply", np.eye(3)))
