@@ -61,7 +61,6 @@ SEARCH = (
     ),
     Switch("sure", {"sure": INF}),
     Switch("held_chance", {"held_chance": 0.0}),
-    Switch("predicts", {"predicts": 0.0}),
     Switch("swap", {"swap": INF}),
     Switch("places", {}, {"starts": 1, "rounds": 0}),
     Switch("apart", {"apart": INF}),

@@ -43,9 +43,6 @@ class Thresholds:
     explains: float = 1.25
     """A model that leaves less than this mean square, in units of the noise, explains the data: others need not be fitted to their ends."""
 
-    predicts: float = 1.0
-    """Where evidence is close, so much of what left-out sweeps surely gain counts as dBIC; 0: nothing."""
-
     # --- places, swaps and ties --------------------------------------------------------------------------------------------------
     as_good_places: float = 0.05
     """Seeds whose gain is less by this share are as good."""
@@ -53,14 +50,11 @@ class Thresholds:
     """Two places count as one where this share of what an effect does in one can be had in the other …"""
     same_step: float = 0.1
     """… with parameters that differ by no more than this share."""
-    polished: float = 2.0
-    """Decrease of χ² that each further parameter of a place or a time must bring."""
     beside_body: float = 0.01
     """A place lies on the body if it is no farther outside than this share of the body's reach."""
-    near_as_good: float = 0.75
-    """An alternative to an effect had this share of its evidence at least when that was named."""
     swap: float = 2.0
-    """dBIC by which an alternative must be better to take the place of an effect or of the input offsets; inf: none does."""
+    """dBIC by which an alternative must be better to take the place of an effect or of the input offsets, and decrease of χ² for which a place or a time is
+    moved, for each of its numbers; inf: nothing is swapped or moved."""
 
     # --- noise and discretisation ------------------------------------------------------------------------------------------------
     apart: float = 3.0

@@ -13,21 +13,15 @@ from femsense.core.errors import FemsenseError
 from femsense.core.parallel import each
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, numbers_of
-from femsense.loop.design.candidate_experiments import Element, candidate_experiments, setup_for
+from femsense.loop.design.candidate_experiments import MOST_EACH, Element, candidate_experiments, setup_for
 from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
 from femsense.loop.design.identifiability import Identifiability, Judge, Row
-from femsense.loop.design.planner import Proposal, element_block
+from femsense.loop.design.planner import FRAMES, Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.drive import has_history
 from femsense.model.effects import OF_INPUTS
 from femsense.model.robot import Robot
-
-MOST_WORK, MOST_FRAMES = 30_000, 40
-"""Tetrahedra × frames, and frames, that items may cost as advice after a loop; the recordings may cost twice that. A few seconds."""
-MOST_LOOKED_AT = 6
-"""Frames of each recording that are looked at then."""
-
 
 # Tables
 
@@ -144,7 +138,7 @@ def next_element(
     tets = len(robot.body.mesh.tets)
     past = has_history(robot) or any(form.path_dependent for form in data.forms if form.name in names)
     cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
-    if not names or cost > 2 * min(MOST_WORK // tets, MOST_FRAMES):
+    if not names or cost > 2 * _most_frames(data, tets):
         return []
     try:
         zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
@@ -158,7 +152,7 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms, decides=data.thresholds), min(MOST_WORK // tets, MOST_FRAMES)
+    judge, left = Judge(forms, decides=data.thresholds), _most_frames(data, tets)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"tell {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
     chosen = []
@@ -185,6 +179,11 @@ def next_element(
     return [item for _, item in sorted(found, key=lambda f: -f[0])]
 
 
+def _most_frames(data: Data, tets: int) -> int:
+    """Return how many frames items may cost as advice after a loop, a few seconds' worth; the recordings may cost twice that."""
+    return min(3 * data.effort.work // (2 * tets), FRAMES)
+
+
 def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
     kinds = [e.key.split(":")[0] for e in elements]
     return [e for _, _, e in sorted(((kinds[:i].count(kinds[i]), i, e) for i, e in enumerate(elements)), key=lambda t: t[:2])]
@@ -192,7 +191,7 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
 
 def _representative(trial: Trial) -> Trial:
     frames = trial.scene.frames
-    every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
+    every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_EACH, len(frames))).round().astype(int))
     return replace(trial.part(frames[every]), together=False)  # it goes by its number with the markers of its recording
 
 

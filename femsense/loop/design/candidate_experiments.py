@@ -39,7 +39,8 @@ STEP_S = 1.0
 SLOW_S = 10.0
 HOLD_S = 15.0
 """Time from frame to frame [s]: usual, slow, and while holding."""
-MOST_PAIRS = 6
+MOST_EACH = 6
+"""Pairs of cables, seeds of an effect and frames of a recording that are looked at, the most spread ones first."""
 FAR = 1.6
 """The second camera stands so many times as far away."""
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -235,7 +236,7 @@ def _leads(pulls: Sequence[Pull]) -> list[Pull]:
 def _pairs(pulls: Sequence[Pull]) -> list[tuple[Pull, Pull]]:
     """Return pairs, opposite ones first, each pull in turn."""
     every = sorted(combinations(pulls, 2), key=lambda ab: _cosine(*ab))
-    return every[:MOST_PAIRS]
+    return every[:MOST_EACH]
 
 
 def _cosine(a: Pull, b: Pull) -> float:

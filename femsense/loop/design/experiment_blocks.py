@@ -14,6 +14,7 @@ from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.least_squares import FitResult
 from femsense.core.pose import rotation_from_vector
 from femsense.loop.data.trial import Trial
+from femsense.loop.design.candidate_experiments import MOST_EACH
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.search.effect_fields import effect_fields
 from femsense.model.effects import EFFECTS, Effect, Entry, Parameter
@@ -23,10 +24,6 @@ from femsense.model.robot import Robot
 from femsense.rig.camera import measured_points, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import SceneTable
-
-MOST_SEEDS = 6
-"""Places and times of one effect that are tried; the most spread ones come first."""
-
 
 # Forms
 
@@ -65,7 +62,7 @@ def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[
     result: list[Form] = []
     at = 0
     for effect, label in _kinds(robot):
-        seeds = effect.seeds(robot)[:MOST_SEEDS]
+        seeds = effect.seeds(robot)[:MOST_EACH]
         for seed in seeds if names is None or effect.name in names else []:
             parameters = effect.parameters(robot, control)
             if not parameters and not effect.discrete:

@@ -36,8 +36,6 @@ BRINGS = 0.8
 """An experiment is proposed for a parameter whose standard deviation falls below this share."""
 AT_REST, TOGETHER = 0.02, 0.25
 """Inputs below the first share of their ranges are at rest; two above the second pull together."""
-MOST_WORK = 40_000
-"""Tetrahedra × states beyond which nothing is predicted."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,7 +98,9 @@ def _gains(data: Data, fitted: FittedModel, noise: Noise, steps: Sequence[Step])
     """Return for each step by which share the standard deviation falls that falls most, and that in words."""
     nothing = [(1.0, "")] * len(steps)
     hypothesis = fitted.fit.hypothesis
-    if len(hypothesis.robot.body.mesh.tets) * sum(len(t.scene.frames) for t in data.train) > MOST_WORK:
+    if (
+        len(hypothesis.robot.body.mesh.tets) * sum(len(t.scene.frames) for t in data.train) > 2 * data.effort.work
+    ):  # nothing is predicted then
         return nothing
     try:
         J, open_model = _with_weight(data, fitted, noise)

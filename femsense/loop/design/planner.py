@@ -35,10 +35,9 @@ from femsense.rig.script import ScriptTable, check_script
 NOISE_M = 2e-4
 """Standard deviation of each coordinate of a marker, if nothing else is known: a depth camera at half a metre [m]."""
 FRAMES = 60
+"""Of a proposal at most; of a recording that exists so many are looked at: more are thinned out evenly and count for those between them."""
 WORTH = 0.05
 """An item must lower the confusion by this to be added."""
-MOST_GIVEN = 60
-"""Frames of a recording that exists that are looked at; more are thinned out evenly and count for those between them."""
 
 Progress = Callable[[int, int], None]
 
@@ -264,7 +263,7 @@ def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = Fals
 def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: float) -> Block:
     """Return the block of a recording that exists, calibrated."""
     frames = marked_frames(recording)
-    thin = int(np.ceil(len(frames) / MOST_GIVEN))
+    thin = int(np.ceil(len(frames) / FRAMES))
     calibration = calibrate(robot, recording, frames=frames[::thin].tolist())
     scene = make_scene(robot, recording, frames[::thin])
     initial = None

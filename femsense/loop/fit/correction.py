@@ -28,8 +28,6 @@ RATIOS = 1.0, 3.0, 10.0, 30.0, 100.0, 300.0
 LIKELIER = 3.0
 """A correction must be likelier by this log-likelihood than none, since its length and ratio are chosen, and one of all inputs together than one of each by
 itself, which carries over to inputs that were not pulled together."""
-LEAST_STATES = 6
-"""Fewer states tell no function of the inputs."""
 
 
 def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
@@ -37,7 +35,7 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
     there are too few states."""
     rows = _rows_of(data, fitted)
     states, number = np.unique(np.round(rows.inputs, 9), axis=0, return_inverse=True)
-    if len(states) < LEAST_STATES:
+    if len(states) <= data.thresholds.states:
         return None
     number = np.asarray(number).reshape(-1)
     plain = _Model(rows, np.zeros((len(number), 0)))

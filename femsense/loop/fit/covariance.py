@@ -19,7 +19,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.least_squares import covariance_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.cross_validation import half_inverse, sweep_rows
+from femsense.loop.fit.cross_validation import LEAST_SWEEPS, half_inverse, sweep_rows
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
@@ -27,9 +27,6 @@ from femsense.model.effects.base import KnownLength, known_length
 
 RINGS, SPOKES = 160, 48
 """Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
-
-LEAST_SWEEPS = 3
-"""Fewer cannot disagree."""
 
 
 def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[str, FloatArray]) -> dict[str, FloatArray]:

@@ -13,6 +13,8 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.trial import Trial, numbers_of
 from femsense.loop.fit.joint_fit import JointFit
 
+LEAST_SWEEPS = 3
+"""Fewer cannot disagree."""
 OPEN = 1e-8
 """Share of what is known of a direction that comes from the sweeps that are not left out; below it they leave it open."""
 
@@ -24,7 +26,7 @@ def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> 
     """
     rows = sweep_rows(trials, before)
     gains = np.array([_density(after, r) - _density(before, r) for r in rows])
-    if len(gains) < 3:
+    if len(gains) < LEAST_SWEEPS:
         return float(gains.sum()), float("inf")
     return float(gains.sum()), float(np.sqrt(len(gains)) * gains.std(ddof=1))
 

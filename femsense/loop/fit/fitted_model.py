@@ -19,7 +19,7 @@ from femsense.model.effects.base import range_units
 from femsense.model.observation import Hypothesis, SceneJet
 from femsense.model.robot import Robot
 
-ROUGHLY = 3
+ROUGHLY = 4
 """Steps of a fit that only has to come near: one that tells the noise by its residual, or part of a model."""
 
 

@@ -12,7 +12,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
+from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
@@ -24,8 +24,8 @@ from femsense.model.robot import Robot
 
 START = Noise({"white": 5e-4}, "start")
 """The noise until it is estimated."""
-ROUGHLY, STEPS = 4, 12
-"""Steps of the fit whose residual tells the noise; and at most with that, to the end, or, on large meshes, to where what is left to gain is spared."""
+STEPS = 12
+"""Steps of a fit with the noise that was told, at most: to the end or, on large meshes, to where what is left to gain is spared."""
 Ready = tuple[Data, FittedModel, History]
 """Data, the declared model with its camera calibrated, and the models that effects are sought on top of."""
 

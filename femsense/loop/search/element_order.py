@@ -17,8 +17,8 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
-from femsense.loop.data.representative_states import spread_states
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, span_of
+from femsense.loop.data.representative_states import FEWEST, spread_states
+from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, span_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
@@ -30,10 +30,6 @@ from femsense.loop.search.subsampling import representative_cases
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
-STEPS = 6
-"""Steps of a fit that tries refined linear elements."""
-ASKED = 12
-"""States of a recording in which both kinds of elements are calibrated."""
 PLAINLY = 0.5
 """Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated: a tenth in the arms of
 `benchmarks/distinct_states.py --elements`, which were computed on the declared elements."""
@@ -75,7 +71,7 @@ def both_calibrated(data: Data) -> tuple[float, float]:
     Raises:
         DataError: a kind of elements has no equilibrium there.
     """
-    part = replace(data, train=[t.part(spread_states(t, ASKED)[0]) for t in data.train], held=[], held_of=[])
+    part = replace(data, train=[t.part(spread_states(t, FEWEST)[0]) for t in data.train], held=[], held_of=[])
     linear = calibrated_on(part, data.robot, calibrated_pose(part, data.robot, START))
     return linear.fit.rms, calibrated_on(part, with_quadratic(data.robot), linear).fit.rms
 
@@ -131,7 +127,7 @@ def _refined(data: Data, search: Search, seed: Entry) -> RefitRecord:
     cases = representative_cases(data, search.final, search.noise)
     try:
         made = _on(
-            cases.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], cases.fitted, search.noise, steps=STEPS
+            cases.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], cases.fitted, search.noise, steps=ROUGHLY
         )
         verdict = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {cases.fitted.fit.chi2:.0f}"
     except FemsenseError as error:

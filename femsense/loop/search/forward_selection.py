@@ -45,7 +45,7 @@ def select_next(
     if not leading:
         return None, _updated(records, refits)
     # where evidence is close, what surely predicts better
-    first = max(leading, key=lambda i: leading[i].score + data.thresholds.predicts * surely_predicts(leading[i]))
+    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]))
     winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
@@ -295,4 +295,4 @@ def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress
     inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, values)) and lies_on_body(
         data.robot, more, values, data.thresholds
     )
-    return made if made.fit.chi2 < best.fit.chi2 - data.thresholds.polished * len(more) and inside else best
+    return made if made.fit.chi2 < best.fit.chi2 - data.thresholds.swap * len(more) and inside else best

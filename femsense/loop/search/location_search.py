@@ -76,7 +76,7 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
         around = [start.effect.nearby(data.robot, here.seed) for here in ways]
         at([seed for seeds in around for seed in seeds])
         best = [max([here, *at(seeds)], key=lambda c: c.gain) for here, seeds in zip(ways, around)]
-        further = [found if found.gain >= here.gain + data.thresholds.polished else here for here, found in zip(ways, best)]
+        further = [found if found.gain >= here.gain + data.thresholds.swap else here for here, found in zip(ways, best)]
         if further == ways:
             break
         ways = further
@@ -117,11 +117,11 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
             return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
         scatter = _scatter(around, best, share, data.thresholds)
-        if best.gain < here.gain + share * data.thresholds.polished:
+        if best.gain < here.gain + share * data.thresholds.swap:
             return fitted, scatter
         there = _seeds_instead(data, fitted, noise, [best.seed]) if cases.spares else [best]
         made = _moved(data, fitted, there[0], noise) if there else None
-        if made is None or made.fit.chi2 > fitted.fit.chi2 - data.thresholds.polished:
+        if made is None or made.fit.chi2 > fitted.fit.chi2 - data.thresholds.swap:
             return fitted, scatter
         fitted = made
 
@@ -163,7 +163,7 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
     fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
     seen = screen(without_term(fit, i), problem_of(data, fit, noise), fields, 100.0)
     here = next((c for c in seen if c.seed == seed), None)
-    return here is None or max(c.gain for c in seen) > here.gain + data.thresholds.polished
+    return here is None or max(c.gain for c in seen) > here.gain + data.thresholds.swap
 
 
 def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:

@@ -19,8 +19,6 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
 
-DECLARED = -1.0
-"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
 LEFT = 0.5
 """What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
 FORGONE = 2.0, 1.25
@@ -72,12 +70,12 @@ def refit(
     if adds_history(fitted.fit, candidate, start):
         worth = np.inf
 
-    def started_at(share: float) -> FittedModel | None:
-        part = 1.0 if share == DECLARED else share
+    def started_at(share: float | None) -> FittedModel | None:
+        part = 1.0 if share is None else share
         known = jets_with(fitted, candidate) if free and share == 0.0 else None
-        near = fitted.fit.jets if not candidate.parameters and share != DECLARED else None
+        near = fitted.fit.jets if not candidate.parameters and share is not None else None
         try:
-            theta = _declared(data, fitted, hypothesis, noise) if share == DECLARED else fitted.fit.fit.theta + share * answer
+            theta = _declared(data, fitted, hypothesis, noise) if share is None else fitted.fit.fit.theta + share * answer
             coordinates = np.concatenate([theta[fitted.fit.own :], null + part * (start - null)])
             return fit_model(
                 data,
@@ -134,10 +132,11 @@ def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) 
     return within(fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
 
 
-def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
-    """Return the shares of the linear step from which a refit may start, in order: that step may go too far."""
+def _shares(candidate: Candidate, free: bool) -> tuple[float | None, ...]:
+    """Return the shares of the linear step from which a refit may start, in order: that step may go too far. None: from what is declared, where a
+    discrete alternative does not fit from where calibration has gone without it."""
     if candidate.effect.discrete:
-        return (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
+        return (1.0, None) if candidate.gain < np.inf else (None, 1.0)
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 

@@ -96,7 +96,7 @@ def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord]
         for r in refits
         if r.answers_as(own)
         and r.passes
-        and r.evidence > data.thresholds.near_as_good * own.evidence - data.thresholds.evidence
+        and r.evidence > own.evidence - data.thresholds.evidence
         and r.name not in fitted.fit.hypothesis.names
     ]
     others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
@@ -161,10 +161,7 @@ def _without(data: Data, history: History, without: FittedModel, name: str, nois
 def instead_of_offsets(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
 ) -> OffsetAlternative | None:
-    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing.
-
-    Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
-    """
+    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing."""
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None or np.isinf(data.thresholds.swap):
         return None
@@ -182,9 +179,8 @@ def instead_of_offsets(
 
 def _takes(data: Data, best: Refit, fitted: FittedModel, without: FittedModel, worth: float) -> tuple[bool, float]:
     """Return whether an effect takes the place of the input offsets, which are worth so much dBIC, and by how much it is ahead: where evidence is close,
-    what predicts left-out sweeps better; and what does the same with fewer numbers."""
+    what predicts left-out sweeps better."""
     assert best.record.cv_gain is not None
     ahead, evident, least = best.score - worth, data.thresholds.evidence, data.thresholds.swap
     predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
-    mirrors = best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + evident
-    return ahead > least or (ahead > -evident and ahead + predicts > least) or mirrors, ahead
+    return ahead > least or (ahead > -evident and ahead + predicts > least), ahead

@@ -8,7 +8,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.cross_validation import sweep_rows
+from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweep_rows
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.result.evidence import ConfoundingMap, Estimate, Ranked, Size
 from femsense.loop.search.screening import Candidate, one_each
@@ -16,8 +16,6 @@ from femsense.loop.thresholds import Thresholds
 
 DRAWS = 200
 """Bootstrap draws of sweeps."""
-LEAST_SWEEPS = 3
-"""With fewer there is no such bootstrap."""
 MAP = 14
 """Effects in the map of confounding."""
 KINDS = {"linear": "change", "log": "factor", "reciprocal": "softer_than"}

@@ -12,9 +12,6 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.result.records import CorrectionRecord
 from femsense.model.marker_correction import Correction
 
-HELPS = 1.0
-"""Held-out frames must be better by so many standard errors of their mean: as sweeps that are left out must be for an effect, and more."""
-
 
 def judged_correction(data: Data, fitted: FittedModel) -> tuple[CorrectionRecord, Correction | None]:
     """Return whether held-out markers are predicted better with an empirical correction of what a model leaves, and that correction; None where they
@@ -28,7 +25,7 @@ def judged_correction(data: Data, fitted: FittedModel) -> tuple[CorrectionRecord
     after = [r - rows_of(learned, t)[0] for t, r in pairs]
     gains = np.concatenate([_by_frame(t.scene.frame, r, a) for (t, r), a in zip(pairs, after)])
     mean, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else float("inf")
-    helps = mean > HELPS * error
+    helps = mean > error
     record = CorrectionRecord(
         accepted=helps,
         verdict="held-out markers are predicted better" if helps else "held-out markers are not surely predicted better",

@@ -26,10 +26,8 @@ from femsense.model.camera_frame import in_robot_frame
 from femsense.model.observation import SceneJet, placements
 from femsense.model.robot import Robot, spread_features
 
-LOADED_FRAMES = 8
-"""Frames with known loads at most."""
 POINTS = 8
-"""Places of the body at which compliances are compared."""
+"""Places of the body at which compliances are compared, and frames with known loads at most."""
 FIELD_POINTS = 48
 """Points of the surface that carry the field of equivalent forces."""
 WEAKEST = 0.03
@@ -103,7 +101,7 @@ def force_consequence(before: list[View], after: list[View], noise: Noise) -> Fo
     loaded = loaded or [(a, b, k) for a, b in pairs for k in _loaded_frames(a)]
     try:
         if loaded:
-            chosen = np.unique(np.linspace(0, len(loaded) - 1, LOADED_FRAMES).round().astype(int))
+            chosen = np.unique(np.linspace(0, len(loaded) - 1, POINTS).round().astype(int))
             rows = each(lambda at: _at_loads(at[0], at[1], at[2], noise), [loaded[i] for i in chosen])
             return ForceImpact(loads=tuple(row for row in rows if row is not None))
         return ForceImpact(compliance=_compliances(*pairs[0]))

@@ -10,9 +10,7 @@ from femsense.loop.data.trial import Trial
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.result.evidence import LackOfFit, Tested
 from femsense.loop.result.records import Structure
-
-REPEATS = 6
-"""Degrees of freedom of the pure error at least."""
+from femsense.model.repeats import LEAST_REPEATS
 
 
 def tested(trials: list[Trial], residuals: list[FloatArray], fit: JointFit, structure: Structure) -> Tested:
@@ -36,7 +34,7 @@ def lack_of_fit(trials: list[Trial], residuals: list[FloatArray], parameters: in
             pure += float(((values - mean) ** 2).sum())
             cells, stays = cells + len(mean), stays + len(mean) * len(values)
     own, free = cells - parameters, stays - cells
-    if free < REPEATS or own < 1 or pure <= 0:
+    if free < LEAST_REPEATS or own < 1 or pure <= 0:
         return None
     ratio = (lack / own) / (pure / free)
     error = float(np.sqrt(max(r.shape[1] for r in residuals) * pure / free))

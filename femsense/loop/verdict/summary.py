@@ -11,6 +11,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, heads_of, normal_rms_of, rms_of, vectors_of
+from femsense.loop.fit.cross_validation import LEAST_SWEEPS
 from femsense.loop.fit.discretisation_error import representative_frames
 from femsense.loop.fit.fitted_model import FittedModel, held_out, roughly_keeping
 from femsense.loop.fit.noise_components import Noise
@@ -36,10 +37,8 @@ from femsense.loop.verdict.candidate_tables import KINDS, own_size
 from femsense.loop.verdict.sentences import mesh_error_rms
 from femsense.model.effects.base import absent_elsewhere, placed
 
-MIN_SWEEPS = 4
-"""With fewer held-out sweeps the interval of the held-out error resamples frames."""
 DRAWS = 2000
-"""Draws of the bootstrap of that interval."""
+"""Draws of the bootstrap of the interval of the held-out error: of sweeps or, of fewer than LEAST_SWEEPS, of frames."""
 
 # Effects
 
@@ -125,7 +124,7 @@ def errors_of(data: Data, fitted: FittedModel, rng: np.random.Generator) -> Erro
 def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generator) -> tuple[tuple[float, float], str]:
     """Return the 95 % interval of the held-out error of markers (kind 3) or clouds (1) [m], and what was drawn again."""
     pairs = [((r**2).sum(axis=1), t.groups) for r, t in zip(fitted.held_residuals, data.held) if r.shape[1] == kind]
-    by_sweep = sum(np.unique(g.sweep).size for _, g in pairs) >= MIN_SWEEPS
+    by_sweep = sum(np.unique(g.sweep).size for _, g in pairs) >= LEAST_SWEEPS
     blocks = [s[labels == g] for s, own in pairs for labels in [own.sweep if by_sweep else own.frame] for g in np.unique(labels)]
     sums, counts = np.array([b.sum() for b in blocks]), np.array([len(b) for b in blocks])
     drawn = rng.integers(0, len(blocks), size=(DRAWS, len(blocks)))
