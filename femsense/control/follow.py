@@ -20,7 +20,7 @@ from femsense.control.search import Pace, ReachOptions, Search
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.model.robot import Robot
 
-PACE = Pace(farthest=0.02, sure_gain=1e-3, faithful=0.5, tolerance=1e-4, least_m=1e-5)
+PACE = Pace(farthest=0.02, by_body=True, sure_gain=1e-3, faithful=0.5, tolerance=1e-4, least_m=1e-5)
 """Of steps while a hand drags. Steps of 0.05 take twice the processor time on the four-leg robot, since they need stiffnesses
 of their own (24 and 47 ms). Without `least_m` the gripper pulls its other finger to the limit for micrometres."""
 

@@ -60,6 +60,8 @@ class Pace:
 
     farthest: float = np.inf
     """A step of one input moves no node farther than this share of the body's reach [1]."""
+    by_body: bool = False
+    """A step is as long as the farthest node moves; else as the points move, however far that moves the rest of the body."""
     sure_gain: float = SURE_GAIN
     """Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
     faithful: float = np.inf
@@ -190,7 +192,9 @@ class Search:
 
     def _step(self, slopes: Slopes) -> None:
         bend = self._curvature if slopes.exact else 0.0 * self._curvature
-        self.last = _best_step(self.body, self.goal, self.bounds, self.state, slopes, self._radius, self.options, bend)
+        self.last = _best_step(
+            self.body, self.goal, self.bounds, self.state, slopes, self._radius, self.options, bend, self.pace.by_body
+        )
 
     def _fall_back(self, tried: Equilibrium, within: bool) -> None:
         """Shrink the trust region after a step that led nowhere, or end where none is left."""
@@ -228,11 +232,13 @@ def _best_step(
     radius: float,
     options: ReachOptions,
     curvature: FloatArray,
+    by_body: bool,
 ) -> Step:
     """Return the best step of the linearised problem, with what is known of its curvature, in a trust region."""
     u, miss = efforts_of(state), goal.miss(state.positions)
     J, W = slopes.points, slopes.wound
-    unit = body.reach / np.maximum(slopes.body, WEAKEST * max(float(slopes.body.max(initial=0.0)), 1e-300))
+    moved = slopes.body if by_body else np.linalg.norm(J, axis=0)
+    unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
     scaled = J * unit
     top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
     low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)
