@@ -15,6 +15,7 @@ from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
+from femsense.io.importers.mapping import mappable
 from femsense.io.importers.writer import RECORD, write_recording
 
 Progress = Callable[..., None]
@@ -174,8 +175,9 @@ def _check_options(options: Options, inputs: str | None, zero: str | None) -> No
 
 def _without_log(options: Options, log: Path) -> Options:
     """Return the options without the mappings that are about columns of the log of actuation."""
-    of_log, _ = header_of(log)
-    return replace(options, columns={old: new for old, new in options.columns.items() if old not in of_log})
+    of_log = mappable(header_of(log)[0])
+    columns = {old: new for old, new in options.columns.items() if old not in of_log}
+    return replace(options, columns=columns, log_names=tuple(of_log))
 
 
 def _identity(

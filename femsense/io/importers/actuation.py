@@ -10,10 +10,11 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.csv_tables import read_numbers, time_column
+from femsense.io.importers.csv_tables import read_numbers, split_unit, time_column
 from femsense.io.importers.frames import Options
 from femsense.io.importers.journal import Journal
-from femsense.io.importers.plain_csv import input_columns, named_columns
+from femsense.io.importers.mapping import check_targets, resolved
+from femsense.io.importers.plain_csv import input_columns, mapped_time
 
 SURE = 0.6
 """A correlation below this does not tell the offset."""
@@ -60,12 +61,16 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
     """
     file = Path(path)
     names, table = read_numbers(file)
-    clock, scale = time_column(names, file)
+    check_targets(options.columns)
+    columns = resolved(options.columns, names)
+    clock, scale = mapped_time(names, columns, file) or time_column(names, file)
     time_s = table[:, clock] * scale
-    mapped = named_columns(names, options.columns, ("cable_", "chamber_"))
-    direct, actuation = input_columns(names, {})
-    others = [(f"cable_{name}", j, 1.0) for j, name in enumerate(names) if j != clock and name.lower() not in ("frame", "id")]
-    chosen = mapped or direct or others
+    direct, actuation = input_columns(names, columns, file)
+    mapped = [column for column in direct if names[column[1]] in columns]
+    chosen = mapped or direct
+    if not chosen:
+        others = {n: f"cable_{split_unit(n)[0]}" for j, n in enumerate(names) if j != clock and n.lower() not in ("frame", "id")}
+        chosen, actuation = input_columns(names, others, file)
     if not chosen:
         raise InputError(
             "no inputs", where=file, found=", ".join(names), expected="columns cable_… or chamber_…, or --map NAME=cable_x"
@@ -75,7 +80,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
     if len(time_s) < 2 or (np.diff(time_s) <= 0).any():
         raise InputError("time does not increase", where=file, found=f"{len(time_s)} rows", expected="rows in order of time")
     values = np.stack([factor * table[kept, j] for _, j, factor in chosen], axis=1)
-    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values, None if mapped else actuation)
+    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values, actuation)
 
 
 def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[ActuationLog, dict[str, Any]]:

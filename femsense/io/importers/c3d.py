@@ -18,6 +18,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.mapping import MARKER
 
 BLOCK = 512
 MOST = 65535
@@ -85,6 +86,7 @@ def open_c3d(path: Path, options: Options) -> Source:
         },
         count=whole,
         notes=notes,
+        names=dict.fromkeys(header.labels, MARKER),
     )
 
 
@@ -171,7 +173,7 @@ def _points(data: bytes, header: Header) -> tuple[FloatArray, npt.NDArray[np.boo
 
 def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[int, str]]:
     """Return the columns to take and their names; the same label twice gets a number."""
-    for wanted in [*options.topics, *options.columns]:
+    for wanted in options.topics:
         if wanted not in header.labels:
             raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
     taken = [(k, name) for k, name in enumerate(header.labels) if not options.topics or name in options.topics]

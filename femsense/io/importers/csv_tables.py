@@ -23,12 +23,12 @@ SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 
 """Seconds in one unit of time."""
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 FORCES = {"n": 1.0, "mn": 1e-3, "kn": 1e3}
-PRESSURES = {"pa": 1.0, "hpa": 1e2, "mbar": 1e2, "kpa": 1e3, "bar": 1e5, "psi": 6894.757}
+PRESSURES = {"pa": 1.0, "hpa": 1e2, "mbar": 1e2, "kpa": 1e3, "mpa": 1e6, "bar": 1e5, "psi": 6894.757}
 SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """A time without a unit that is as large as this cannot be seconds (10¹¹ s is the year 5138): seconds in one unit of it."""
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
 BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*([A-Za-zµ]+)\s*[\])]")
-ENDED = re.compile(r"(.+?)[_ ](mm|cm|m|ms|us|ns|s|[hk]?[pP]a|m?bar|psi|m?[nN])")
+ENDED = re.compile(r"(.+?)[_ ](mm|cm|m|ms|us|ns|s|MPa|[hk]?[pP]a|m?bar|psi|m?[nN])")
 DAY = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 MARKS = "\t;,"
 LOOKED_AT = 20
@@ -163,7 +163,9 @@ def number_rows(path: Path) -> Iterator[list[float]]:
 def split_unit(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit in small letters; "" where it names none."""
     match = BRACKETED.fullmatch(name.strip()) or ENDED.fullmatch(name.strip())
-    return (match[1].strip(), match[2].lower()) if match else (name.strip(), "")
+    if match is None:
+        return name.strip(), ""
+    return match[1].strip(), match[2] if match[2] == "mPa" else match[2].lower()
 
 
 def time_column(names: Sequence[str], path: Path) -> tuple[int, float]:
@@ -171,7 +173,7 @@ def time_column(names: Sequence[str], path: Path) -> tuple[int, float]:
     for j, name in enumerate(names):
         bare, unit = split_unit(name)
         if bare.lower() in TIMES and unit in ("", *SECONDS):
-            return j, SECONDS[unit] if unit else _size_of(path, j)
+            return j, SECONDS[unit] if unit else time_scale(path, j)
     wanted = ", ".join((*TIMES, "time_s", "time_ms", "time [ms]"))
     raise InputError("no column of time", where=path, found=", ".join(names[:12]), expected=wanted)
 
@@ -182,7 +184,7 @@ def is_time(name: str) -> bool:
     return bare.lower() in TIMES and unit in ("", *SECONDS)
 
 
-def _size_of(path: Path, column: int) -> float:
+def time_scale(path: Path, column: int) -> float:
     """Return seconds in one unit of a time without a unit, by its size."""
     first = next(number_rows(path), None)
     if first is None:

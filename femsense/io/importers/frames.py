@@ -110,6 +110,8 @@ class Source:
     """Camera → its own source, where several look; see `several.joined`."""
     free: Sequence[tuple[float, float]] = ()
     """See `Options.free`."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """Name that `--map` may take → what it may become; see `mapping.check_names`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -140,6 +142,8 @@ class Options:
     """Of so many frames one is taken."""
     free: Sequence[tuple[float, float]] = ()
     """From and to [s] after the first frame: nothing touches the robot meanwhile."""
+    log_names: Sequence[str] = ()
+    """Columns of a log of actuation beside it, for messages."""
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.folders import CLOUDS, PAIRS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.frames import Options, Source
 from femsense.io.importers.kinect import open_kinect
+from femsense.io.importers.mapping import check_names, check_taken, check_targets, resolved
 from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
 from femsense.io.importers.plain_csv import open_plain_csv
 from femsense.io.importers.ros import list_ros, open_ros
@@ -60,7 +60,18 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
     Raises:
         InputError: nothing there, no format that is known, or a choice that a person must make: what can be chosen is named.
     """
-    source, said = Path(path).expanduser(), options or Options()
+    said = options or Options()
+    check_targets(said.columns)
+    source = _opened(path, said)
+    check_names(said.columns, source.names, source.path, said.log_names)
+    if not source.views:
+        check_taken(said.columns, source.names, source.path)
+    return source
+
+
+def _opened(path: str | Path, said: Options) -> Source:
+    """Return a source; whether it has the names of `--map` is not looked at."""
+    source = Path(path).expanduser()
     if source.name in ("depth.txt", *PAIRS) and folder_kind(source.parent) == "tum":
         source = source.parent
     if not source.exists():
@@ -111,6 +122,7 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
         return source if source.views or not said.shifts else joined({"": source}, source.path, said)
     given = [split_name(path) for path in paths]
     guessed = camera_names([str(path) for _, path in given])
+    check_targets(said.columns)
     names = [name or other for (name, _), other in zip(given, guessed)]
     if len(set(names)) < len(names):
         raise InputError(
@@ -118,16 +130,21 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
         )
     files = [path for _, path in given]
     try:
-        return joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
+        source = joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
     except InputError:
         if said.clock != "auto":
             raise
         by_record = replace(said, clock="record")
         sources = {name: _one_of(file, by_record) for name, file in zip(names, files)}
-        with contextlib.suppress(InputError):
+        try:
             source = joined(sources, files[0], said)
-            return replace(source, notes=[*source.notes, "the devices' clocks differ: times are those of recording"])
-        raise
+        except InputError:
+            source = None
+        if source is None:
+            raise
+        source = replace(source, notes=[*source.notes, "the devices' clocks differ: times are those of recording"])
+    check_names(said.columns, source.names, files[0], said.log_names)
+    return source
 
 
 def _one_of(path: Path, options: Options) -> Source:
@@ -135,7 +152,10 @@ def _one_of(path: Path, options: Options) -> Source:
     if options.topics and path.exists() and (options.format or guess_format(path)) in ("ros", "realsense"):
         held = {row["topic"] for row in list_ros(path)["topics"]}
         options = replace(options, topics=[topic for topic in options.topics if topic in held])
-    source = open_source(path, options)
+    if path.is_file() and (options.format or guess_format(path)) == "csv":
+        held_here = resolved(options.columns, header_of(path)[0])
+        options = replace(options, columns={old: new for old, new in held_here.items() if old in header_of(path)[0]})
+    source = _opened(path, options)
     if source.views:
         raise InputError(
             "a capture with several cameras beside others", where=path, found=", ".join(source.views), expected="one"

@@ -14,6 +14,7 @@ import numpy as np
 from femsense.core.errors import InputError
 from femsense.io.importers.csv_tables import is_cut_off, rows_of
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.mapping import MARKER
 
 HEAD = 12
 """The headers are in the first lines."""
@@ -69,6 +70,7 @@ def open_mocap_csv(path: Path, options: Options) -> Source:
         notes=(f"{nameless} tracks have no name: the column marker stays empty there, calibration assigns them",)
         if nameless
         else (),
+        names={name: MARKER for name, _ in export.markers if name},
     )
 
 

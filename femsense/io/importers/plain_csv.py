@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.core.text import did_you_mean
-from femsense.io.importers.csv_tables import (
-    FORCES,
-    LENGTHS,
-    PRESSURES,
-    header_of,
-    is_time,
-    number_in,
-    number_rows,
-    split_unit,
-    time_column,
-)
+from femsense.io.importers.csv_tables import LENGTHS, header_of, is_time, number_rows, split_unit, time_column, time_scale
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.mapping import (
+    Column,
+    cable_kind,
+    check_names,
+    kind_of_target,
+    mappable,
+    mapped_inputs,
+    resolved,
+    split_factor,
+    unit_beside,
+)
 
 NO_PLACES = (
     "q",
@@ -43,25 +44,6 @@ NO_PLACES = (
 """Stems of columns that end in x, y, z and are no places."""
 
 
-def named_columns(names: Sequence[str], columns: Mapping[str, str], prefixes: Sequence[str]) -> list[tuple[str, int, float]]:
-    """Return (name in the recording, column, factor) of the mapped columns whose new name starts with one of the prefixes."""
-    found = []
-    for old, new in columns.items():
-        name, factor = split_factor(new)
-        if name.startswith(tuple(prefixes)) and old in names:
-            found.append((name, list(names).index(old), factor))
-    return found
-
-
-def split_factor(target: str) -> tuple[str, float]:
-    """Return name and factor of a target such as cable_north*4.615. Raises InputError."""
-    name, star, factor = target.partition("*")
-    value = number_in(factor) if star else 1.0
-    if value is None:
-        raise InputError("not a factor", where="--map", found=target, expected="NAME=TARGET*NUMBER")
-    return name.strip(), value
-
-
 # As a source
 
 
@@ -76,10 +58,11 @@ def open_plain_csv(path: Path, options: Options) -> Source:
         InputError: nothing to take, or a unit that nobody says.
     """
     names, headed = header_of(path)
-    _check_map(names, options, path)
+    options = replace(options, columns=resolved(options.columns, names))
+    check_names(options.columns, mappable(names), path, options.log_names)
     raw = not headed and not options.columns
     triples = _raw_triples(path, names) if raw else _mapped_triples(names, options) or _named_triples(names)
-    inputs, actuation = input_columns(names, options.columns)
+    inputs, actuation = input_columns(names, options.columns, path)
     if not triples and not inputs:
         raise InputError(
             "nothing that can be taken",
@@ -104,14 +87,16 @@ def open_plain_csv(path: Path, options: Options) -> Source:
 
     found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
     notes = () if label else ("the markers have no names: the column marker stays empty, calibration assigns them",)
-    return Source("csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes)
+    return Source(
+        "csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes, names=mappable(names)
+    )
 
 
 def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tuple[int, float] | None:
     """Return the column of time and its unit; None where a rate stands for it."""
-    mapped = named_columns(names, options.columns, ("time",))
-    if mapped:
-        return mapped[0][1], mapped[0][2]
+    mapped = mapped_time(names, options.columns, path)
+    if mapped is not None:
+        return mapped
     if not headed:
         return 1, 1.0
     if options.rate is not None and not any(map(is_time, names)):
@@ -126,25 +111,46 @@ def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tupl
     return time_column(names, path)
 
 
-def input_columns(names: Sequence[str], mapping: Mapping[str, str]) -> tuple[list[tuple[str, int, float]], str | None]:
+def mapped_time(names: Sequence[str], columns: Mapping[str, str], path: Path) -> tuple[int, float] | None:
+    """Return the column that is mapped to the time and seconds in one unit of it; None where none is. Raises InputError."""
+    for old, new in columns.items():
+        if kind_of_target(new) == "time" and old in names:
+            column = list(names).index(old)
+            if "*" in new:
+                return column, split_factor(new)[1]
+            scale, unit = unit_beside(old, "time")
+            return column, scale if unit else time_scale(path, column)
+    return None
+
+
+def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) -> tuple[list[Column], str | None]:
     """Return (name in the recording, column, factor) of the inputs, mapped or named cable_… and chamber_…, and what cables hold.
 
     A unit behind a name gives the factor, and says whether cables hold tensions or displacements.
+
+    Raises:
+        InputError: a unit that is none of the input's, or cables in newtons beside others in metres.
     """
-    found = named_columns(names, mapping, ("cable_", "chamber_"))
-    kinds = set[str]()
+    found, kinds = mapped_inputs(names, mapping)
     for j, name in enumerate(names):
         if name in mapping or not name.startswith(("cable_", "chamber_")):
             continue
-        bare, unit = split_unit(name)
-        sizes = PRESSURES if name.startswith("chamber_") else FORCES | LENGTHS
-        bracketed = name.endswith(("]", ")"))
-        if unit not in sizes or not (bracketed or len(unit) > 1):  # a cable may be named cable_arm_n
-            bare, unit = name, ""
-        found.append((bare, j, sizes.get(unit, 1.0)))
-        if unit and bare.startswith("cable_"):
-            kinds.add("tension" if unit in FORCES else "displacement")
-    return found, kinds.pop() if len(kinds) == 1 else None
+        factor, unit = unit_beside(name, name, mapped=False)
+        bare = split_unit(name)[0] if unit else name
+        found.append((bare, j, factor))
+        kinds |= cable_kind(bare, unit)
+    taken = [name for name, _, _ in found]
+    if len(set(taken)) < len(taken):
+        twice = next(name for name in taken if taken.count(name) > 1)
+        raise InputError("two columns become the same", where=path, found=twice, expected="a name each")
+    if len(kinds) > 1:
+        raise InputError(
+            "cables that hold tensions beside others that hold displacements",
+            where=path,
+            found=", ".join(names[j] for name, j, _ in found if name.startswith("cable_")),
+            expected="one of both in all columns",
+        )
+    return found, next(iter(kinds), None)
 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
@@ -206,18 +212,6 @@ def _raw_triples(path: Path, names: Sequence[str]) -> list[tuple[str, tuple[int,
             expected="counter, time [s], then x, y, z of each marker; or --map 3=marker.x (columns count from 1)",
         )
     return [(str(k), (2 + 3 * k, 3 + 3 * k, 4 + 3 * k)) for k in range((len(names) - 2) // 3)]
-
-
-def _check_map(names: Sequence[str], options: Options, path: Path) -> None:
-    for old, new in options.columns.items():
-        if old not in names:
-            raise InputError(
-                "a column that the table does not have",
-                where=f"{path}, --map {old}={new}",
-                found=old,
-                expected=", ".join(names[:20]),
-                hint=did_you_mean(old, names),
-            )
 
 
 def _extent(path: Path, columns: Sequence[int]) -> float:

@@ -94,6 +94,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         count=choice.primary.topic.count,
         notes=plan.notes,
         T_robot_camera=robot_pose(bag, choice.primary, options.base),
+        names=plan.names,
     )
 
 

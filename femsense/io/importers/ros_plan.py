@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,10 +11,10 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import UNITS, Options
+from femsense.io.importers.mapping import INPUT, LOAD, MARKER, split_factor
 from femsense.io.importers.pictures import FINE_UNIT
-from femsense.io.importers.plain_csv import split_factor
 from femsense.io.importers.ros_bag import Bag, Message
-from femsense.io.importers.ros_messages import header_of, stamp_of
+from femsense.io.importers.ros_messages import header_of, markers_of, stamp_of
 from femsense.io.importers.ros_topics import Choice, Stream, transform_between, transforms_of
 
 LAG_S = 0.5
@@ -45,11 +46,14 @@ class Plan:
     """Name of a marker, or topic of one without a name → its name in the recording."""
     scale: float | None
     """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
+    names: dict[str, str]
+    """Name that `--map` may take → what it may become."""
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     """Return what is read from a bag, and how: streams, columns, clock."""
     notes = list(choice.notes)
+    names = _mappable(bag, choice, options)
     columns, fields = {}, set[str]()
     for stream in choice.inputs:
         columns[stream.topic.name], taken = _input_columns(bag, stream, options)
@@ -84,7 +88,24 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
         tuple(notes),
         renamed,
         scale,
+        names,
     )
+
+
+def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
+    """Return the names that `--map` may take; those of markers are sought in the messages where one is not known otherwise."""
+    names = {stream.topic.name: LOAD for stream in choice.loads} | {stream.topic.name: MARKER for stream in choice.markers}
+    for stream in choice.inputs if options.columns else ():
+        for name, fld in _largest_values(bag, stream):
+            names |= dict.fromkeys((name, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
+    for stream in choice.markers:
+        for message in bag.messages([stream.topic.name]):
+            if set(options.columns) <= set(names):
+                break
+            with contextlib.suppress(InputError):
+                found = markers_of(bag.decode(message), stream.topic.type)
+                names |= {label: MARKER for label, _ in found if label and label not in names}
+    return names
 
 
 def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str, tuple[str, str, float]], set[str]]:

@@ -62,6 +62,7 @@ def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Sourc
         count=len(match.times),
         notes=notes,
         views=dict(sources),
+        names={name: kind for source in sources.values() for name, kind in source.names.items()},
     )
 
 

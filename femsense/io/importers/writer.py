@@ -61,6 +61,8 @@ def write_recording(
         InputError: no frames, none of the pictures readable, columns whose meaning nobody said.
     """
     if log is not None:
+        if actuation and log.actuation not in (None, actuation):
+            raise _another_kind(log.path, actuation, str(log.actuation))
         _actuation(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
@@ -218,6 +220,8 @@ def _input_columns(journal: Journal) -> list[str]:
 def _actuation(source: Source, columns: list[str], said: str | None) -> str:
     kind = said or source.actuation
     cables = [name for name in columns if name.startswith("cable_")]
+    if cables and source.format == "csv" and source.actuation not in (None, kind):
+        raise _another_kind(source.path, str(said), str(source.actuation))
     if kind is None and cables:
         raise InputError(
             "what the cables' values are is not known",
@@ -227,6 +231,12 @@ def _actuation(source: Source, columns: list[str], said: str | None) -> str:
             hint="--map NAME=cable_x*FACTOR converts other units",
         )
     return kind or "tension"
+
+
+def _another_kind(path: Path, said: str, by_unit: str) -> InputError:
+    return InputError(
+        "the units of the cables' columns say something else", where=f"{path}, --inputs {said}", found=by_unit, expected=said
+    )
 
 
 def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def test_a_header_by_mapping_names_and_units(tmp_path: Path) -> None:
     recording, _ = imported(tmp_path / "a.csv", tmp_path / "out", Options(columns=mapping, unit="mm"), actuation="tension")
     np.testing.assert_allclose(marker_grid(recording)[:, 0], [[0.001, 0.002, 0.003], [np.nan] * 3])
     np.testing.assert_allclose(recording.inputs[:, 0], [2.0, 2.5])
-    with pytest.raises(InputError, match="a column that the table does not have") as caught:
+    with pytest.raises(InputError, match="a name that the source does not have") as caught:
         open_source(tmp_path / "a.csv", Options(columns={"mtor": "cable_a"}, unit="m"))
     assert "motor" in str(caught.value)
 
