@@ -123,13 +123,16 @@ def unspoken(fit: Fit, i: int) -> bool:
 def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
     """Return "ok", or in words that an object touches whose force may be none: beside a sure one, or where no contact is reported.
 
+    One that carries less than how well the sure ones are known is part of their deviation, and not spoken of.
+
     Arguments:
         fit: of the frame.
         touching: those of its contacts, and of the places where completed objects touch the body, where nothing seems to touch in free frames.
     """
     silent = [i for i, touch in enumerate(fit.touches) if any(touch is one for one in touching) and unspoken(fit, i)]
     most = [float(np.linalg.norm(fit.forces[i])) + 2.0 * _std_along(fit, i) for i in silent]
-    if most:
+    sure = [_std_along(fit, i) for i, value in enumerate(chi_squared(fit)) if value >= SURE]
+    if most and max(most) > max(sure):
         return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
     return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK
 
