@@ -13,6 +13,8 @@ from femsense.calib.calibrate import calibrate
 from femsense.calib.reference import less_reference
 from femsense.core.arrays import freeze
 from femsense.core.errors import DataError, InputError
+from femsense.loop.data.dataset import prepare
+from femsense.loop.fit.fitted_model import with_nuisance
 from femsense.loop.improve import ImproveOptions, improve
 from femsense.model.recording import Recording, select_frames
 
@@ -47,6 +49,13 @@ def test_the_loop_finds_a_weight_in_what_is_left() -> None:
     assert abs(mass.value - 0.004) < 2.0 * mass.std < 0.0012
     again, _ = record(INPUTS, effects=[SHARED], noise=1e-4, seed=5, truth=arm((6, 2, 2), law="neo_hookean"))
     assert not improve(arm((4, 1, 1)), [again], effects=["tip_mass"], options=ImproveOptions(references=[bare])).effects
+
+
+def test_beside_a_reference_modulus_and_input_offsets_stay() -> None:
+    """What the model misses of the reference holds for those that it was computed with."""
+    data = prepare(arm((4, 1, 1)), [twins()[0]], [])
+    assert with_nuisance(data)[0].names == ("stiffness", "cable_offset")
+    assert with_nuisance(replace(data, relative=True))[0].names == ()
 
 
 def test_the_nearest_inputs_count_in_whatever_order() -> None:
