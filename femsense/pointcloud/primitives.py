@@ -74,11 +74,11 @@ class Shape:
             return self
         return replace(self, axes=self.axes * np.array([[1.0], [1.0], [-1.0]]), behind_m=2.0 * float(self.half[:2].min()))
 
-    def distance(self, places: FloatArray) -> FloatArray:
-        """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,)."""
+    def distance(self, places: FloatArray, *, within: float = np.inf) -> FloatArray:
+        """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,); inf may stand for more than `within` [m]."""
         if self.kind == "points":
             assert self.tree is not None
-            return np.asarray(self.tree.query(places)[0])
+            return np.asarray(self.tree.query(places, distance_upper_bound=within)[0])
         if self.surface is not None:
             return self.surface.closest(places)[1]
         local = (places - self.center) @ self.axes.T

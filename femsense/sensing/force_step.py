@@ -13,14 +13,14 @@ from scipy.linalg import block_diag
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
-from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.qp.friction_cone import pyramid_rows
 from femsense.qp.problem import Problem
 from femsense.qp.solve import solve
-from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
+from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std
+from femsense.sensing.responses import response_at
 from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, tangents_of, touch_normal
-from femsense.sensing.types import Rows, Sensor, Touch
+from femsense.sensing.types import Response, Rows, Sensor, Touch
 
 ACROSS = 0.5
 """Forces along the surface are expected to be so much smaller than those along the normal: rubber on plastic or skin slides at 0.5 to 1, and few slide."""
@@ -57,7 +57,7 @@ class ForceStep:
 class Linearisation:
     """The rows of an iterate as they answer to small changes."""
 
-    tangent: Tangent
+    response: Response
     by_force: FloatArray  # (r, 3m)
     by_shift: FloatArray  # (r, 2m)
     frames: FloatArray  # tangents at rest, (m, 2, 3)
@@ -65,7 +65,6 @@ class Linearisation:
     residual: FloatArray  # (r,), without what the free frames say
     normals: FloatArray  # outward, deformed, (m, 3)
     moves: FloatArray  # of the nodes by unit forces, (3m, n, 3)
-    sag: FloatArray  # of the nodes by the modulus and the pulls, as `sag_at` has it
     misfit: float  # of the rows with nuisance fitted
 
     def cost(self, here: Iterate) -> float:
@@ -77,7 +76,7 @@ class Linearisation:
 
         The two differed by less than a twentieth of what the cost had changed, but for steps that were ten times too long.
         """
-        return misfit_beside(sensor, there.rows, self.sag) + prior_cost(there, self.normals)
+        return misfit_beside(sensor, there.rows, self.response.sag) + prior_cost(there, self.normals)
 
     def step(self, sensor: Sensor, here: Iterate, trust: float = 1.0, *, firm: bool = False) -> ForceStep:
         """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.
@@ -201,22 +200,21 @@ class ForceEquations:
         return np.asarray(self.eliminated[:, -1] - self.eliminated[:, :-1] @ forces)
 
 
-def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray] | None = None) -> Linearisation:
+def linearise(sensor: Sensor, here: Iterate, near: Response | None = None) -> Linearisation:
     """Return how the rows of an iterate answer to forces, to shifts of their places, and to the nuisance.
 
-    `at_hand` are the tangent and `sag_at` of its state, where these are known.
+    `near` is a response at hand, which is taken where it was made near by.
     """
-    tangent = tangent_at(sensor.robot.body, here.state) if at_hand is None else at_hand[0]
+    response = response_at(sensor, here.state, near)
     n, m = len(here.state.positions), len(here.touches)
     basis = np.array([t.patch.spread(axis, n) for t in here.touches for axis in np.eye(3)])
     frames = np.array([tangents_of(t.normal) for t in here.touches]).reshape(m, 2, 3)
     shifts = [nodal_forces_by_shift(sensor, t, e, f) for t, es, f in zip(here.touches, frames, here.forces) for e in es]
-    sag = sag_at(sensor, here.state, tangent) if at_hand is None else at_hand[1]
-    moves = tangent.respond(np.concatenate([basis, np.array(shifts)]))
+    moves = response.tangent.respond(np.concatenate([basis, np.array(shifts)]))
     answers = here.rows.functional(moves)
-    columns, known = nuisance_columns(sensor.knowledge, here.rows, sag)
+    columns, known = nuisance_columns(sensor.knowledge, here.rows, response.sag)
     return Linearisation(
-        tangent,
+        response,
         answers[:, : 3 * m],
         answers[:, 3 * m :],
         frames,
@@ -224,7 +222,6 @@ def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray]
         here.rows.residual - known,
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],
-        sag,
         misfit_of(here.rows.residual - known, columns, here.rows)[0],
     )
 

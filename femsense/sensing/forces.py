@@ -13,14 +13,14 @@ import numpy as np
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
-from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise, misfit_beside, prior_cost
 from femsense.sensing.measurement_rows import rows_at
-from femsense.sensing.nuisance import misfit_of, nuisance_columns, sag_at
+from femsense.sensing.nuisance import misfit_of, nuisance_columns
+from femsense.sensing.responses import response_at
 from femsense.sensing.states import solve_with
 from femsense.sensing.touches import make_touch, touch_normal, within_cones
-from femsense.sensing.types import Fit, Sensor, Touch
+from femsense.sensing.types import Fit, Response, Sensor, Start, Touch
 
 TRIES = 4
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
@@ -28,14 +28,13 @@ SLIGHT = 1e-4
 """A step that lowered the cost by less than this share of it is the last one."""
 
 
-def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, like: Fit | None = None) -> Fit:
-    """Return the fit of a frame without contacts; `like` is one of the same state to other points."""
+def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, near: Response | None = None) -> Fit:
+    """Return the fit of a frame without contacts; `near` is a response at hand, which is taken where it was made near by."""
     rows = rows_at(sensor, k, scan, state)
-    tangent = tangent_at(sensor.robot.body, state) if like is None or like.tangent is None else like.tangent
-    sag = sag_at(sensor, state, tangent) if like is None or like.sag is None else like.sag
-    columns, known = nuisance_columns(sensor.knowledge, rows, sag)
+    response = response_at(sensor, state, near)
+    columns, known = nuisance_columns(sensor.knowledge, rows, response.sag)
     cost = misfit_of(rows.residual - known, columns, rows)[0]
-    return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost, tangent=tangent, sag=sag)
+    return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost, response=response)
 
 
 def fit_forces(
@@ -45,7 +44,7 @@ def fit_forces(
     touches: Sequence[Touch],
     free: Fit,
     *,
-    start: tuple[Equilibrium, FloatArray] | None = None,
+    start: Start | None = None,
     before: tuple[FloatArray, ...] | None = None,
 ) -> Fit:
     """Return the forces at some places that explain frame k best.
@@ -53,7 +52,7 @@ def fit_forces(
     Arguments:
         touches: where forces may act.
         free: the fit without them, from which it begins.
-        start: a state near by and the forces in it (m, 3) [N]; taken where it explains the frame better than the free state.
+        start: a state near by with the forces in it; taken where it explains the frame better than the free state.
         before: tensions along the cables until now (friction).
 
     Raises:
@@ -61,9 +60,10 @@ def fit_forces(
     """
     frame = _Frame(sensor, k, scan, before)
     here, linear = frame.best_start(touches, free, start)
-    here, linear, step, converged = frame.settle(here, linear, firm=False)
-    if here.rows.of_clouds:
-        here, linear, step, again = frame.settle(here, linear, firm=True)
+    near = start is not None and start.firm and here.state is not free.state
+    converged = False
+    for firm in ((True,) if near else (False, True)) if here.rows.of_clouds else (False,):
+        here, linear, step, again = frame.settle(here, linear, firm)
         converged = converged or again
     return frame.fit_of(here, linear, step, converged)
 
@@ -84,30 +84,27 @@ class _Frame:
     scan: Scan | None
     before: tuple[FloatArray, ...] | None
 
-    def best_start(
-        self, touches: Sequence[Touch], free: Fit, start: tuple[Equilibrium, FloatArray] | None
-    ) -> tuple[Iterate, Linearisation]:
+    def best_start(self, touches: Sequence[Touch], free: Fit, start: Start | None) -> tuple[Iterate, Linearisation]:
         """Return the free state, or the given start where that explains the frame better. Raises DataError."""
         m, sensor = len(touches), self.sensor
         here = Iterate(tuple(touches), np.zeros((m, 3)), free.state, free.rows, np.full(m, sensor.options.force_std_n))
-        warm = None if start is None or len(start[1]) != m else self._from_start(here, free, start)
+        warm = None if start is None or len(start.forces) != m else self._from_start(here, free, start)
         if warm is not None:
             return warm
-        return here, linearise(sensor, here, None if free.tangent is None or free.sag is None else (free.tangent, free.sag))
+        return here, linearise(sensor, here, free.response)
 
-    def _from_start(
-        self, here: Iterate, free: Fit, start: tuple[Equilibrium, FloatArray]
-    ) -> tuple[Iterate, Linearisation] | None:
+    def _from_start(self, here: Iterate, free: Fit, start: Start) -> tuple[Iterate, Linearisation] | None:
         """Return a given start where it costs less than the free state, which need not be linearised then."""
-        forces = within_cones(self.sensor, here.touches, start[1], start[0])
-        there = self._settled(replace(here, forces=forces, state=start[0]))
+        forces = within_cones(self.sensor, here.touches, start.forces, start.state)
+        there = self._settled(replace(here, forces=forces, state=start.state))
         if there is None:
             return None
         cost = free.cost + prior_cost(here, np.zeros((len(forces), 3)))
         normals = np.array([touch_normal(self.sensor, touch, there.state) for touch in there.touches])
-        if free.sag is not None and misfit_beside(self.sensor, there.rows, free.sag) + prior_cost(there, normals) >= cost:
+        known = free.response
+        if known is not None and misfit_beside(self.sensor, there.rows, known.sag) + prior_cost(there, normals) >= cost:
             return None
-        linear = linearise(self.sensor, there)
+        linear = linearise(self.sensor, there, start.response)
         return (there, linear) if linear.cost(there) < cost else None
 
     def settle(self, here: Iterate, linear: Linearisation, firm: bool) -> tuple[Iterate, Linearisation, ForceStep, bool]:
@@ -145,7 +142,7 @@ class _Frame:
         cost, settled = at.cost(here), self._settled(there)
         if settled is None or at.cost_beside(self.sensor, settled) >= cost:
             return None
-        linear = linearise(self.sensor, settled)
+        linear = linearise(self.sensor, settled, at.response)
         return (settled, linear) if linear.cost(settled) < cost else None
 
     def _settled(self, there: Iterate) -> Iterate | None:
@@ -169,8 +166,7 @@ class _Frame:
             here.rows,
             linear.cost(replace(here, sizes=sizes)),
             converged,
-            linear.tangent,
-            linear.sag,
+            linear.response,
         )
 
 
@@ -185,6 +181,6 @@ def _moved(sensor: Sensor, here: Iterate, linear: Linearisation, step: ForceStep
         touches.append(touch)
     forces = within_cones(sensor, tuple(touches), here.forces + (step.forces - here.forces), here.state)
     move = np.tensordot((forces - here.forces).ravel(), linear.moves, axes=1)
-    factor = linear.tangent.factor if linear.tangent.factor.negative == 0 else None
+    factor = linear.response.tangent.factor if linear.response.tangent.factor.negative == 0 else None
     state = replace(here.state, positions=here.state.positions + move, factor=factor)
     return Iterate(tuple(touches), forces, state, here.rows, here.sizes)

@@ -9,10 +9,10 @@ import numpy as np
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.fem.compliance import tangent_at
 from femsense.fem.mesh import TetMesh
 from femsense.sensing.measurement_rows import rows_at, seen_through
-from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess, sag_at
+from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess
+from femsense.sensing.responses import response_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
 OK = "ok"
@@ -150,7 +150,7 @@ def shared_errors(sensor: Sensor, fit: Fit) -> float:
 
 
 def _sag_of(sensor: Sensor, fit: Fit) -> FloatArray:
-    return sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)) if fit.sag is None else fit.sag
+    return response_at(sensor, fit.state).sag if fit.response is None else fit.response.sag
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:

@@ -36,7 +36,7 @@ def law_std(sensor: Sensor, fit: Fit, free: Equilibrium) -> FloatArray:
     n = len(fit.state.positions)
     loads = np.array([t.patch.spread(force, n) for t, force in zip(fit.touches, fit.forces)])
     std = fit.rows.std / np.sqrt(fit.rows.weight)
-    tangent = tangent_at(body, fit.state) if fit.tangent is None else fit.tangent
+    tangent = tangent_at(body, fit.state) if fit.response is None else fit.response.tangent
     moves = fit.rows.functional(tangent.respond(np.concatenate([loads, extra[None]]))) / std[:, None]
     return np.asarray(np.abs(np.linalg.lstsq(moves[:, :m], moves[:, m], rcond=None)[0]))
 

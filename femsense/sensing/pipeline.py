@@ -27,7 +27,7 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
 from femsense.sensing.paper import sense_as_published
-from femsense.sensing.places import away_from_scenery, find_touches, near_places, object_touches, seen_objects
+from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, segmented
 from femsense.sensing.states import foretold, free_state
@@ -121,15 +121,13 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     before = previous.state.segment_tensions if previous is not None and has_history(sensor.robot) else None
     alone = free_state(sensor, k, None if previous is None else previous.free_state, before)
     clock.lap("equilibrium")
-    near = foretold(previous, alone)
-    scan = scan_of(sensor, k, near)
+    scan = scan_of(sensor, k, foretold(previous, alone))
     clock.lap("scan")
-    scan, free = segmented(sensor, k, scan, alone, near, previous, before)
+    scan, free = segmented(sensor, k, scan, alone, previous, before)
     clock.lap("rows")
     shapes = seen_objects(sensor, k, scan, free.state)
-    touches = find_touches(sensor, shapes, free)
     clock.lap("places")
-    fit = explain(sensor, k, scan, shapes, touches, free, previous, before)
+    fit = explain(sensor, k, scan, shapes, free, previous, before)
     clock.lap("forces")
     contacts = contacts_of(sensor, k, fit, alone, previous)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
@@ -154,7 +152,8 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         dict(fit.state.pressure),
         clock.stages,
     )
-    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts, sure_forces(fit))
+    sure = sure_forces(fit)
+    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts, sure, fit.response, free.response)
 
 
 class _Clock:
@@ -191,7 +190,8 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
 
 def _under_inputs(frame: SensedFrame) -> SensedFrame:
     """Return a frame as the inputs alone have it: what the next one starts from where its forces are not trusted (friction remembers it)."""
-    return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), sure=())
+    forces, response = np.zeros((0, 3)), frame.free_response
+    return replace(frame, touches=(), state=frame.free_state, forces=forces, contacts=(), sure=(), response=response)
 
 
 PREDICTED = "no marker and no cloud: the model's prediction under the inputs"

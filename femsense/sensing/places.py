@@ -19,7 +19,7 @@ from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, registe
 from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Fit, Sensor, Touch
+from femsense.sensing.types import Sensor, Touch
 
 LOCAL = 0.06
 """How much of an object counts for its shape, beyond its nearest point, relative to the body's diagonal."""
@@ -37,11 +37,9 @@ FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
 
-def find_touches(sensor: Sensor, shapes: list[Shape], free: Fit) -> list[Touch]:
-    """Return where forces may act before the shape is asked: the given places, else where objects touch the state."""
-    if len(sensor.places):
-        return [make_touch(sensor, place, source="given") for place in sensor.places]
-    return object_touches(sensor, shapes, free.state)
+def given_touches(sensor: Sensor) -> list[Touch]:
+    """Return touches at the given places."""
+    return [make_touch(sensor, place, source="given") for place in sensor.places]
 
 
 def said_free(sensor: Sensor, k: int) -> bool:
@@ -122,7 +120,7 @@ def away_from_scenery(sensor: Sensor, touches: Sequence[Touch]) -> list[Touch]:
 def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     triangles, corners = sensor.surface.triangles, state.positions[sensor.surface.nodes]
     shape = shape.towards(corners)
-    corner = shape.distance(corners)
+    corner = shape.distance(corners, within=1.01 * NEAR * sensor.size + sensor.surface.edge)
     if corner.min() > NEAR * sensor.size:
         return None
     by_node = np.full(len(state.positions), np.inf)

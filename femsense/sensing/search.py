@@ -10,19 +10,20 @@ import numpy as np
 from femsense.calib.scan import REACH, Scan, parted
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.fem.compliance import Tangent, tangent_at
+from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
-from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
-from femsense.sensing.places import find_touches, object_touches, said_free
+from femsense.sensing.nuisance import nuisance_columns, robust_std
+from femsense.sensing.places import given_touches, object_touches, said_free
 from femsense.sensing.prepare import condensed_at
+from femsense.sensing.responses import response_at
 from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
+from femsense.sensing.types import Fit, SensedFrame, Sensor, Start, Touch
 
 ANYWHERE = 0.2
 """How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
@@ -41,6 +42,8 @@ ROUNDS = 2
 """How often a place is looked for again with the state that its force makes."""
 NEARBY = 0.03
 """The search takes the answers of a state whose nodes are nearer than this share of the body's diagonal: they rank places, and do not weigh forces."""
+SOME = 500
+"""Points that tell which of two states is closer to all of them."""
 THIN = 2000
 """Rows that the search uses at most."""
 
@@ -50,19 +53,23 @@ def explain(
     k: int,
     scan: Scan | None,
     shapes: list[Shape],
-    touches: Sequence[Touch],
     free: Fit,
     previous: SensedFrame | None,
     before: tuple[FloatArray, ...] | None,
 ) -> Fit:
     """Return the contacts and forces that explain frame k; those that do not make the misfit smaller are left out."""
-    if not touches and (scan is None or len(sensor.places)):
-        return free
     if scan is None or len(sensor.places):
+        touches = given_touches(sensor)
+        if not touches:
+            return free
         return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
     if said_free(sensor, k):
         return free
-    return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, shapes, free, previous, before), free, before)
+    again = _held(sensor, k, scan, shapes, free, previous, before)
+    if again is not None and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
+        return again
+    fit = _with_objects(sensor, k, scan, shapes, free, free if again is None else again, before)
+    return _with_hidden(sensor, k, scan, fit, free, before)
 
 
 def segmented(
@@ -70,7 +77,6 @@ def segmented(
     k: int,
     scan: Scan | None,
     alone: Equilibrium,
-    near: Equilibrium,
     previous: SensedFrame | None,
     before: tuple[FloatArray, ...] | None,
 ) -> tuple[Scan | None, Fit]:
@@ -80,15 +86,14 @@ def segmented(
 
     Arguments:
         alone: the state without forces.
-        near: a state on which most points lie.
+        previous: the frame before.
+        before: tensions along the cables until now (friction).
     """
+    response, near = None if previous is None else previous.free_response, foretold(previous, alone)
     if scan is None:
-        return None, no_forces(sensor, k, None, alone)
-    states = (
-        [alone] if near is alone else [near, alone]
-    )  # what touched in the frame before may be gone: then few points agree on its state
-    few = min((condensed_at(sensor, scan, state) for state in states), key=lambda means: len(means.view))
-    free = no_forces(sensor, k, few, alone)
+        return None, no_forces(sensor, k, None, alone, response)
+    few = condensed_at(sensor, scan, near if _closer(sensor, scan, near, alone) else alone)
+    free = no_forces(sensor, k, few, alone, response)
     if scan.segmented:
         return few, free
     state, last = alone, scan
@@ -101,12 +106,21 @@ def segmented(
             break
         own = _parted(sensor, scan, state)
         few = condensed_at(sensor, own, state)
-        free = no_forces(sensor, k, few, alone, free)
+        free = no_forces(sensor, k, few, alone, free.response)
         if len(sensor.places) and abs(len(own.view) - len(last.view)) < SETTLED * len(own.view):
             return few, free
         last = own
     few = condensed_at(sensor, _parted(sensor, scan, state), state)
-    return few, no_forces(sensor, k, few, alone, free)
+    return few, no_forces(sensor, k, few, alone, free.response)
+
+
+def _closer(sensor: Sensor, scan: Scan, near: Equilibrium, alone: Equilibrium) -> bool:
+    """Return whether most points lie closer to one state than to another: what touched in the frame before may be gone."""
+    if near is alone:
+        return True
+    points = scan.points(sensor.calibration.poses)[:: max(1, len(scan.view) // SOME)]
+    first, second = (Surface(state.positions, sensor.surface.triangles).gap(points) for state in (near, alone))
+    return bool(np.median(first) <= np.median(second))
 
 
 def _by_shape(
@@ -120,7 +134,7 @@ def _by_shape(
     """Return what explains the shape: forces at the given places, else hidden ones."""
     if not len(sensor.places):
         return _with_hidden(sensor, k, scan, free, free, before)
-    touches = find_touches(sensor, [], free)
+    touches = given_touches(sensor)
     return _better(free, _try(sensor, k, scan, touches, free, _start(previous, touches), before))
 
 
@@ -132,7 +146,7 @@ def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
 def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
     """Return the fit with contacts that the shape alone betrays, one after the other."""
     for _ in range(MOST - len(fit.touches)):
-        start = (fit.state, np.vstack([fit.forces, np.zeros((1, 3))]))
+        start = Start(fit.state, np.vstack([fit.forces, np.zeros((1, 3))]), fit.response)
         more = fit
         for found in find_hidden(sensor, fit):
             more = _better(more, _try(sensor, k, scan, [*fit.touches, found], free, start, before))
@@ -166,15 +180,15 @@ def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
 
 def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N]."""
-    body, n, rows = sensor.robot.body, len(fit.state.positions), fit.rows
-    tangent = tangent_at(body, fit.state) if fit.tangent is None else fit.tangent
+    n, rows = len(fit.state.positions), fit.rows
+    response = response_at(sensor, fit.state, fit.response)
     normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
     frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
-    answers = _answers(sensor, fit.state, tangent)
-    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent) if fit.sag is None else fit.sag)
+    answers = _answers(sensor, fit.state)
+    columns, known = nuisance_columns(sensor.knowledge, rows, response.sag)
     residual = rows.residual - known
     other = (
-        [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
+        [rows.functional(response.tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
         if fit.touches
         else []
     )
@@ -200,13 +214,13 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     return np.where(f[:, 0] < 0, np.where(slides, alone, gain), -np.inf), np.einsum("ci,cij->cj", f, frames)
 
 
-def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
+def _answers(sensor: Sensor, state: Equilibrium) -> FloatArray:
     """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3n, 3c)."""
     kept = sensor.answers
     if kept.state is None or np.abs(kept.state.positions - state.positions).max() > NEARBY * sensor.size:
         kept.state, kept.columns = replace(state, factor=None), None
     if kept.columns is None:
-        near = tangent if kept.state.positions is state.positions else tangent_at(sensor.robot.body, kept.state)
+        near = tangent_at(sensor.robot.body, kept.state)
         n, c = len(state.positions), len(sensor.candidates)
         loads = np.zeros((c, 3, n, 3))
         loads[np.arange(c), :, sensor.candidates] = np.eye(3)
@@ -218,19 +232,9 @@ def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray
 
 
 def _with_objects(
-    sensor: Sensor,
-    k: int,
-    scan: Scan,
-    shapes: list[Shape],
-    free: Fit,
-    previous: SensedFrame | None,
-    before: tuple[FloatArray, ...] | None,
+    sensor: Sensor, k: int, scan: Scan, shapes: list[Shape], free: Fit, fit: Fit, before: tuple[FloatArray, ...] | None
 ) -> Fit:
-    """Return the fit with what objects touch, their places found again in the state that the forces make."""
-    again = _held(sensor, k, scan, shapes, free, previous, before)
-    if again is not None and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
-        return again
-    fit = free if again is None else again
+    """Return a fit with what objects touch, their places found again in the state that the forces make."""
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
         if _same(sensor, found, fit):
@@ -260,7 +264,7 @@ def _held(
     near = foretold(previous, free.state)
     held, kept = held_on(sensor, previous.touches, object_touches(sensor, shapes, near), previous.sure, gone=not shapes)
     forces = np.vstack([previous.forces, np.zeros((1, 3))])[kept]
-    again = _try(sensor, k, scan, held, free, (near, forces), before) if held else None
+    again = _try(sensor, k, scan, held, free, Start(near, forces, previous.response, firm=True), before) if held else None
     if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit or again.cost >= free.cost:
         return None
     return again
@@ -350,7 +354,7 @@ def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before
         kept = [t for i, t in enumerate(fit.touches) if i != weakest]
         if not kept:
             return free
-        start = (fit.state, np.delete(fit.forces, weakest, axis=0))
+        start = Start(fit.state, np.delete(fit.forces, weakest, axis=0), fit.response)
         fit = _better(free, _try(sensor, k, scan, kept, free, start, before))
     return fit
 
@@ -361,7 +365,7 @@ def _try(
     scan: Scan,
     touches: Sequence[Touch],
     free: Fit,
-    start: tuple[Equilibrium, FloatArray] | None,
+    start: Start | None,
     before: tuple[FloatArray, ...] | None,
 ) -> Fit | None:
     try:
@@ -375,13 +379,13 @@ def _better(free: Fit, fit: Fit | None) -> Fit:
     return free if fit is None or fit.cost >= free.cost else fit
 
 
-def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
+def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> Start | None:
     if previous is None or len(previous.touches) != len(touches):
         return None
-    return previous.state, previous.forces
+    return Start(previous.state, previous.forces, previous.response)
 
 
-def _start_of(sensor: Sensor, fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
+def _start_of(sensor: Sensor, fit: Fit, touches: Sequence[Touch]) -> Start | None:
     """Return the state and forces of a fit as a start for some touches, each with the force of the nearest one; None where one has no place there."""
     if not fit.touches or not touches:
         return None
@@ -391,4 +395,4 @@ def _start_of(sensor: Sensor, fit: Fit, touches: Sequence[Touch]) -> tuple[Equil
         return None
     forces = np.zeros((len(touches), 3))
     forces[nearest] = fit.forces
-    return fit.state, forces
+    return Start(fit.state, forces, fit.response)

@@ -191,6 +191,29 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Response:
+    """How a body answers near a state (see `response_at`)."""
+
+    tangent: Tangent
+    sag: FloatArray
+    """How the nodes move with the modulus and the pulls, as `sag_at` has it [m], shape (1 + a + c, n, 3)."""
+    positions: FloatArray
+    """Nodes of the state where it was made [m], shape (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Start:
+    """Where a fit may begin: a state, and forces for its touches."""
+
+    state: Equilibrium
+    forces: FloatArray
+    """[N], shape (m, 3)."""
+    response: Response | None = None  # near the state, where it is known
+    firm: bool = False
+    """Whether it is so near the answer that outliers are known from the first step on (see `robust_std`)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Fit:
     """Forces at some places that explain a frame."""
 
@@ -208,10 +231,8 @@ class Fit:
     """Misfit: Huber's function of the whitened residual with nuisance fitted, and the priors."""
     still: bool = True
     """Whether the forces had stopped changing."""
-    tangent: Tangent | None = None
-    """At the state, where it was made."""
-    sag: FloatArray | None = None
-    """How the nodes move with the modulus and the pulls (`sag_at`), where that was asked."""
+    response: Response | None = None
+    """At the state or near it, where it was made."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -229,6 +250,8 @@ class SensedFrame:
     contacts: tuple[ContactForce, ...]
     sure: tuple[bool, ...] = ()
     """Whether each force was more than noise."""
+    response: Response | None = None  # near the state
+    free_response: Response | None = None  # near the state under the inputs alone
 
 
 @dataclass(eq=False, slots=True)

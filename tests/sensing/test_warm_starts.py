@@ -1,0 +1,95 @@
+"""A frame begins with the contacts of the one before: what holds, what is gone, what is new, and when that is enough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import arm
+from touched_arm import touched
+
+from femsense.calib.calibrate import calibrate
+from femsense.sensing.forces import fit_forces, no_forces
+from femsense.sensing.pipeline import sense_frame
+from femsense.sensing.prepare import condensed_at, make_sensor, scan_of
+from femsense.sensing.responses import response_at
+from femsense.sensing.search import held_on, nothing_new
+from femsense.sensing.states import foretold, free_state
+from femsense.sensing.touches import make_touch
+from femsense.sensing.types import Fit, SensedFrame, Sensor
+
+FORCE = np.array([0.0, 0.0, -0.15])
+AWAY = np.array([0.04, 0.0, 0.01])
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sensor, SensedFrame]:
+    """Return a sensor and its frame in which a ball pushes."""
+    folder: Path = tmp_path_factory.mktemp("ball")
+    seen = touched(folder, FORCE, ball=True)
+    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    return sensor, sense_frame(sensor, 3, None)
+
+
+@pytest.fixture(scope="module")
+def fits(pushed: tuple[Sensor, SensedFrame]) -> tuple[Fit, Fit]:
+    """Return that frame without forces, and with one where the ball is."""
+    sensor, frame = pushed
+    scan = scan_of(sensor, 3, frame.state)
+    assert scan is not None
+    few = condensed_at(sensor, scan, frame.state)
+    free = no_forces(sensor, 3, few, frame.free_state)
+    return free, fit_forces(sensor, 3, few, frame.touches, free)
+
+
+def test_the_same_frame_again_has_the_same_force(pushed):
+    sensor, frame = pushed
+    again = sense_frame(sensor, 3, frame)
+    assert len(frame.contacts) == 1 and again.report.status == "ok"
+    assert abs(again.contacts[0].force_n - frame.contacts[0].force_n) < 0.5 * frame.contacts[0].std_n
+
+
+def test_a_touch_moves_on_with_its_object(pushed):
+    sensor, frame = pushed
+    touch = frame.touches[0]
+    found = make_touch(sensor, touch.expected + np.array([0.004, 0.0, 0.0]), source="cloud", std_m=1e-3)
+    held, kept = held_on(sensor, frame.touches, [found], frame.sure)
+    assert kept.tolist() == [0]
+    np.testing.assert_allclose(held[0].expected, found.place)
+    np.testing.assert_allclose(held[0].place - found.place, touch.place - touch.expected, atol=1e-4)
+
+
+def test_what_is_gone_is_left_out_and_what_is_new_is_fitted_along(pushed):
+    sensor, frame = pushed
+    assert held_on(sensor, frame.touches, [], (True,), gone=True)[0] == []
+    assert held_on(sensor, frame.touches, [], (True,))[0] == [frame.touches[0]]
+    assert held_on(sensor, frame.touches, [], (False,))[0] == []
+    other = make_touch(sensor, AWAY, source="cloud", std_m=1e-3)
+    held, kept = held_on(sensor, frame.touches, [frame.touches[0], other], (False,))
+    assert kept.tolist() == [0, -1] and held[1] is other and held[0].std_m == 0.0
+
+
+def test_a_fit_is_enough_where_it_leaves_nothing_to_another_contact(pushed, fits):
+    sensor, frame = pushed
+    free, fit = fits
+    assert nothing_new(sensor, fit, frame.touches)
+    assert not nothing_new(sensor, fit, [*frame.touches, make_touch(sensor, AWAY, source="cloud")])
+    assert not nothing_new(sensor, free, [])  # the shape betrays a touch
+
+
+def test_a_state_is_foretold_by_the_inputs(pushed):
+    frame = pushed[1]
+    alone = replace(frame.free_state, positions=frame.free_state.positions + 1e-3)
+    np.testing.assert_allclose(foretold(frame, alone).positions, frame.state.positions + 1e-3)
+    assert foretold(None, alone) is alone
+
+
+def test_a_response_is_lent_to_states_near_by_alone(pushed):
+    sensor = pushed[0]
+    state = free_state(sensor, 3, None, None)
+    here = response_at(sensor, state)
+    near, far = (replace(state, positions=state.positions + share * sensor.size) for share in (5e-5, 2e-4))
+    assert response_at(sensor, near, here) is here
+    assert response_at(sensor, far, here) is not here
