@@ -1,6 +1,6 @@
 """How often a dragged point is answered, and how near it comes on a robot that is not the model.
 
-    python benchmarks/drag.py
+    python benchmarks/drag.py [--robots NAME …]
 
 The first table drags a marker of the robots that come along, to and fro for five seconds with 30 wishes a second, partly
 out of reach; then the hand rests.
@@ -12,6 +12,7 @@ The target is where two tensions bring the robot. Measurements are noisy by 0.1 
 # ruff: noqa: E402
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
@@ -108,8 +109,9 @@ def answered(name: str, marker: str) -> str:
             hub.received(Message(f"femsense/{name}/drag", json.dumps(wish).encode()), "me")
             time.sleep(1.0 / 30.0)
 
-    drag(1.0, 0.0)  # kernels are loaded
     hub.attach(answers)
+    while len(answers.told) < 5:
+        drag(1.0, 0.5)  # until kernels are loaded
     busy, begun = time.process_time(), time.monotonic()
     drag(MOVES, 2.0)
     ended, busy = time.monotonic(), time.process_time() - busy
@@ -128,13 +130,18 @@ def answered(name: str, marker: str) -> str:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", nargs="*", choices=ROBOTS, help="the first table alone, of these")
+    chosen = parser.parse_args().robots
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     print(
         "| robot | answers a second | p50 [ms] | p95 [ms] | processor time an answer [ms] | rests after [s] | off [mm] |", end=""
     )
     print(" off by reach [mm] |\n|---|---|---|---|---|---|---|---|")
-    for name, marker in ROBOTS.items():
-        print(answered(name, marker), flush=True)
+    for name in ROBOTS if chosen is None else chosen:
+        print(answered(name, ROBOTS[name]), flush=True)
+    if chosen is not None:
+        return
     print("| in the way | measured | target away [mm] | tip ends off [mm] | force of the post [N] |\n|---|---|---|---|---|")
     for name, post in (("nothing", None), ("a post at the middle", POST)):
         for measured in (False, True):
