@@ -12,6 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.csv_tables import read_numbers, split_unit, time_column
 from femsense.io.importers.frames import Options
+from femsense.io.importers.input_samples import samples_of
 from femsense.io.importers.journal import Journal
 from femsense.io.importers.mapping import check_targets, resolved
 from femsense.io.importers.plain_csv import input_columns, mapped_time
@@ -41,12 +42,12 @@ class ActuationLog:
     columns: tuple[str, ...]
     """Columns of frames.csv."""
     values: FloatArray
-    """[N], [m] or [Pa], shape (n, columns)."""
+    """[N], [m] or [Pa], NaN where a cell is empty, shape (n, columns)."""
     actuation: str | None = None
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
-        """Return each column at these times of the log's clock [s], linearly between the rows, held at the ends."""
-        return {name: np.interp(times, self.time_s, self.values[:, j]) for j, name in enumerate(self.columns)}
+        """Return each column at these times of the log's clock [s], NaN where it is not known; see `Samples.at`."""
+        return dict(zip(self.columns, samples_of(self.time_s, self.values).at(times).T))
 
 
 def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
@@ -75,7 +76,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
         raise InputError(
             "no inputs", where=file, found=", ".join(names), expected="columns cable_… or chamber_…, or --map NAME=cable_x"
         )
-    kept = np.isfinite(time_s) & np.isfinite(table[:, [j for _, j, _ in chosen]]).all(axis=1)
+    kept = np.isfinite(time_s) & np.isfinite(table[:, [j for _, j, _ in chosen]]).any(axis=1)
     time_s = time_s[kept]
     if len(time_s) < 2 or (np.diff(time_s) <= 0).any():
         raise InputError("time does not increase", where=file, found=f"{len(time_s)} rows", expected="rows in order of time")
@@ -124,7 +125,8 @@ def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) ->
         raise _unsure(log, "fewer than eight frames show the robot")
     step = max(float(np.median(np.diff(times))), (times[-1] - times[0] + np.ptp(log.time_s)) / GRID)
     motion = _activity(times[kept], places[kept], step)
-    drive = _activity(log.time_s, log.values / np.maximum(np.ptp(log.values, axis=0), 1e-12), step)
+    size = np.nanmax(log.values, axis=0) - np.nanmin(log.values, axis=0)
+    drive = _activity(log.time_s, log.values / np.maximum(size, 1e-12), step)
     score = _correlations(motion, drive)
     best = int(np.argmax(score))
     width = max(3, len(motion) // 50)

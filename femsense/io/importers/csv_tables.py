@@ -29,6 +29,8 @@ SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
 BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*([A-Za-zµ]+)\s*[\])]")
 ENDED = re.compile(r"(.+?)[_ ](mm|cm|m|ms|us|ns|s|MPa|[hk]?[pP]a|m?bar|psi|m?[nN])")
+EMPTY = ("", "na", "n/a", "null", "none")
+"""What stands in a cell without a number, in small letters; float() reads "nan" itself."""
 DAY = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 MARKS = "\t;,"
 LOOKED_AT = 20
@@ -143,7 +145,7 @@ def number_rows(path: Path) -> Iterator[list[float]]:
     for k, (line, cells) in enumerate(rows):
         if headed and k == 0 and _are_units(cells):
             continue
-        values = [np.nan if not cell.strip() else number_in(cell) for cell in cells[: len(names)]]
+        values = [np.nan if cell.strip().lower() in EMPTY else number_in(cell) for cell in cells[: len(names)]]
         if len(values) == len(names) and all(value is not None for value in values):
             yield [float(value) for value in values if value is not None]
             continue

@@ -136,13 +136,12 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
             raise
         by_record = replace(said, clock="record")
         sources = {name: _one_of(file, by_record) for name, file in zip(names, files)}
-        try:
-            source = joined(sources, files[0], said)
-        except InputError:
-            source = None
-        if source is None:
+        by_time: Source | None = None
+        with contextlib.suppress(InputError):
+            by_time = joined(sources, files[0], said)
+        if by_time is None:
             raise
-        source = replace(source, notes=[*source.notes, "the devices' clocks differ: times are those of recording"])
+        source = replace(by_time, notes=[*by_time.notes, "the devices' clocks differ: times are those of recording"])
     check_names(said.columns, source.names, files[0], said.log_names)
     return source
 

@@ -40,6 +40,8 @@ class Entry:
     """Six numbers each: place [m], force [N]."""
     seen: Mapping[str, Seen]
     """Camera → what it gave; the name is empty where there is one camera."""
+    number: int = 0
+    """Its pictures carry it as their name."""
 
     @property
     def center(self) -> list[float] | None:
@@ -56,6 +58,8 @@ class Journal:
         self.head = json.dumps(plain(identity), sort_keys=True)
         self.done = self._whole_entries()
         self.stream: TextIO | None = None
+        self.left_out: frozenset[int] = frozenset()
+        """Numbers of frames that `entries` passes over."""
 
     def __enter__(self) -> Journal:
         if self.done is None:
@@ -86,9 +90,11 @@ class Journal:
         """Yield the frames in the order in which they were written."""
         with self.file.open(encoding="utf-8") as stream:
             next(stream)
-            for line in stream:
+            for number, line in enumerate(stream):
+                if number in self.left_out:
+                    continue
                 time, inputs, loads, seen = json.loads(line)
-                yield Entry(time, inputs, loads, {name: Seen(*one) for name, one in seen.items()})
+                yield Entry(time, inputs, loads, {name: Seen(*one) for name, one in seen.items()}, number)
 
     def times(self) -> FloatArray:
         """Return the times of all frames [s], shape (F,)."""

@@ -12,6 +12,7 @@ import numpy as np
 from femsense.core.errors import InputError
 from femsense.io.importers.csv_tables import LENGTHS, header_of, is_time, number_rows, split_unit, time_column, time_scale
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.input_samples import Samples, samples_of
 from femsense.io.importers.mapping import (
     Column,
     cable_kind,
@@ -78,11 +79,16 @@ def open_plain_csv(path: Path, options: Options) -> Source:
     label = not raw
 
     def frames() -> Iterator[Frame]:
+        between: Samples | None = None
         for number, row in enumerate(number_rows(path)):
             time = number / (options.rate or 1.0) if clock is None else row[clock[0]] * clock[1]
             places = {name: scale * np.array([row[j] for j in axes]) for name, axes in triples}
             seen = {name: upright(p, options.up)[0] for name, p in places.items() if np.isfinite(p).all() and p.any()}
             drive = {name: factor * row[j] for name, j, factor in inputs if np.isfinite(row[j])}
+            if len(drive) < len(inputs):
+                between = between or _input_samples(path, inputs, clock or (None, 1.0 / (options.rate or 1.0)))
+                filled = zip(inputs, between.at(time)[0].tolist())
+                drive = {name: value for (name, _, _), value in filled if np.isfinite(value)}
             yield Frame(time, markers=seen if label else {}, unlabelled=() if label else list(seen.values()), inputs=drive)
 
     found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
@@ -90,6 +96,14 @@ def open_plain_csv(path: Path, options: Options) -> Source:
     return Source(
         "csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes, names=mappable(names)
     )
+
+
+def _input_samples(path: Path, inputs: Sequence[Column], clock: tuple[int | None, float]) -> Samples:
+    """Return all inputs of a table; without a column of time its rows count."""
+    column, scale = clock
+    taken = [[k if column is None else row[column], *(row[j] for _, j, _ in inputs)] for k, row in enumerate(number_rows(path))]
+    rows = np.array(taken, dtype=np.float64)
+    return samples_of(rows[:, 0] * scale, rows[:, 1:] * [factor for _, _, factor in inputs])
 
 
 def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tuple[int, float] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
+from femsense.io.importers.input_samples import NEAR_S, Samples, samples_of
 from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.pictures import depth_of_metres
 from femsense.io.importers.ros_bag import Bag, Message, open_bag
@@ -33,9 +35,6 @@ from femsense.io.importers.ros_plan import (
 from femsense.io.importers.ros_topics import Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
 from femsense.pointcloud.cloud import PointCloud
-
-NEAR_S = 0.05
-"""A picture or a marker belongs to a frame if it is at most this far from it in time."""
 
 
 def open_ros(path: Path, options: Options) -> Source:
@@ -143,17 +142,6 @@ class _Track:
         k = int(np.argmin(apart))
         return self.values[k] if apart[k] <= NEAR_S else None
 
-    def between(self, time: float) -> FloatArray | None:
-        """Return the values at a time, linearly between their neighbours, held at the ends; None where there is none."""
-        if not self.times:
-            return None
-        after = next((i for i, t in enumerate(self.times) if t >= time), None)
-        if after is None or after == 0 or len(self.values[after]) != len(self.values[after - 1]):
-            return np.asarray(self.values[-1 if after is None else after])
-        t0, t1 = self.times[after - 1], self.times[after]
-        share = (time - t0) / (t1 - t0) if t1 > t0 else 1.0
-        return (1 - share) * np.asarray(self.values[after - 1]) + share * np.asarray(self.values[after])
-
 
 def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
     """Read the bag once, in the order in which it was written; hold back what is younger than LAG_S."""
@@ -161,11 +149,15 @@ def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
     if choice.lens is not None:
         rays = pixel_rays(choice.lens)
     primary = choice.primary.topic.name
+    sampled = {s.topic.name for s in (*choice.inputs, *choice.loads) if plan.columns.get(s.topic.name, True)}
     tracks: dict[str, _Track] = {
-        s.topic.name: _Track() for s in chosen_streams(choice) if plan.metadata or s is not choice.primary
+        s.topic.name: _Track()
+        for s in chosen_streams(choice)
+        if (plan.metadata or s is not choice.primary) and s.topic.name not in sampled
     }
     waiting: deque[tuple[float, Message, Any]] = deque()
     with open_bag(path) as bag:
+        samples = {topic: _samples(bag, plan, topic) for topic in sorted(sampled)}
         for message in bag.messages([primary, *tracks, *plan.metadata]):
             try:
                 _take(bag, plan, message, primary, tracks, waiting)
@@ -173,9 +165,28 @@ def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
                 warnings.warn(" ".join(str(problem).split()), stacklevel=2)
                 continue
             while waiting and message.record - waiting[0][1].record > LAG_S:
-                yield _frame(bag, plan, *waiting.popleft(), tracks, rays)
+                yield _frame(bag, plan, *waiting.popleft(), tracks, samples, rays)
         while waiting:
-            yield _frame(bag, plan, *waiting.popleft(), tracks, rays)
+            yield _frame(bag, plan, *waiting.popleft(), tracks, samples, rays)
+
+
+def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
+    """Return all that a topic of inputs or loads says; messages that are broken are counted in a warning."""
+    rows, broken = array("d"), list[str]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # where a bag breaks off is told when the frames are read
+        for message in bag.messages([topic]):
+            try:
+                decoded = bag.decode(message)
+            except InputError as problem:
+                broken.append(" ".join(str(problem).split()))
+                continue
+            time = message.record if plan.clock != "header" else header_time(decoded, message)
+            rows.extend([time, *_values(plan, message, decoded)])
+    if broken:
+        warnings.warn(f"{len(broken)} messages of {topic} are left out: {broken[0]}", stacklevel=2)
+    table = np.array(rows).reshape(-1, 1 + (3 if topic in plan.load_points else len(plan.columns[topic])))
+    return samples_of(table[:, 0], table[:, 1:])
 
 
 def _take(
@@ -195,13 +206,18 @@ def _take(
         tracks[message.topic].add(time, message)
         return
     decoded = bag.decode(message)
-    time = message.record if plan.clock != "header" else header_time(decoded, message)
-    value = decoded if message.topic in plan.T_camera_markers else _values(plan, message, decoded)
-    tracks[message.topic].add(time, value)
+    tracks[message.topic].add(message.record if plan.clock != "header" else header_time(decoded, message), decoded)
 
 
 def _frame(
-    bag: Bag, plan: Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track], rays: FloatArray | None
+    bag: Bag,
+    plan: Plan,
+    time: float,
+    message: Message,
+    decoded: Any,
+    tracks: dict[str, _Track],
+    samples: dict[str, Samples],
+    rays: FloatArray | None,
 ) -> Frame:
     choice = plan.choice
     for track in tracks.values():
@@ -214,12 +230,10 @@ def _frame(
     elif choice.primary.kind == "cloud":
         picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
-    inputs = _inputs(plan, time, message, decoded, tracks)
-    loads = []
-    for stream in choice.loads:
-        force = tracks[stream.topic.name].between(time)
-        if force is not None:
-            loads.append((plan.load_points[stream.topic.name], force))
+    now = {topic: one.at(time)[0] for topic, one in samples.items()}
+    pairs = ((c, v) for topic in plan.columns if topic in now for (c, _, _), v in zip(plan.columns[topic].values(), now[topic]))
+    inputs = {column: float(value) for column, value in pairs if np.isfinite(value)}
+    loads = [(point, now[topic]) for topic, point in plan.load_points.items()]
     return Frame(time if device is None else device, picture, markers=named, unlabelled=unnamed, inputs=inputs, loads=loads)
 
 
@@ -289,16 +303,6 @@ def _markers(
             else:
                 unnamed.append(xyz)
     return named, unnamed
-
-
-def _inputs(plan: Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track]) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for stream in plan.choice.inputs:
-        name = stream.topic.name
-        values = _values(plan, message, decoded) if name == message.topic else tracks[name].between(time)
-        if values is not None:
-            found.update({c: float(v) for (c, _, _), v in zip(plan.columns[name].values(), values) if np.isfinite(v)})
-    return found
 
 
 def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,7 @@ from femsense.io.importers.frames import need
 from femsense.io.importers.ros_recovery import NotRos, RecoveredReader
 
 ENDINGS = (".bag", ".db3", ".mcap")
+BEGINNINGS = ((b"#ROSBAG V2.0", ".bag"), (b"\x89MCAP0", ".mcap"), (b"SQLite format 3\0", ".db3"))
 IMAGE = "sensor_msgs/msg/Image"
 
 
@@ -82,27 +84,58 @@ class Bag:
             ) from None
 
 
+def content_ending(path: Path) -> str | None:
+    """Return the ending of a bag's content, whatever the file is called; None for what is no bag."""
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    return next((ending for begin, ending in BEGINNINGS if head.startswith(begin)), None)
+
+
+@contextmanager
+def _named_by_content(path: Path) -> Iterator[Path]:
+    """Yield a file under a name with the ending of its content: rosbags goes by the ending.
+
+    Raises:
+        InputError: no link can be made, so that the file must be renamed.
+    """
+    ending = content_ending(path) if path.is_file() else None
+    if ending in (None, path.suffix):
+        yield path
+        return
+    with TemporaryDirectory(prefix="femsense-") as folder:
+        link = Path(folder) / f"{path.stem}{ending}"
+        try:
+            link.symlink_to(path.resolve())
+        except OSError:
+            raise InputError(
+                "a bag with another ending", where=path, found=path.suffix, expected=f"rename it to {ending}"
+            ) from None
+        yield link
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a .bag, a .db3, a .mcap or a folder of ROS 2.
+    """Open a .bag, a .db3, a .mcap or a folder of ROS 2; of a file the content counts, not the ending.
 
     Raises:
         InputError: the package rosbags is missing, or the file is none of these, is empty, cut off or not indexed.
     """
     highlevel = need("rosbags.highlevel", "ros", "reading ROS bags")
     typesys = need("rosbags.typesys", "ros", "reading ROS bags")
-    files, store = _files(path), typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    try:
-        reader = highlevel.AnyReader(files, default_typestore=store)
-        reader.open()
-    except InputError:
-        raise
-    except Exception as error:  # rosbags raises what zlib, sqlite, YAML and struct raise, beside its own
-        reader = _without_metadata(path, highlevel, store, error) if path.is_dir() else _recovered(path, error)
-    try:
-        yield Bag(path, reader)
-    finally:
-        reader.close()
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with _named_by_content(path) as named:
+        files = _files(named)
+        try:
+            reader = highlevel.AnyReader(files, default_typestore=store)
+            reader.open()
+        except InputError:
+            raise
+        except Exception as error:  # rosbags raises what zlib, sqlite, YAML and struct raise, beside its own
+            reader = _without_metadata(path, highlevel, store, error) if path.is_dir() else _recovered(path, error)
+        try:
+            yield Bag(path, reader)
+        finally:
+            reader.close()
 
 
 def _without_metadata(path: Path, highlevel: Any, store: Any, error: Exception) -> Any:
@@ -166,7 +199,14 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     hint = None
     if "index" in text.lower():
         hint = "it was not closed properly: `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) mends it"
-    elif path.suffix == ".mcap":
+    elif path.is_file() and content_ending(path) is None:
+        return InputError(
+            "not readable as a ROS bag: it is none",
+            where=path,
+            found=_head(path),
+            expected="a whole .bag, .db3, .mcap or ROS 2 folder",
+        )
+    elif path.is_file() and content_ending(path) == ".mcap":
         hint = "it was not closed properly: `mcap recover FILE` mends it"
     return InputError(
         "not readable as a ROS bag", where=path, found=text, expected="a whole .bag, .db3, .mcap or ROS 2 folder", hint=hint
@@ -178,6 +218,11 @@ def _library_errors() -> tuple[type[Exception], ...]:
     rosbags2 = need("rosbags.rosbag2", "ros", "reading ROS bags")
     apsw = need("apsw", "ros", "reading ROS bags")
     return rosbags1.ReaderError, rosbags2.ReaderError, apsw.Error
+
+
+def _head(path: Path) -> str:
+    with path.open("rb") as stream:
+        return f"a file that begins {stream.read(12)!r}"
 
 
 def _line(error: BaseException) -> str:

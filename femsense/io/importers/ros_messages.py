@@ -127,14 +127,19 @@ def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(swapped)
 
 
-def lens_of(message: Any, where: str | Path | None) -> Lens:
+def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Lens:
     """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for the images that its region and binning leave.
+
+    Images as they come have the matrix K and the distortion D; rectified ones have the matrix P and no distortion.
 
     image_geometry, `PinholeCameraModel`: a region moves the centre, binning divides.
     """
     K = np.asarray(getattr(message, "k", None) if hasattr(message, "k") else message.K, dtype=float).ravel()
     D = np.asarray(getattr(message, "d", None) if hasattr(message, "d") else message.D, dtype=float).ravel()
     name = message.distortion_model.strip().lower()
+    P = np.asarray(getattr(message, "p", None) if hasattr(message, "p") else message.P, dtype=float).ravel()
+    if rectified and len(P) == 12 and P[0] > 0 and P[5] > 0:
+        K, D = P.reshape(3, 4)[:, :3].ravel(), np.zeros(0)
     if len(K) != 9 or K[0] <= 0 or K[4] <= 0:
         raise InputError("a camera without a lens", where=where, found=f"K = {K.tolist()}", expected="focal lengths > 0")
     model = MODELS.get(name)

@@ -42,12 +42,17 @@ class NotRos(InputError):
     """An MCAP file without messages of ROS."""
 
 
+def _is_mcap(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+
+
 class RecoveredReader:
     """Stands for a reader of `rosbags`: the same messages as far as the file goes."""
 
     def __init__(self, path: Path) -> None:
         """path: a .bag or an .mcap file. Raises InputError where not one message is whole."""
-        self.path, self.bare = path, path.suffix == ".bag"
+        self.path, self.bare = path, not _is_mcap(path)
         found: dict[int, Connection] = {}
         counts: dict[int, int] = {}
         for item in self._records():

@@ -23,6 +23,8 @@ INPUTS = ("JointState", "Float64MultiArray", "Float32MultiArray", "FluidPressure
 TRANSPORTS = ("/compressedDepth", "/compressed", "/theora", "/ffmpeg")
 INFRARED = re.compile(r"(^|[/_])(ir|infra\d?|infrared\d?)([/_]|$)")
 """Names of topics whose images of 16 bits are no depth."""
+RECTIFIED = re.compile(r"(^|[/_])rect(_[^/]*)?$")
+"""Names of topics whose images have no distortion any more, such as image_rect and image_rect_raw (image_proc)."""
 KINDS = ("depth", "cloud", "color", "grey", "markers", "inputs", "loads", "other")
 
 
@@ -255,7 +257,7 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
     frame, folder = stamp_of(info)[1], _base(stream.topic.name).rpartition("/")[0]
     if frame and stream.frame and frame != stream.frame and not first.topic.startswith((f"{folder}/", "/device_")):
         return None  # another camera's
-    lens = lens_of(info, f"{bag.path}, topic {first.topic}")
+    lens = lens_of(info, f"{bag.path}, topic {first.topic}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
     model = _sdk_model(bag, stream.topic.name)
     return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
 

@@ -81,14 +81,14 @@ def _markers(journal: Journal) -> dict[str, Any]:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     most, loads, frames = 0, 0, 0
     swaps: dict[str, _Swaps] = {}
-    for number, entry in enumerate(journal.entries()):
-        frames, loads = number + 1, loads + len(entry.loads)
+    for entry in journal.entries():
+        frames, loads = frames + 1, loads + len(entry.loads)
         for camera, one in entry.seen.items():
             most = max(most, len(one.unlabelled))
             places = np.array([*one.markers.values(), *one.unlabelled], dtype=float).reshape(-1, 3)
             if len(places):
                 low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
-            swaps.setdefault(camera, _Swaps()).look(number, one.markers)
+            swaps.setdefault(camera, _Swaps()).look(entry.number, one.markers)
         for name in {name for one in entry.seen.values() for name in one.markers}:
             seen[name] = seen.get(name, 0) + 1
     swapped = [item for one in swaps.values() for item in one.found]

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.files import PART_PREFIX, followed, write_csv, write_json, write_toml
 from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.input_samples import spans
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
 from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.summary import summary
@@ -128,7 +130,7 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
     seen = {name: _write_view(own, one, part, name, number) for name, own, one in looking}
     loads = [[*np.asarray(p, dtype=float).tolist(), *np.asarray(f, dtype=float).tolist()] for p, f in frame.loads]
     inputs = {name: float(value) for name, value in frame.inputs.items()}
-    return Entry(float(frame.time), inputs, loads, seen)
+    return Entry(float(frame.time), inputs, loads, seen, number)
 
 
 def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int) -> Seen:
@@ -192,17 +194,19 @@ def _finish(
             "no frames", where=source.path, found=f"{source.format} without a frame", expected="frames in order of time"
         )
     applied, aligned = (None, {}) if log is None else align(log, journal, offset)
-    columns = _input_columns(journal) + ([] if applied is None else list(applied.columns))
+    columns = list(dict.fromkeys([*_input_columns(journal), *(() if applied is None else applied.columns)]))
     kind = _actuation(source, columns, actuation or (log.actuation if log is not None else None))
     zero_kind = zero or ("unknown" if kind == "displacement" and columns else "absolute")
     write_toml(part / "recording.toml", _document(source, kind, zero_kind, part))
-    rows = _frame_rows(journal, times[0], columns, {} if applied is None else applied.at(times), source.free)
+    values = _known_inputs(source, part, journal, columns, {} if applied is None else applied.at(times))
+    rows = _frame_rows(journal, times[0], values, source.free)
     write_csv(part / "frames.csv", ["frame", "time_s", *columns, *(["free"] if source.free else [])], rows)
     camera = ["camera"] if source.views else []
     _write_rows(part / "markers.csv", ["frame", *camera, "marker", *PLACE_COLUMNS], _marker_rows(journal))
     _write_rows(part / "loads.csv", ["frame", *PLACE_COLUMNS, *FORCE_COLUMNS], _load_rows(journal))
     return {
         **summary(source, journal, counts),
+        **({"frames_left_out": len(journal.left_out)} if journal.left_out else {}),
         "actuation": kind if columns else None,
         "actuation_zero": zero_kind if columns else None,
         "inputs": columns,
@@ -215,6 +219,48 @@ def _input_columns(journal: Journal) -> list[str]:
     for entry in journal.entries():
         columns.update(dict.fromkeys(entry.inputs))
     return sorted(columns)
+
+
+def _known_inputs(
+    source: Source, part: Path, journal: Journal, columns: list[str], applied: Mapping[str, FloatArray]
+) -> FloatArray:
+    """Return the inputs of all frames, shape (frames, columns); those where one is not known are left out, with a warning.
+
+    Raises:
+        InputError: none are left.
+    """
+    times = journal.times()
+    values = np.full((len(times), len(columns)), np.nan)
+    loads = np.ones(len(times), dtype=bool)
+    for entry in journal.entries():
+        values[entry.number] = [entry.inputs.get(name, np.nan) for name in columns]
+        loads[entry.number] = np.isfinite(np.array(entry.loads)).all()
+    for name, column in applied.items():
+        values[:, columns.index(name)] = column
+    lost = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~loads)
+    if not len(lost):
+        return values
+    lacking = [name for name, column in zip(columns, values.T) if not np.isfinite(column).all()]
+    told = ", ".join([*lacking, *(() if loads.all() else ("known loads",))])
+    if len(lost) == len(times):
+        raise InputError(
+            "no frame whose inputs are known",
+            where=source.path,
+            found=f"none of {len(times)} frames, {times[0]:.3f} … {times[-1]:.3f} s, has a value of each of {told}",
+            expected="values before and after a frame, on the frames' clock",
+            hint="--clock header|record, or --actuation FILE with a row at each end of what is known to be constant",
+        )
+    warnings.warn(
+        f"{source.path}: {len(lost)} of {len(times)} frames are left out, since {told} "
+        f"{'are' if ',' in told else 'is'} not known then: {spans(lost.tolist(), times - times[0])}",
+        stacklevel=3,
+    )
+    journal.left_out = frozenset(lost.tolist())
+    for folder, ending in (("clouds", "ply"), ("depth", "png"), ("color", "png")):
+        for view in source.views or ("",):
+            for number in journal.left_out:
+                (part / folder / view / f"{number:06d}.{ending}").unlink(missing_ok=True)
+    return values
 
 
 def _actuation(source: Source, columns: list[str], said: str | None) -> str:
@@ -264,28 +310,25 @@ def _lens(source: Source, images: Path) -> dict[str, Any]:
 
 
 def _frame_rows(
-    journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any], free: Sequence[tuple[float, float]]
+    journal: Journal, start: float, values: FloatArray, free: Sequence[tuple[float, float]]
 ) -> Iterator[Sequence[object]]:
-    held: dict[str, float] = {}
-    for number, entry in enumerate(journal.entries()):
-        held.update(entry.inputs)
-        values = [applied[name][number] if name in applied else held.get(name, 0.0) for name in columns]
+    for entry in journal.entries():
         time = entry.time - start
         told = [int(any(first - EXACT <= time <= last + EXACT for first, last in free))] if free else []
-        yield [number, time, *values, *told]
+        yield [entry.number, time, *values[entry.number].tolist(), *told]
 
 
 def _marker_rows(journal: Journal) -> Iterator[Sequence[object]]:
-    for number, entry in enumerate(journal.entries()):
+    for entry in journal.entries():
         for camera, seen in entry.seen.items():
-            begin = [number, camera] if camera else [number]
+            begin = [entry.number, camera] if camera else [entry.number]
             yield from ([*begin, name, *place] for name, place in seen.markers.items())
             yield from ([*begin, "", *place] for place in seen.unlabelled)
 
 
 def _load_rows(journal: Journal) -> Iterator[Sequence[object]]:
-    for number, entry in enumerate(journal.entries()):
-        yield from ([number, *load] for load in entry.loads)
+    for entry in journal.entries():
+        yield from ([entry.number, *load] for load in entry.loads)
 
 
 def _write_rows(path: Path, columns: list[str], rows: Iterator[Sequence[object]]) -> None:

@@ -13,7 +13,7 @@ pytest.importorskip("rosbags")
 from imported import imported, without_invalid
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from ros_writers import START_NS, STEP_NS, BagWriter, color_of, depth_of, write_camera
+from ros_writers import LENS, START_NS, STEP_NS, BagWriter, color_of, depth_of, write_camera
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
@@ -226,3 +226,32 @@ def test_pictures_that_show_nothing_are_counted(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="2 of 3 pictures show nothing"):
         _, found = imported(tmp_path / "take", tmp_path)
     assert found["empty_pictures"] == 2
+
+
+@pytest.mark.parametrize(("topic", "lens"), [("image_rect", (40.0, 41.0, 30.0, 22.0)), ("image_raw", LENS)])
+def test_rectified_depth_has_the_projection_matrix_and_no_distortion(topic: str, lens: tuple, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        info = bag.info(START_NS, d=(0.1, 0.0, 0.0, 0.0, 0.0))
+        info.p[[0, 5, 2, 6]] = [40.0, 41.0, 30.0, 22.0]
+        bag.write("/cam/depth/camera_info", START_NS, info)
+        bag.write(f"/cam/depth/{topic}", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+    found = imported(tmp_path / "take", tmp_path)[0].cameras[0]
+    assert found is not None and (found.fx, found.fy, found.cx, found.cy) == lens
+    assert bool(np.any(np.asarray(found.distortion) != 0.0)) == (topic == "image_raw")
+
+
+@pytest.mark.parametrize("name", ["TAKE.BAG", "take", "take.mcap"])
+@pytest.mark.parametrize("kind", ["1", "sqlite3"])
+def test_the_content_tells_a_bag_and_not_its_ending(kind: str, name: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a.bag" if kind == "1" else "a")
+    with BagWriter(path, kind) as bag:
+        write_camera(bag, 3)
+    (path if path.is_file() else next(path.glob("*.db3"))).rename(tmp_path / name)
+    assert imported(tmp_path / name, tmp_path)[0].frame_count == 3
+
+
+def test_noise_with_the_ending_of_a_bag_is_called_none(tmp_path: Path) -> None:
+    (tmp_path / "take.mcap").write_bytes(np.random.default_rng(0).bytes(500))
+    with pytest.raises(InputError, match="it is none") as caught:
+        open_source(tmp_path / "take.mcap")
+    assert "recover" not in str(caught.value)

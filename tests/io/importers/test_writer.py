@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -105,14 +104,6 @@ def test_swapped_labels_are_named(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="a and b at frame 20"):
         found = write_recording(Source("test", Path("x"), items), tmp_path / "out", identity={})
     assert found["label_swaps"] == 1
-
-
-def test_an_input_that_comes_later_is_zero_before_and_held_after(tmp_path: Path) -> None:
-    values = [{}, {"cable_a": 1.0}, {}, {"cable_a": 3.0}]
-    made = Source("test", Path("x"), lambda: (Frame(0.1 * k, inputs=v) for k, v in enumerate(values)), actuation="tension")
-    write_recording(made, tmp_path / "out", identity={})
-    with (tmp_path / "out/frames.csv").open() as stream:
-        assert [float(row["cable_a"]) for row in csv.DictReader(stream)] == [0.0, 1.0, 1.0, 3.0]
 
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
