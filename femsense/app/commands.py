@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -236,13 +237,17 @@ def script_plan(
     from femsense.loop.design.planner import identifiability_of_script
     from femsense.rig.camera import pose_of
     from femsense.rig.force_map import force_map
-    from femsense.rig.force_map_files import force_document, force_text, write_force_map
+    from femsense.rig.force_map_files import check_force_map, force_document, force_text, write_force_map
     from femsense.rig.script import read_script
 
     body, table = load_robot(robot), read_script(script)
+    if folder is not None:
+        check_force_map(folder)
     identifiability = identifiability_of_script(body, table, Path(script), noise=noise)
     document, text = identifiability_document(identifiability), identifiability_text(identifiability)
     if table.clouds.kind == "none":
+        if folder is not None:
+            warnings.warn(f"nothing is written to {folder}: a map of forces needs [clouds] in the script", stacklevel=2)
         return document, text
     found = force_map(body, table, Path(script))
     files = [] if folder is None else write_force_map(found, Path(folder), pose_of(next(iter(table.views.values()))))
@@ -275,7 +280,8 @@ def plan_into(
     Raises:
         FemsenseError: bad input, or a robot without an equilibrium.
     """
-    from femsense.io.files import write_toml
+    from femsense.io.files import check_target, write_toml
+    from femsense.io.own_files import SCRIPT
     from femsense.loop.design.advice import proposal_text
     from femsense.loop.design.documents import proposal_document
     from femsense.loop.design.planner import plan_experiment
@@ -284,13 +290,16 @@ def plan_into(
         raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")
     if file is not None and Path(file).suffix != ".toml":
         raise InputError("not the name of a script", where="-o", found=str(file), expected="a file that ends in .toml")
+    if file is not None:
+        check_target(file, folder=False, kind=SCRIPT)
     recording = None if given is None else load_recording(given)
     proposal = plan_experiment(load_robot(robot), control=control, noise=noise, frames=frames, given=recording, progress=progress)
     files = []
     for name, script in proposal.scripts().items() if file is not None else ():
         target = Path(str(file))
         target = target.with_stem(target.stem + name)
-        write_toml(target, script)
+        check_target(target, folder=False, kind=SCRIPT)
+        write_toml(target, script, comment="written by femsense improve --plan")
         files.append(str(target))
     text = proposal_text(proposal) + "".join(
         f"\n\nwritten: {f} (femsense simulate ROBOT {f} -o RECORDING tries it)" for f in files

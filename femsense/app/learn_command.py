@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from femsense.core.errors import InputError
 from femsense.io.files import check_target
+from femsense.io.own_files import MODEL
 
 if TYPE_CHECKING:
     from femsense.xr.proprioception.labelled import Labelled
@@ -50,7 +51,8 @@ def learn_into(
         raise InputError(
             "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
         )
-    check_target(output, folder=False)
+    used = [*files, *(test or ()), *([] if adapt is None else [adapt])]
+    check_target(output, folder=False, kind=MODEL, inputs=used)
     data = read_labelled(*files)
     other = None if test is None else read_labelled(*test)
     if adapt is not None:

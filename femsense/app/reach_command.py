@@ -10,7 +10,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.files import write_json
+from femsense.io.files import check_target, write_json
+from femsense.io.own_files import MOTION
 from femsense.model.robot import Robot
 
 FORMAT = "femsense-motion-1"
@@ -41,6 +42,8 @@ def reach_targets(
     from femsense.control.search import ReachOptions
     from femsense.io.robot_toml import load_robot
 
+    if output is not None:
+        check_target(output, folder=False, kind=MOTION)
     body = load_robot(robot)
     wanted = dict(_target(text) for text in targets)
     _check_size(body, wanted)

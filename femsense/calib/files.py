@@ -11,7 +11,8 @@ from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
-from femsense.io.files import plain, write_json
+from femsense.io.files import check_target, plain, write_json
+from femsense.io.own_files import CALIBRATION
 from femsense.io.result_folder import number_of, numbers_of, read_document, table_of, value_of
 
 CALIBRATION_FORMAT = "femsense-calibration-1"
@@ -53,12 +54,13 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
-    """Write calibration.json and return its path. Raises InputError where the path is a folder."""
+    """Write calibration.json and return its path. Raises InputError where a folder or another file stands there."""
     target = Path(path)
     if target.is_dir():
         raise InputError(
             "a folder stands where the file should be written", where=target, hint=f"-o {target / 'calibration.json'}"
         )
+    check_target(target, folder=False, kind=CALIBRATION)
     write_json(target, calibration_document(calibration))
     return target
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import json
 import math
@@ -12,14 +13,16 @@ import secrets
 import shutil
 import stat
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.io.own_files import FileKind, check_replaceable
 
 PART_PREFIX = ".part-"
 """Names of unfinished files and folders start so."""
@@ -58,8 +61,18 @@ def write_beside(path: str | Path) -> Iterator[Path]:
         _remove(part)
 
 
-def check_target(path: str | Path, *, folder: bool) -> None:
-    """Refuse, before anything is computed, a place where no result can be written. Raises InputError."""
+def check_target(path: str | Path, *, folder: bool, kind: FileKind | None = None, inputs: Iterable[str | Path] = ()) -> None:
+    """Refuse, before anything is computed, a place where no result can be written.
+
+    Arguments:
+        path: the place.
+        folder: a folder is to be written there.
+        kind: what a file that stands there must be, to be replaced.
+        inputs: files that the result is made from: none of them is replaced.
+
+    Raises:
+        InputError: with what stands there.
+    """
     if writes_through(path):
         if folder:
             raise _wrong_kind(path, "a device or a pipe", "a folder")
@@ -73,6 +86,7 @@ def check_target(path: str | Path, *, folder: bool) -> None:
     if nearest == final:
         _check_writable(final)
         _check_kind(final, folder=folder)
+    check_replaceable(final, kind, inputs)
 
 
 def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
@@ -113,10 +127,25 @@ def _through(final: Path) -> Iterator[Path]:
         if part.is_dir():
             raise _wrong_kind(final, "a device or a pipe", "a folder")
         try:
-            with part.open("rb") as source, final.open("r+b" if final.is_block_device() else "wb") as sink:
+            with part.open("rb") as source, _opened(final) as sink:
                 shutil.copyfileobj(source, sink)
         except OSError as error:
             raise _refusal(final, error.strerror or "an error of the system") from None
+
+
+def _opened(final: Path) -> BinaryIO:
+    """Open a device or a pipe for writing; a pipe that nobody reads is waited for, as the system does, and that is said."""
+    if final.is_fifo():
+        try:
+            handle = os.open(final, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO:
+                raise
+            warnings.warn(f"{final} is a pipe that nobody reads: waiting for a reader", stacklevel=2)
+        else:
+            os.set_blocking(handle, True)
+            return os.fdopen(handle, "wb")
+    return final.open("r+b" if final.is_block_device() else "wb")
 
 
 def followed(path: str | Path) -> Path:
@@ -171,14 +200,15 @@ def json_text(data: Any, *, indent: int | None = 2) -> str:
     return json.dumps(plain(data), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
-def write_toml(path: str | Path, document: Mapping[str, Any]) -> None:
-    """Write a TOML document.
+def write_toml(path: str | Path, document: Mapping[str, Any], *, comment: str = "") -> None:
+    """Write a TOML document, after a line of comment if one is given.
 
     Arrays become lists; numbers are written so that they read back the same; points stay on one line.
     """
     import tomli_w
 
-    write_text(path, _on_one_line(tomli_w.dumps(plain(document, nonfinite=True))))
+    text = _on_one_line(tomli_w.dumps(plain(document, nonfinite=True)))
+    write_text(path, f"# {comment}\n{text}" if comment else text)
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

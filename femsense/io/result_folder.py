@@ -12,6 +12,7 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.io.files import PART_PREFIX, check_target, write_beside
+from femsense.io.own_files import FileKind, check_files
 
 # Parts
 
@@ -36,8 +37,9 @@ def results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
             os.replace(file, root / file.name)
 
 
-def check_folder(root: Path, not_beside: Sequence[str]) -> None:
-    """Raise InputError where results cannot be written into a folder, or would mix with a file named in `not_beside`."""
+def check_folder(root: Path, not_beside: Sequence[str], kinds: Mapping[str, FileKind]) -> None:
+    """Raise InputError where results cannot be written into a folder, would mix with a file named in `not_beside`, or replace a
+    file of another kind than its name has in `kinds`."""
     foreign = next((name for name in not_beside if (root / name).is_file()), None)
     if foreign is not None:
         raise InputError(
@@ -50,6 +52,7 @@ def check_folder(root: Path, not_beside: Sequence[str]) -> None:
     if root.exists() and not root.is_dir():
         raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
     check_target(root, folder=True)
+    check_files(root, kinds)
 
 
 def read_document(file: Path, expected: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from femsense.io.files import plain, write_json
+from femsense.io.own_files import LOOP
 from femsense.io.provenance import recording_input, robot_input, versions
 from femsense.io.result_folder import check_folder, read_document, results_folder
 
@@ -54,7 +55,7 @@ def check_loop_folder(folder: str | Path) -> None:
     """Raise InputError where a loop cannot be written: in a recording, a run or a robot that no loop wrote, or at a file."""
     root = Path(folder).expanduser()
     own = (root / "loop.json").is_file()
-    check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"))
+    check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"), LOOP)
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:

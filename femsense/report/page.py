@@ -249,7 +249,7 @@ def page(title: str, kind: str, chapters: Sequence[Chapter]) -> str:
     )
     head = (
         f'<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, '
-        f'initial-scale=1">\n<title>{escape(title)}</title>\n<style>{STYLE}</style>'
+        f'initial-scale=1">\n<meta name="generator" content="femsense">\n<title>{escape(title)}</title>\n<style>{STYLE}</style>'
     )
     foot = element("footer", "Lengths are 3-D distances unless the text says otherwise; ± is one standard deviation.")
     return (

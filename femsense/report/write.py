@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from femsense.core.errors import InputError
-from femsense.io.files import write_text
+from femsense.io.files import check_target, write_text
+from femsense.io.own_files import REPORT
 from femsense.report.calibration import calibration_chapter
 from femsense.report.compare import comparison_chapter
 from femsense.report.found import Found, find_results
@@ -33,7 +34,7 @@ def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
         the file.
 
     Raises:
-        InputError: no such folder, no results in it, a broken file among them, or a folder where the file should be written.
+        InputError: no such folder, no results in it, a broken file among them, or a folder or another file where it should be written.
     """
     root = Path(folder).expanduser()
     target = root / "report.html" if path is None else Path(path).expanduser()
@@ -44,7 +45,9 @@ def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
             expected="the name of a file",
             hint=str(target / "report.html"),
         )
-    write_text(target, report_html(root))
+    text = report_html(root)
+    check_target(target, folder=False, kind=REPORT)
+    write_text(target, text)
     return target
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import triangle_normals
-from femsense.io.files import write_beside, write_csv
+from femsense.io.files import check_target, followed, write_beside, write_csv
+from femsense.io.own_files import FORCE_MAP, check_files
 from femsense.rig.force_map import ForceMap
 
 LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -59,9 +60,16 @@ def force_text(found: ForceMap) -> str:
     return "\n".join(lines)
 
 
+def check_force_map(folder: str | Path) -> None:
+    """Raise InputError where a map of forces cannot be written: at a file, or where other files have its names."""
+    check_target(folder, folder=True)
+    check_files(followed(folder), FORCE_MAP)
+
+
 def write_force_map(found: ForceMap, folder: Path, T_robot_camera: FloatArray) -> list[Path]:
     """Write forces.csv, forces.glb (colours at the vertices) and forces.png (from the camera and from behind);
-    return the files."""
+    return the files. Raises InputError: as `check_force_map`."""
+    check_force_map(folder)
     folder.mkdir(parents=True, exist_ok=True)
     table, mesh, picture = folder / "forces.csv", folder / "forces.glb", folder / "forces.png"
     columns = ("x_m", "y_m", "z_m", "normal_std_n", "tangent_std_n", "visible")
@@ -98,7 +106,11 @@ def _write_mesh(found: ForceMap, path: Path) -> None:
     colors = (255 * mpl.colormaps[COLORS](_scaled(found))).astype(np.uint8)
     mesh = trimesh.Trimesh(found.positions, found.triangles, vertex_colors=colors, process=False)
     with write_beside(path) as part:
-        part.write_bytes(mesh.export(file_type="glb"))
+        part.write_bytes(mesh.export(file_type="glb", tree_postprocessor=_sign))
+
+
+def _sign(tree: dict[str, Any]) -> None:
+    tree["asset"]["generator"] = "femsense"
 
 
 def _write_picture(found: ForceMap, path: Path, T_robot_camera: FloatArray) -> None:
@@ -126,4 +138,4 @@ def _write_picture(found: ForceMap, path: Path, T_robot_camera: FloatArray) -> N
         axes.set(aspect="equal", title=title, xlabel="mm", ylabel="mm")
     figure.colorbar(ScalarMappable(norm, COLORS), ax=figure.axes, label="one standard deviation of a force along the normal [N]")
     with write_beside(path) as part:
-        figure.savefig(part, dpi=120, format="png")
+        figure.savefig(part, dpi=120, format="png", metadata={"Software": "femsense"})

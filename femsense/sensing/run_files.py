@@ -19,6 +19,7 @@ from femsense.calib.files import calibration_document, write_calibration
 from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
 from femsense.io.files import json_text, write_beside, write_csv, write_json
+from femsense.io.own_files import RUN
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
 from femsense.io.result_folder import RUN_FILES, check_folder, read_document, results_folder, table_of
 from femsense.io.tables import read_csv
@@ -130,8 +131,8 @@ def write_run(
 
 
 def check_run_folder(folder: str | Path) -> None:
-    """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where a file stands."""
-    check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"))
+    """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where another file has its name."""
+    check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"), RUN)
 
 
 def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:

@@ -14,6 +14,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
 from femsense.io.files import check_target, write_beside
+from femsense.io.own_files import GLB, USDZ
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.glb_arrows import with_arrows
@@ -73,13 +74,13 @@ def export_glb(
         what was written, with the distance to the finite-element surface.
 
     Raises:
-        InputError: another ending, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
+        InputError: another ending, another file at that place, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
     """
     target = Path(path).expanduser()
     if target.suffix.lower() not in ENDINGS:
         hint = "--mcap and --rerun write for Foxglove and Rerun" if target.suffix.lower() in (".mcap", ".rrd") else None
         raise InputError("the ending names no format that is written", where=target, expected=" or ".join(ENDINGS), hint=hint)
-    check_target(target, folder=False)
+    check_target(target, folder=False, kind=GLB if target.suffix.lower() == ".glb" else USDZ)
     target.parent.mkdir(parents=True, exist_ok=True)
     if arrows:
         if target.suffix.lower() != ".glb":

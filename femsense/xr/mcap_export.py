@@ -11,6 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.io.files import check_target, write_beside
+from femsense.io.own_files import MCAP
 from femsense.model.recording import Recording
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, Run
@@ -48,9 +49,9 @@ def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
         path: the .mcap file.
 
     Raises:
-        InputError: no run, or the package mcap-ros2-support is missing.
+        InputError: no run, another file at that place, or the package mcap-ros2-support is missing.
     """
-    check_target(path, folder=False)
+    check_target(path, folder=False, kind=MCAP)
     run = read_run(folder)
     writer_module = needed("mcap_ros2.writer", package="mcap-ros2-support", extra="mcap", doing="writing MCAP")
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0

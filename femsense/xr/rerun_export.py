@@ -10,6 +10,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.io.files import check_target, write_beside
+from femsense.io.own_files import RERUN
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, FrameReport, Run
 from femsense.xr.extras import needed
@@ -39,9 +40,9 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
         path: the .rrd file.
 
     Raises:
-        InputError: no run, or the package rerun-sdk is missing.
+        InputError: no run, another file at that place, or the package rerun-sdk is missing.
     """
-    check_target(path, folder=False)
+    check_target(path, folder=False, kind=RERUN)
     rr, run = needed("rerun", package="rerun-sdk", extra="rerun", doing="writing .rrd"), read_run(folder)
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part:

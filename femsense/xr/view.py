@@ -14,6 +14,7 @@ from typing import Any
 
 from femsense.core.errors import FemsenseError, InputError, MissingDependency
 from femsense.io.files import check_target, followed
+from femsense.io.own_files import VIEW, check_files
 from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
 
 PAGE = Path(__file__).with_name("viewer") / "dist"
@@ -106,7 +107,8 @@ def write_static_page(folder: str | Path, out_dir: str | Path, *, page: Path = P
     run = run_folder(folder)
     out = Path(out_dir)
     check_target(out, folder=True)
-    foreign = [name for name in files if (out / name).exists() and not (out / "contacts.json").is_file()]
+    check_files(followed(out), VIEW)
+    foreign = [name for name in (*files, "fields.bin") if (out / name).exists() and not (out / "contacts.json").is_file()]
     if foreign:
         raise InputError(
             "something else stands there", where=out, found=", ".join(foreign), expected="a folder of its own", hint="another -o"

@@ -61,9 +61,12 @@ def export(
         shown = export_rerun(run, rerun)
         text = f"{shown.frames} frames, {shown.clouds} clouds, {shown.contacts} contacts"
         return Answer({"path": str(rerun), **asdict(shown)}, f"{text}\n\nwritten: {rerun}")
+    from femsense.io.files import check_target
     from femsense.xr.export import export_glb
     from femsense.xr.run_contents import skin_for_run
 
+    if skin is not None:
+        check_target(output, folder=False, inputs=[skin])
     worn = None if skin is None else skin_for_run(run, skin, unit=skin_unit, budget=vertices)
     report = export_glb(run, output, bones=bones, skin=worn, arrows=arrows)
     document = {name: getattr(report, name) for name in ("bones", "vertices", "frames", "rms_m", "max_m")}

@@ -32,11 +32,12 @@ def calibrate(
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.calib.files import calibration_document, write_calibration
     from femsense.io.files import check_target
+    from femsense.io.own_files import CALIBRATION
     from femsense.io.recording_folder import load_recording
     from femsense.io.robot_toml import load_robot
     from femsense.report.text import calibration_text
 
-    check_target(output, folder=False)
+    check_target(output, folder=False, kind=CALIBRATION)
     calibration = calibrate_recording(load_robot(robot), load_recording(recording), correct=correct)
     if not calibration.settled:
         text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from femsense.app.commands import estimate_into, improve_into
 from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
 from femsense.core.errors import FemsenseError, InputError
-from femsense.io.files import write_json
+from femsense.io.files import check_target, write_json
+from femsense.io.own_files import DEMO, check_files
 from femsense.io.provenance import versions
 from femsense.io.robot_toml import robot_names
 from femsense.report.loop.document import Effect
@@ -58,6 +59,8 @@ def run_demo(
     from femsense.xr.export import export_glb
 
     how, out, recording = steps or DemoSteps(), Path(folder), demo_recording(robot_names())
+    check_target(out, folder=True)
+    check_files(out, DEMO)
     say(f"1/4  forces with the robot as it is declared → {out / 'declared'}")
     before = how.estimate(out / "declared", ROBOT, recording, say=say, progress=progress)
     say(f"2/4  what does its model lack? → {out / 'loop'}")

@@ -40,7 +40,7 @@ def draw_demo(before: Run, after: Run, truth: Sequence[TrueContact], document: M
     _draw_forces(figure.add_subplot(grid[0, 1]), before, after, truth)
     _draw_residuals(figure.add_subplot(grid[1, 1]), document)
     with write_beside(path) as part:
-        figure.savefig(part, format="png")
+        figure.savefig(part, format="png", metadata={"Software": "femsense"})
     return Path(path)
 
 

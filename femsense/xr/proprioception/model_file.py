@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
-from femsense.io.files import json_text
+from femsense.io.files import check_target, json_text
+from femsense.io.own_files import MODEL
 from femsense.xr.armature import Armature
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
@@ -32,7 +33,8 @@ CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
-    """Write a model as an ONNX file and return its path."""
+    """Write a model as an ONNX file and return its path. Raises InputError where another file stands there."""
+    check_target(path, folder=False, kind=MODEL)
     width = len(model.channels)
     inputs = {"readings": width}
     nodes = []
