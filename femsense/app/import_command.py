@@ -16,7 +16,7 @@ from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
 from femsense.io.importers.mapping import mappable
-from femsense.io.importers.writer import RECORD, write_recording
+from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
@@ -98,6 +98,7 @@ def import_into(
     _check_options(options, inputs, zero)
     check_target(folder, folder=True)
     final = followed(folder)
+    _check_apart(paths, final)
     identity = _identity(paths, options, inputs, zero, actuation, offset)
     known = _standing(final, identity, again)
     if known is not None:
@@ -201,9 +202,28 @@ def _identity(
     }
 
 
+def _check_apart(paths: Sequence[str | Path], final: Path) -> None:
+    """Raise InputError where a capture is the recording itself, or a part of it that would be replaced."""
+    for place in (split_name(path)[1].resolve() for path in paths):
+        inside = place.is_relative_to(final.resolve())
+        if inside and (place.is_dir() or OWN_FILES.fullmatch(place.relative_to(final.resolve()).as_posix())):
+            raise InputError(
+                "the recording would replace what it is made from", where=place, found=f"-o {final}", expected="a new place"
+            )
+
+
 def _state(path: Path) -> list[Any]:
     if not path.exists():
         raise InputError("nothing there", where=path, expected="a file or a folder")
+    items = [path, *(path.rglob("*") if path.is_dir() else ())]
+    pipe = next((item for item in items if item.exists() and not item.is_file() and not item.is_dir()), None)
+    if pipe is not None:
+        raise InputError(
+            "a pipe or a device cannot be imported",
+            where=pipe,
+            expected="files, which are read more than once",
+            hint="cat it into a file first",
+        )
     files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
     stats = [file.stat() for file in files]
     return [str(path.resolve()), len(files), sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)]
@@ -222,6 +242,7 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
         )
     kept = json.loads(record.read_text(encoding="utf-8"))
     if again:
+        check_unchanged(final)
         return None
     if kept.get("identity") == json.loads(json.dumps(identity)):
         return dict(kept["found"])

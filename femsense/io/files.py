@@ -94,8 +94,7 @@ def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
 
     Unfinished files of femsense do not count; links do. Raises InputError.
     """
-    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    foreign = sorted(name for name in names if PART_PREFIX not in name and not own.fullmatch(name))
+    foreign = other_files(folder, own)
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
         raise InputError(
@@ -105,6 +104,12 @@ def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
             expected=f"a new folder, or {what} and nothing beside",
             hint="another -o",
         )
+
+
+def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
+    """Return what lies below a folder and `own` does not match, as paths from there; links count, unfinished files do not."""
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(name for name in names if PART_PREFIX not in name and not own.fullmatch(name))
 
 
 def writes_through(path: str | Path) -> bool:

@@ -71,6 +71,50 @@ def test_another_import_is_replaced_only_when_that_is_said(
     assert not list(tmp_path.glob(".part-*"))
 
 
+def test_again_keeps_the_files_of_others(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["import", table, "-o", tmp_path / "out", "--inputs", "tension", "--unit", "mm"]
+    assert answer(capsys, *words)[0] == 0
+    for name in ("notes.txt", "thesis/ch1.tex", "thesis/000001.ply", "rest.csv"):
+        (tmp_path / "out" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "out" / name).write_text(f"my {name}")
+    (tmp_path / "out" / "link").symlink_to(tmp_path)
+    (tmp_path / "out" / "rest.csv").write_text("marker,x_m,y_m,z_m\ntip,0,0,0\n")
+    assert answer(capsys, *words[:-1], "cm", "--again")[0] == 0
+    assert load_recording(tmp_path / "out").marker_xyz[1, 0] == pytest.approx(0.01)
+    assert (tmp_path / "out/notes.txt").read_text() == "my notes.txt" and (tmp_path / "out/link").is_symlink()
+    assert (tmp_path / "out/thesis/ch1.tex").is_file() and (tmp_path / "out/thesis/000001.ply").is_file()
+    assert (tmp_path / "out/rest.csv").is_file() and not list(tmp_path.glob(".part-*"))
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "recording.toml", "loads.csv"])
+def test_again_does_not_undo_changes_of_a_person(
+    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    words = ["import", table, "-o", tmp_path / "out", "--inputs", "tension", "--unit", "mm"]
+    assert answer(capsys, *words)[0] == 0
+    with (tmp_path / "out" / name).open("a") as stream:
+        stream.write("# changed\n")
+    changed = (tmp_path / "out" / name).read_text()
+    status, document = answer(capsys, *words, "--again")
+    assert status == 2 and name in document["error"] and "--free FROM:TO" in document["error"]
+    assert (tmp_path / "out" / name).read_text() == changed
+
+
+def test_a_pipe_is_no_capture_and_a_recording_not_its_own(
+    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "folder/000000.ply")
+    for source in (tmp_path / "folder/000000.ply", tmp_path / "folder"):
+        status, document = answer(capsys, "import", source, "-o", tmp_path / "out")
+        assert status == 2 and "a pipe or a device cannot be imported" in document["error"]
+    words = ["-o", tmp_path / "out", "--inputs", "tension", "--unit", "mm"]
+    assert answer(capsys, "import", table, *words)[0] == 0
+    for source in (tmp_path / "out", tmp_path / "out/markers.csv"):
+        status, document = answer(capsys, "import", source, *words, "--again")
+        assert status == 2 and "would replace what it is made from" in document["error"]
+
+
 def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/notes.txt").write_text("precious")

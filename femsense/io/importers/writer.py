@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import secrets
 import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +16,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.files import PART_PREFIX, followed, write_csv, write_json, write_toml
+from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_csv, write_json, write_toml
 from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.input_samples import spans
@@ -26,6 +29,11 @@ from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
 """What a recording was made from; lies in its folder."""
+TABLES = ("recording.toml", "frames.csv", "markers.csv", "loads.csv")
+OWN_FILES = re.compile(
+    "|".join(map(re.escape, (*TABLES, RECORD))) + r"|(clouds|depth|color)/([^/]+/)?\d{6,}\.(ply|png)",
+)
+"""Names of the files that an import writes: with `--again` only these give way."""
 EXACT = 1e-6
 """Times are as exact as this [s]."""
 Progress = Callable[..., None]
@@ -53,15 +61,17 @@ def write_recording(
         zero: "absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero.
         log: inputs on a clock of their own.
         offset: source time minus the log's time [s]; None finds it from the motion.
-        replace: an earlier recording at this place goes when the new one is whole.
+        replace: an earlier import at this place goes when the new one is whole; other files in its folder stay.
         progress: called with (frames done, frames in all).
 
     Returns:
         what was found and written, as in import.json.
 
     Raises:
-        InputError: no frames, none of the pictures readable, columns whose meaning nobody said.
+        InputError: no frames, none of the pictures readable, columns whose meaning nobody said, tables that were changed since.
     """
+    if replace:
+        check_unchanged(followed(folder))
     if log is not None:
         if actuation and log.actuation not in (None, actuation):
             raise _another_kind(log.path, actuation, str(log.actuation))
@@ -72,7 +82,8 @@ def write_recording(
     with Journal(part, identity) as journal:
         counts = _write_frames(source, part, journal, progress)
     found = _finish(source, part, journal, counts, actuation, zero, log, offset)
-    write_json(part / RECORD, {"identity": identity, "found": found})
+    tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
+    write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
     (part / JOURNAL).unlink()
     _give_name(part, final, replace)
     return found
@@ -82,11 +93,34 @@ def _give_name(part: Path, final: Path, replace: bool) -> None:
     """Rename the finished folder. Raises InputError where something stands there that nobody said to replace."""
     if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
         raise InputError("something stands there already", where=final, expected="a new place for the recording")
-    old = final.with_name(f"{PART_PREFIX}old-{final.name}")
-    if final.exists():
-        final.rename(old)
+    if not final.exists():
+        part.rename(final)
+        return
+    check_unchanged(final)
+    old = final.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-old-{final.name}")
+    final.rename(old)
     part.rename(final)
+    for name in other_files(old, OWN_FILES):
+        (final / name).parent.mkdir(parents=True, exist_ok=True)
+        (old / name).rename(final / name)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def check_unchanged(folder: Path) -> None:
+    """Refuse to replace an import whose tables somebody changed since, or added to. Raises InputError."""
+    if not (folder / RECORD).is_file():
+        return
+    written = json.loads((folder / RECORD).read_text(encoding="utf-8")).get("tables", {})
+    there = [name for name in TABLES if (folder / name).exists()]
+    changed = [name for name in there if not (folder / name).is_file() or file_hash(folder / name) != written.get(name)]
+    if changed:
+        raise InputError(
+            "tables were changed since the import and would be replaced",
+            where=folder,
+            found=", ".join(changed),
+            expected="the tables as they were imported",
+            hint="a new place and the changes made there again; --free FROM:TO instead of a column free",
+        )
 
 
 def _prepare(part: Path, identity: Mapping[str, Any]) -> None:
