@@ -15,6 +15,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
+from femsense.sensing.afar import from_afar
 from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std
@@ -34,8 +35,7 @@ ACROSS = 0.3
 MOST = 4
 """Contacts a frame at most."""
 GIVEN_ROUNDS = 5
-"""How often robot and surroundings are separated at most where the places are given: a weight that moves a tip by a tenth of the body's
-diagonal took two to three."""
+"""How often robot and surroundings are separated at most where the places are given; two or three times are usual."""
 SETTLED = 0.005
 """They are separated where the number of the robot's points changes by less than this share of it."""
 ROUNDS = 2
@@ -51,25 +51,29 @@ THIN = 2000
 def explain(
     sensor: Sensor,
     k: int,
+    whole: Scan | None,
     scan: Scan | None,
     shapes: list[Shape],
     free: Fit,
     previous: SensedFrame | None,
     before: tuple[FloatArray, ...] | None,
-) -> Fit:
-    """Return the contacts and forces that explain frame k; those that do not make the misfit smaller are left out."""
+) -> tuple[Scan | None, Fit, Fit]:
+    """Return the contacts and forces that explain frame k, with the scan and the fit without forces that go with them.
+
+    Contacts that do not make the misfit smaller are left out. `whole` is every point that was measured, `scan` what `segmented` made of it.
+    """
     if scan is None or len(sensor.places):
         touches = given_touches(sensor)
-        if not touches:
-            return free
-        return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
+        fit = fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before) if touches else None
+        return scan, _better(free, fit), free
     if said_free(sensor, k):
-        return free
+        return scan, free, free
     again = _held(sensor, k, scan, shapes, free, previous, before)
     if again is not None and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
-        return again
+        return scan, again, free
     fit = _with_objects(sensor, k, scan, shapes, free, free if again is None else again, before)
-    return _with_hidden(sensor, k, scan, fit, free, before)
+    scan, fit, free = from_afar(sensor, k, whole, scan, fit, free, before)
+    return scan, _with_hidden(sensor, k, scan, fit, free, before), free
 
 
 def segmented(
@@ -83,11 +87,7 @@ def segmented(
     """Return the scan with robot and surroundings apart, neighbouring points averaged, and the fit without forces to what is the robot's.
 
     Where colour has not separated them, the shape is explained first, with all points; what then lies off the surface is something else.
-
-    Arguments:
-        alone: the state without forces.
-        previous: the frame before.
-        before: tensions along the cables until now (friction).
+    `alone` is the state without forces.
     """
     response, near = None if previous is None else previous.free_response, foretold(previous, alone)
     if scan is None:

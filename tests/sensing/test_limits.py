@@ -56,6 +56,16 @@ def test_a_large_force_that_comes_at_once_is_reached_by_steps(tmp_path):
     assert run.frames[3].rms_after_m < 0.2 * run.frames[3].rms_before_m
 
 
+def test_a_body_that_a_touch_has_moved_far_at_once_is_found(tmp_path):
+    """So many rays miss the state without forces that no step from there leads on."""
+    seen = touched(tmp_path, np.array([0.0, 0, -0.8]), ball=True)
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    moved = np.abs(run.states.nodes_m[3] - run.states.nodes_m[2]).max()
+    assert run.frames[3].status == "ok"
+    assert moved > 0.3 * np.linalg.norm(np.ptp(run.states.rest_nodes_m, axis=0))
+    assert run.contacts[-1].force_n == pytest.approx(0.8, rel=0.08)
+
+
 def test_a_frame_that_nothing_explains_is_not_ok(tmp_path):
     """In the last frame the whole arm is seen 3 mm beside where it can be."""
     seen = touched(tmp_path, np.zeros(3), ball=False)
