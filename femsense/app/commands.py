@@ -129,6 +129,7 @@ def improve_into(
             hint="without --validation whole sweeps are held out",
         )
     body = load_robot(robot)
+    check_loop_folder(folder, body)
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
     own = {str(file): file_hash(Path(file)) for file in how.user_effects if Path(file).is_file()}
     inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=how.measured)

@@ -7,10 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from femsense.core.errors import InputError
 from femsense.io.files import plain, write_json
+from femsense.io.mesh_files import mesh_companions
 from femsense.io.own_files import LOOP
 from femsense.io.provenance import recording_input, robot_input, versions
 from femsense.io.result_folder import check_folder, read_document, results_folder
+from femsense.io.robot_toml import robot_document, save_robot
 
 if TYPE_CHECKING:
     from femsense.loop.result.loop_result import LoopResult
@@ -40,9 +43,7 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     Raises:
         InputError: see `check_loop_folder`.
     """
-    from femsense.io.robot_toml import save_robot
-
-    check_loop_folder(folder)
+    check_loop_folder(folder, loop.declared)
     with results_folder(folder, "loop.json") as part:
         declared = (loop.declared.document or {}).get("effects", [])
         handed_back = replace(loop.declared, correction=loop.robot.correction)
@@ -51,11 +52,33 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     return Path(folder)
 
 
-def check_loop_folder(folder: str | Path) -> None:
-    """Raise InputError where a loop cannot be written: in a recording, a run or a robot that no loop wrote, or at a file."""
+def check_loop_folder(folder: str | Path, robot: Robot | None = None) -> None:
+    """Raise InputError where a loop cannot be written.
+
+    That is in a recording, a run or a robot that no loop wrote, at a file, or where other files have its names.
+
+    Arguments:
+        folder: the place.
+        robot: that it begins with: its own folder is none to write into, and no other mesh of its name is replaced.
+    """
     root = Path(folder).expanduser()
     own = (root / "loop.json").is_file()
     check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"), LOOP)
+    if robot is None:
+        return
+    if robot.folder is not None and root.exists() and root.samefile(robot.folder):
+        raise InputError("the result would replace the robot that it is made from", where=root, hint="another -o")
+    mesh = str(robot_document(robot)["mesh"]["file"])
+    files = [mesh] if robot.folder is None else [file.name for file in mesh_companions(robot.folder / mesh)]
+    foreign = [] if own else [name for name in files if (root / Path(name).name).exists()]
+    if foreign:
+        raise InputError(
+            "another mesh would be replaced",
+            where=root,
+            found=", ".join(foreign),
+            expected="a folder of its own",
+            hint="another -o",
+        )
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:

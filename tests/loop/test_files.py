@@ -59,6 +59,18 @@ def test_a_loop_replaces_its_own_robot_but_no_other(tmp_path: Path, robot: Robot
         write_loop(make_loop(robot), write_block_robot(tmp_path / "mine"))
 
 
+def test_a_loop_replaces_no_mesh_and_not_the_robot_it_is_made_from(tmp_path: Path, robot: Robot) -> None:
+    folder = write_loop(make_loop(robot), tmp_path / "out")
+    with pytest.raises(InputError, match="the result would replace the robot"):
+        write_loop(make_loop(load_robot(folder)), folder)
+    mesh = load_robot(folder).document["mesh"]["file"]  # type: ignore[index]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / mesh).write_text("mine", encoding="utf-8")
+    with pytest.raises(InputError, match=f"another mesh would be replaced\n  found:    {mesh}"):
+        write_loop(make_loop(robot), tmp_path / "mine")
+    assert (tmp_path / "mine" / mesh).read_text(encoding="utf-8") == "mine"
+
+
 def test_a_loop_is_not_written_at_a_file(tmp_path: Path, robot: Robot) -> None:
     (tmp_path / "file").write_text("x", encoding="utf-8")
     with pytest.raises(InputError, match="a file stands"):
