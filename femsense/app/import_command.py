@@ -22,6 +22,19 @@ Progress = Callable[..., None]
 Say = Callable[[str], None]
 MANY_FRAMES = 1000
 """Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
+USELESS = {
+    "realsense": ("--rate", "--up", "--unit"),
+    "ros": ("--rate",),
+    "kinect": ("--clock", "--rate", "--up", "--unit", "--topic"),
+    "c3d": ("--clock", "--rate"),
+    "optitrack": ("--clock",),
+    "vicon": ("--clock",),
+    "csv": ("--clock", "--topic"),
+    "tum": ("--clock", "--rate", "--up", "--unit", "--topic"),
+    "redwood": ("--clock", "--up", "--unit", "--topic"),
+    "clouds": ("--clock", "--topic"),
+}
+"""Options that have no effect on a format; what else has none is said by its importer."""
 ENOUGH_FRAMES = 300
 """… and where a robot moves slowly, so many say as much."""
 
@@ -117,7 +130,8 @@ def import_into(
         replace=again,
         progress=progress,
     )
-    return {**found, "notes": [*source.notes, *_thinning(found, options), *_free(found, options)], **_accepted(final, found)}
+    notes = [*source.notes, *_thinning(found, options), *_free(found, options), *_in_vain(found["format"], options)]
+    return {**found, "notes": notes, **_accepted(final, found)}
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
@@ -149,11 +163,24 @@ def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
     """Return what is said of a recording that does not tell when nothing touches the robot."""
     if options.free:
-        return ()
+        late = [f"{first:g}:{last:g}" for first, last in options.free if first > found["duration_s"] or last < 0]
+        return tuple(f"--free {span}: no frame lies there; the frames last {found['duration_s']:.4g} s" for span in late)
     return (
         f"nothing says when nothing touches the robot: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
         "frames.csv; calibrate and improve use these frames, and estimate learns from them how well camera and model agree",
     )
+
+
+def _in_vain(name: str, options: Options) -> tuple[str, ...]:
+    """Return what is said of options that have no effect on a format."""
+    said = {
+        "--clock": options.clock != "auto",
+        "--rate": options.rate is not None,
+        "--up": options.up is not None,
+        "--unit": options.unit is not None,
+        "--topic": bool(options.topics),
+    }
+    return tuple(f"{key} has no effect: {name} has no use for it" for key in USELESS.get(name, ()) if said[key])
 
 
 def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:

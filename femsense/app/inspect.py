@@ -9,6 +9,7 @@ from typing import Any
 from femsense.app.inspection.recordings import inspect_cloud, inspect_image, inspect_jpeg, inspect_recording
 from femsense.app.inspection.reports import Report, collected
 from femsense.app.inspection.results import (
+    inspect_cad,
     inspect_calibration,
     inspect_capture,
     inspect_folder,
@@ -26,8 +27,10 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import plain
+from femsense.io.importers.ros_bag import content_ending
 from femsense.io.mesh_files import SURFACE_ENDINGS
 from femsense.io.meshes.reading import file_format
+from femsense.io.meshing.cad import CAD_READ
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot, robot_names
 from femsense.io.tables import read_toml
@@ -61,7 +64,7 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
         robot: a recording is compared with this robot.
 
     Returns:
-        plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cloud, image, calibration, run, loop,
+        plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cad, cloud, image, calibration, run, loop,
         capture, table or unknown), what is in it with units in the names, and at the end `problems` and `warnings`,
         lists of texts.
 
@@ -134,8 +137,9 @@ def describe(report: Mapping[str, Any]) -> str:
         if texts:
             lines += ["", f"{len(texts)} {title if len(texts) > 1 else title[:-1]}:"]
             lines += [bullet(text) for text in texts]
-    if report["kind"] in ("capture", "table") and not report.get("problems"):
-        lines += ["", "this much was read; femsense import reads the rest"]
+    if report["kind"] in ("capture", "table", "cad") and not report.get("problems"):
+        command = "mesh" if report["kind"] == "cad" else "import"
+        lines += ["", f"this much was read; femsense {command} reads the rest"]
     elif not report.get("problems"):
         lines += ["", "nothing is wrong with it" if not report.get("warnings") else "no problems"]
     return "\n".join(lines)
@@ -147,6 +151,7 @@ TITLES = {
     "recording": "a recording",
     "mesh": "a mesh of tetrahedra",
     "surface": "a surface",
+    "cad": "a CAD file",
     "cloud": "a point cloud",
     "scene": "a glTF scene",
     "image": "an image",
@@ -214,7 +219,9 @@ def _kind_of_file(file: Path) -> tuple[str, Inspector]:
         return "scene", inspect_scene
     if ending in MESH_ENDINGS or file_format(file):
         return "mesh", inspect_mesh
-    if ending in CAPTURE_ENDINGS:
+    if ending in CAD_READ:
+        return "cad", inspect_cad
+    if ending in CAPTURE_ENDINGS or content_ending(file):
         return "capture", inspect_capture
     others: dict[str, tuple[str, Inspector]] = {
         ".jpg": ("image", inspect_jpeg),

@@ -255,3 +255,10 @@ def test_what_a_log_holds_is_asked_before_the_frames_are_read(
     assert run(words) == 2
     assert "--inputs tension" in capsys.readouterr().err and not list(tmp_path.glob(".part*"))
     assert run([*words, "--inputs", "tension", "--offset", "-100"]) == 0
+
+
+def test_options_without_effect_are_said(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("import", table, "-o", tmp_path / "out", "--unit", "mm", "--inputs", "tension")
+    status, document = answer(capsys, *words, "--free", "5:9", "--rate", "30", "--clock", "header")
+    notes = " ".join(document["notes"])
+    assert status == 0 and all(key in notes for key in ("--free 5:9", "--rate has no effect", "--clock has no effect"))

@@ -423,3 +423,14 @@ def test_a_scene_of_gltf_is_not_a_robot(tmp_path: Path) -> None:
 def write_bytes(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
+
+
+def test_a_cad_file_and_a_bag_without_its_ending(tmp_path: Path) -> None:
+    (tmp_path / "finger.step").write_text("ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\n#1=MANIFOLD_SOLID_BREP('',#2);\nENDSEC;\n")
+    report = inspect_path(tmp_path / "finger.step")
+    assert report["kind"] == "cad" and report["solids"] == 1 and not report["problems"]
+    assert "femsense mesh reads the rest" in describe(report)
+    (tmp_path / "other.stp").write_bytes(b"\x00\x01")
+    assert inspect_path(tmp_path / "other.stp")["problems"]
+    (tmp_path / "take").write_bytes(b"#ROSBAG V2.0\n")
+    assert inspect_path(tmp_path / "take")["kind"] == "capture"

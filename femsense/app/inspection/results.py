@@ -151,6 +151,17 @@ def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
     )
 
 
+def inspect_cad(file: Path, report: Report, problems: list[str]) -> None:
+    """Report what the text of a CAD file says; its shapes are not read."""
+    data = file.read_bytes()
+    report["bytes"] = len(data)
+    if file.suffix.lower() not in (".step", ".stp"):
+        return
+    report["solids"] = data.count(b"MANIFOLD_SOLID_BREP(") + data.count(b"BREP_WITH_VOIDS(")
+    if b"ISO-10303-21" not in data[:1000]:
+        problems.append(str(InputError("no STEP file", where=file, found=f"begins {data[:12]!r}", expected="ISO-10303-21")))
+
+
 def inspect_unknown(file: Path, report: Report, problems: list[str]) -> None:
     """Report a file of no known kind."""
     report["bytes"] = file.stat().st_size

@@ -111,8 +111,9 @@ def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[Ac
         raise InputError(
             "the log of actuation and the frames do not overlap",
             where=log.path,
-            found=f"log {moved.time_s[0]:.3f} … {moved.time_s[-1]:.3f} s, frames {times[0]:.3f} … {times[-1]:.3f} s",
+            found=f"log {log.time_s[0]:.3f} … {log.time_s[-1]:.3f} s, frames {times[0]:.3f} … {times[-1]:.3f} s, offset {offset:g} s",
             expected="the same clock, or --offset SECONDS (frames' time minus the log's)",
+            hint=f"if both began together: --offset {times[0] - log.time_s[0]:.3f}",
         )
     return moved, {**said, "actuation_offset_s": float(offset), "frames_beyond_log": int((~inside).sum())}
 

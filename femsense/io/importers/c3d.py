@@ -6,7 +6,7 @@ Read here, one frame after the other: the readers that exist load the whole file
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
 from femsense.io.importers.mapping import MARKER
 
 BLOCK = 512
@@ -71,7 +71,10 @@ def open_c3d(path: Path, options: Options) -> Source:
             expected=f"{header.frames} frames",
         )
     chosen = _chosen_labels(header, options, path)
-    scale = unit_of(options, header.unit, path, _extent(path, header, whole))
+    extent = _extent(path, header, whole)
+    scale = unit_of(options, header.unit, path, extent)
+    if header.points > 1:
+        check_size(scale * extent, path)
     notes = [f"the file is cut off: {whole} of {header.frames} frames"] if whole < header.frames else []
     notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
     return Source(
@@ -86,7 +89,7 @@ def open_c3d(path: Path, options: Options) -> Source:
         },
         count=whole,
         notes=notes,
-        names=dict.fromkeys(header.labels, MARKER),
+        names=dict.fromkeys([*_without_subjects(header.labels), *header.labels], MARKER),
     )
 
 
@@ -172,18 +175,29 @@ def _points(data: bytes, header: Header) -> tuple[FloatArray, npt.NDArray[np.boo
 
 
 def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[int, str]]:
-    """Return the columns to take and their names; the same label twice gets a number."""
+    """Return the columns to take and their names; the same label twice gets a number.
+
+    The subject before a label (Finger:tip) goes, as in exports of CSV, but where another one has a marker of the same name.
+    """
+    short = _without_subjects(header.labels)
     for wanted in options.topics:
-        if wanted not in header.labels:
+        if wanted not in (*header.labels, *short):
             raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
-    taken = [(k, name) for k, name in enumerate(header.labels) if not options.topics or name in options.topics]
-    renamed = [(k, options.columns.get(name, name).removeprefix("marker.")) for k, name in taken]
+    both = enumerate(zip(header.labels, short))
+    taken = [(k, pair) for k, pair in both if not options.topics or any(name in options.topics for name in pair)]
+    wanted_names = options.columns
+    renamed = [(k, wanted_names.get(a, wanted_names.get(b, b)).removeprefix("marker.")) for k, (a, b) in taken]
     seen: dict[str, int] = {}
     result = []
     for k, name in renamed:
         seen[name] = seen.get(name, 0) + 1
         result.append((k, name if seen[name] == 1 else f"{name}_{seen[name]}"))
     return result
+
+
+def _without_subjects(labels: Sequence[str]) -> list[str]:
+    bare = [label.rpartition(":")[2] for label in labels]
+    return [name if name and bare.count(name) == 1 else label for label, name in zip(labels, bare)]
 
 
 def _extent(path: Path, header: Header, whole: int) -> float:
@@ -251,13 +265,22 @@ def _value(data: bytes, values: _Numbers) -> Any:
     size = int(np.prod(shape)) if shape else 1
     start = 2 + count
     if kind == -1:
-        text = data[start : start + size].decode("latin-1")
+        text = data[start : start + size]
         if len(shape) < 2:
-            return text.strip()
-        return [text[i : i + shape[0]].strip() for i in range(0, size, shape[0])] if shape[0] else []
+            return _decoded(text)
+        return [_decoded(text[i : i + shape[0]]) for i in range(0, size, shape[0])] if shape[0] else []
     if kind == 4:
         return values.reals(data[start : start + 4 * size])
     return np.frombuffer(data[start : start + kind * size], dtype=values.u2 if kind == 2 else np.uint8)
+
+
+def _decoded(text: bytes) -> str:
+    """Return a text in UTF-8, also where its last letter is cut off by the width of its field; else in Latin-1."""
+    try:
+        return text.decode("utf-8").strip()
+    except UnicodeDecodeError as error:
+        cut = error.reason == "unexpected end of data"
+        return (text[: error.start].decode("utf-8") if cut else text.decode("latin-1")).strip()
 
 
 def _labels(parameters: Parameters, points: int) -> tuple[str, ...]:

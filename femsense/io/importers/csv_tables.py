@@ -29,6 +29,8 @@ SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
 BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*([A-Za-zµ]+)\s*[\])]")
 ENDED = re.compile(r"(.+?)[_ ](mm|cm|m|ms|us|ns|s|MPa|[hk]?[pP]a|m?bar|psi|m?[nN])")
+NO_TEXT = bytes([*range(9), *range(14, 27), *range(28, 32)])
+"""Bytes that stand in no text."""
 EMPTY = ("", "na", "n/a", "null", "none")
 """What stands in a cell without a number, in small letters; float() reads "nan" itself."""
 DAY = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
@@ -47,7 +49,10 @@ def open_text(path: Path) -> Iterator[io.TextIOBase]:
         raise InputError("cannot be read", where=path, found=error.strerror) from None
     try:
         with raw as stream:
-            wide = stream.read(2) in (b"\xff\xfe", b"\xfe\xff")
+            head = stream.read(256)
+            wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")
+            if not wide and any(byte in NO_TEXT for byte in head.rstrip(b"\0")):
+                raise InputError("no text", where=path, found=f"a file that begins {head[:8]!r}", expected="a table such as CSV")
             stream.seek(0)
             with io.TextIOWrapper(stream, encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
                 yield text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.pointcloud.cloud import PointCloud
 
+SMALLEST, LARGEST = 2e-3, 100.0
+"""Scenes of motion capture are between these sizes [m]: ten times less than a finger's markers span, ten times a large hall."""
 FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -170,6 +173,13 @@ def unit_of(options: Options, declared: str | None, where: str | Path | None, ex
         expected="--unit " + "|".join(UNITS),
         hint=f"in metres the scene would be {extent:.4g} m wide, in millimetres {1e-3 * extent:.4g} m",
     )
+
+
+def check_size(extent: float, where: str | Path | None) -> None:
+    """Warn of a motion capture that is absurdly small or large [m]: most likely its unit is another."""
+    if 0.0 < extent < SMALLEST or extent > LARGEST:
+        size = f"{extent:.3g} m" if extent > 1.0 else f"{1e3 * extent:.3g} mm"
+        warnings.warn(f"{where}: the scene is {size} across: is its unit another? --unit " + "|".join(UNITS), stacklevel=3)
 
 
 def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:

@@ -100,7 +100,7 @@ def check_taken(columns: Mapping[str, str], known: Mapping[str, str], path: Path
     """Refuse a marker that gets the name of another one of the same source, which keeps it. Raises InputError."""
     for old, new in columns.items():
         name = new.removeprefix("marker.")
-        if known.get(old) == MARKER == known.get(name) and name not in {old, *columns}:
+        if known.get(old) == MARKER == known.get(name) and name not in {old, old.rpartition(":")[2], *columns}:
             raise InputError(
                 "two names become the same",
                 where=f"{path}, --map {old}={new}",

@@ -13,7 +13,7 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.io.importers.csv_tables import is_cut_off, rows_of
-from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
 from femsense.io.importers.mapping import MARKER
 
 HEAD = 12
@@ -57,7 +57,9 @@ def open_mocap_csv(path: Path, options: Options) -> Source:
             expected="positions of markers or bodies",
         )
     renamed = tuple((options.columns.get(name, name).removeprefix("marker."), axes) for name, axes in chosen)
-    scale = unit_of(options, export.unit, path, _extent(path, export))
+    extent = _extent(path, export)
+    scale = unit_of(options, export.unit, path, extent)
+    check_size(scale * extent, path)
     rate = export.rate or options.rate
     if export.time is None and rate is None:
         raise InputError("no times", where=path, found="frame numbers without a rate", expected="--rate HZ")
@@ -67,11 +69,21 @@ def open_mocap_csv(path: Path, options: Options) -> Source:
         path,
         partial(_frames, path, export, renamed, scale, rate or 1.0, options.up),
         found={"unit": options.unit or export.unit, "up": options.up or "as in the file"},
-        notes=(f"{nameless} tracks have no name: the column marker stays empty there, calibration assigns them",)
-        if nameless
-        else (),
+        notes=_notes(nameless, len(chosen) - nameless, export, options),
         names={name: MARKER for name, _ in export.markers if name},
     )
+
+
+def _notes(nameless: int, named: int, export: Export, options: Options) -> list[str]:
+    """Return what a person should know: tracks without a name, a rate that was said in vain."""
+    notes = []
+    if nameless and named:
+        notes.append(f"{nameless} tracks have no name: they are left out of frames that show named markers")
+    elif nameless:
+        notes.append(f"{nameless} tracks have no name: the column marker stays empty, calibration assigns them")
+    if options.rate is not None and (export.time is not None or export.rate is not None):
+        notes.append("--rate has no effect: the file says its times")
+    return notes
 
 
 def read_export(path: Path) -> Export:

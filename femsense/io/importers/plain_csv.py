@@ -92,7 +92,8 @@ def open_plain_csv(path: Path, options: Options) -> Source:
             yield Frame(time, markers=seen if label else {}, unlabelled=() if label else list(seen.values()), inputs=drive)
 
     found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
-    notes = () if label else ("the markers have no names: the column marker stays empty, calibration assigns them",)
+    notes = [] if label else ["the markers have no names: the column marker stays empty, calibration assigns them"]
+    notes += ["--rate has no effect: the table says its times"] if options.rate is not None and clock is not None else []
     return Source(
         "csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes, names=mappable(names)
     )

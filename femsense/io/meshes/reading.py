@@ -40,6 +40,13 @@ def read_content(path: Path, where: str) -> MeshContent:
         content = _read(path, where)
     except InputError:
         raise
+    except ModuleNotFoundError as error:  # meshio needs h5py for XDMF, MED and other formats in HDF5
+        raise InputError(
+            "this format of meshes needs a package that is not there",
+            where=where,
+            found=error.name,
+            hint=f"pip install {error.name}",
+        ) from None
     except (Exception, SystemExit) as error:
         raise InputError(
             "not readable as a mesh",

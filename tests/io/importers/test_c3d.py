@@ -167,3 +167,23 @@ def _by_hand(processor: int) -> bytes:
     block += parameter(1, "LABELS", -1, (2, 1), b"AB") + parameter(1, "UNITS", -1, (2,), b"mm") + b"\0\0"
     frames = b"".join(map(real, (100.0, 200.0, -300.0, 0.0))) + b"".join(map(real, (1.0, 2.0, 3.0, -1.0)))
     return head.ljust(512, b"\0") + block.ljust(512, b"\0") + frames.ljust(512, b"\0")
+
+
+def test_the_subject_before_a_label_goes_and_letters_stay(tmp_path: Path) -> None:
+    points = np.array([[[0.0, 0, 900], [0, 100, 900], [0, 200, 900]]] * 3)
+    names = ["Finger:tip", "Finger:größe", "Finger:mid"]
+    path = written(tmp_path / "a.c3d", points, labels=names)
+    assert list(next(open_source(path).frames()).markers) == ["tip", "größe", "mid"]
+    twice = written(tmp_path / "b.c3d", points, labels=["a:tip", "b:tip", "b:mid"])
+    assert list(next(open_source(twice).frames()).markers) == ["a:tip", "b:tip", "mid"]
+    for key in ("Finger:tip", "tip"):
+        source = open_source(path, Options(columns={key: "marker.end"}, topics=("mid", key)))
+        assert list(next(source.frames()).markers) == ["end", "mid"]
+
+
+def test_a_scene_that_is_absurdly_small_or_large_is_warned_of(tmp_path: Path) -> None:
+    points = np.array([[[0.0, 0, 0.9], [0, 0.12, 0.9]]] * 3)
+    with pytest.warns(UserWarning, match=r"0\.12 mm across.*--unit"):
+        open_source(written(tmp_path / "a.c3d", points, unit="mm"))
+    with pytest.warns(UserWarning, match="120 m across"):
+        open_source(written(tmp_path / "b.c3d", 1000 * points, unit="m"))

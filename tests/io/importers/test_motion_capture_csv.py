@@ -271,3 +271,26 @@ def test_motion_that_tells_no_offset_is_said(motion: float, tmp_path: Path) -> N
     with pytest.raises(InputError, match="does not tell the offset") as caught:
         imported(tmp_path / "a.csv", tmp_path / "out", Options(unit="m"), log=log, actuation="tension")
     assert "--offset" in str(caught.value)
+
+
+def test_a_log_that_does_not_overlap_says_its_own_times(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,cable_a\n100,1\n101,2\n")
+    (tmp_path / "take.csv").write_text("time,tip_x_m,tip_y_m,tip_z_m\n5,0,0,1\n6,0,0,1\n")
+    log = read_actuation_log(tmp_path / "log.csv", Options())
+    with pytest.raises(InputError, match=r"log 100\.000 … 101\.000 s, frames 5\.000 … 6\.000 s, offset 7 s") as caught:
+        imported(tmp_path / "take.csv", tmp_path / "out", log=log, offset=7.0, actuation="tension")
+    assert "--offset -95.000" in str(caught.value)
+
+
+def test_a_binary_file_is_no_log(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_bytes(b"\x7fELF\x02\x01\x01" + bytes(100) + b"a,b\n")
+    with pytest.raises(InputError, match="no text") as caught:
+        read_actuation_log(tmp_path / "log.csv", Options())
+    assert "\0" not in str(caught.value)
+
+
+def test_tracks_without_a_name_beside_named_ones_are_said_to_be_left_out(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text(MOTIVE.format(unit="Meters"))
+    source = open_source(tmp_path / "take.csv", Options(rate=50.0))
+    assert any("left out of frames that show named markers" in note for note in source.notes)
+    assert any("--rate has no effect" in note for note in source.notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -315,3 +316,10 @@ def test_what_gmsh_itself_writes(tmp_path: Path) -> None:
         assert volume == pytest.approx(6.0, rel=1e-6), file.name
     for name in ("a4.msh", "a41.msh"):
         assert set(np.unique(tet_values(tmp_path / name, "gmsh:physical", "here"))) == {1, 2}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("h5py") is not None, reason="h5py is there")
+def test_a_format_that_needs_h5py_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.med").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(InputError, match="pip install h5py"):
+        read_content(tmp_path / "a.med", "a.med")
