@@ -14,8 +14,8 @@ from femsense.io.files import check_target, followed
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.frames import UNITS, Options
-from femsense.io.importers.guess import open_sources, split_name
-from femsense.io.importers.mapping import mappable
+from femsense.io.importers.guess import guess_format, open_sources, split_name
+from femsense.io.importers.mapping import INPUT, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]
@@ -118,7 +118,7 @@ def import_into(
         say(f"{final} holds this import already (--again makes it anew)")
         return known
     log = None if actuation is None else read_actuation_log(actuation, options)
-    source = open_sources(paths, options if actuation is None else _without_log(options, Path(actuation)))
+    source = open_sources(paths, options if actuation is None else _without_log(options, Path(actuation), paths))
     found = write_recording(
         source,
         final,
@@ -201,10 +201,18 @@ def _check_options(options: Options, inputs: str | None, zero: str | None) -> No
         raise InputError("not a rate", where="--rate", found=options.rate, expected="frames a second, > 0")
 
 
-def _without_log(options: Options, log: Path) -> Options:
-    """Return the options without the mappings that are about columns of the log of actuation."""
+def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Options:
+    """Return the options without the mappings that are about columns of the log of actuation.
+
+    Of a column that stands in a table of the capture too, only a mapping to an input is the log's alone.
+    """
     of_log = mappable(header_of(log)[0])
-    columns = {old: new for old, new in options.columns.items() if old not in of_log}
+    files = [path for _, path in map(split_name, paths)]
+    tables = [file for file in files if file.is_file() and guess_format(file) == "csv"]
+    shared = {name for file in tables for name in mappable(header_of(file)[0])}
+    columns = {
+        old: new for old, new in options.columns.items() if old not in of_log or (old in shared and kind_of_target(new) != INPUT)
+    }
     return replace(options, columns=columns, log_names=tuple(of_log))
 
 

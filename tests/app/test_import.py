@@ -262,3 +262,15 @@ def test_options_without_effect_are_said(table: Path, tmp_path: Path, capsys: py
     status, document = answer(capsys, *words, "--free", "5:9", "--rate", "30", "--clock", "header")
     notes = " ".join(document["notes"])
     assert status == 0 and all(key in notes for key in ("--free 5:9", "--rate has no effect", "--clock has no effect"))
+
+
+def test_a_mapping_of_times_counts_in_the_table_and_in_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "take.csv").write_text("Zeit (ms),tip_x_m,tip_y_m,tip_z_m\n0,0,0,1\n500,0,0,1\n")
+    (tmp_path / "log.csv").write_text("Zeit (ms),motor [mN]\n0,1000\n500,2000\n")
+    words = ["import", tmp_path / "take.csv", "--actuation", tmp_path / "log.csv", "--offset", "0", "-o", tmp_path / "out"]
+    status, _ = answer(capsys, *words, "--map", "Zeit (ms)=time", "--map", "motor [mN]=cable_a")
+    assert status == 0
+    recording = load_recording(tmp_path / "out")
+    assert list(recording.time_s) == [0.0, 0.5] and recording.inputs[:, 0].tolist() == [1.0, 2.0]
+    status, document = answer(capsys, *words, "--map", "Zeit (ms)=time", "--map", "motr=cable_a", "--again")
+    assert status == 2 and "the log: " in document["error"] and "take.csv: Zeit (ms)" in document["error"]
