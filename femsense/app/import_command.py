@@ -10,7 +10,7 @@ from typing import Any
 
 import femsense
 from femsense.core.errors import InputError
-from femsense.io.files import check_target, followed
+from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.frames import UNITS, Options
@@ -250,15 +250,7 @@ def _check_apart(paths: Sequence[str | Path], final: Path) -> None:
 def _state(path: Path) -> list[Any]:
     if not path.exists():
         raise InputError("nothing there", where=path, expected="a file or a folder")
-    items = [path, *(path.rglob("*") if path.is_dir() else ())]
-    pipe = next((item for item in items if item.exists() and not item.is_file() and not item.is_dir()), None)
-    if pipe is not None:
-        raise InputError(
-            "a pipe or a device cannot be imported",
-            where=pipe,
-            expected="files, which are read more than once",
-            hint="cat it into a file first",
-        )
+    check_no_pipe([path, *(path.rglob("*") if path.is_dir() else ())])
     files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
     stats = [file.stat() for file in files]
     return [str(path.resolve()), len(files), sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)]

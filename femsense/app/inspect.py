@@ -26,8 +26,8 @@ from femsense.app.inspection.text import bullet, section_lines
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
-from femsense.io.files import plain
 from femsense.io.importers.ros_bag import content_ending
+from femsense.io.files import check_no_pipe, plain
 from femsense.io.mesh_files import SURFACE_ENDINGS
 from femsense.io.meshes.reading import file_format
 from femsense.io.meshing.cad import CAD_READ
@@ -69,9 +69,10 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
         lists of texts.
 
     Raises:
-        InputError: where there is nothing at this path; nothing else, whatever the content is.
+        InputError: where there is nothing at this path, or a pipe; nothing else, whatever the content is.
     """
     target = _existing(path)
+    check_no_pipe([target])
     report: Report = {"path": str(target), "kind": "unknown"}
     problems: list[str] = []
     notes: list[str] = []

@@ -89,6 +89,13 @@ def check_target(path: str | Path, *, folder: bool, kind: FileKind | None = None
     check_replaceable(final, kind, inputs)
 
 
+def check_no_pipe(sources: Iterable[Path]) -> None:
+    """Refuse pipes and devices as sources: files are read more than once. Raises InputError."""
+    pipe = next((item for item in sources if item.exists() and not item.is_file() and not item.is_dir()), None)
+    if pipe is not None:
+        raise InputError("a pipe or a device cannot be read here", where=pipe, expected="a file", hint="cat it into a file first")
+
+
 def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
     """Refuse to replace a folder that holds more than what `own` matches, as paths below it; `what` names that.
 

@@ -107,7 +107,8 @@ def test_a_pipe_is_no_capture_and_a_recording_not_its_own(
     os.mkfifo(tmp_path / "folder/000000.ply")
     for source in (tmp_path / "folder/000000.ply", tmp_path / "folder"):
         status, document = answer(capsys, "import", source, "-o", tmp_path / "out")
-        assert status == 2 and "a pipe or a device cannot be imported" in document["error"]
+        assert status == 2 and "a pipe or a device cannot be read here" in document["error"]
+    assert run(["inspect", str(tmp_path / "folder/000000.ply")]) == 2
     words = ["-o", tmp_path / "out", "--inputs", "tension", "--unit", "mm"]
     assert answer(capsys, "import", table, *words)[0] == 0
     for source in (tmp_path / "out", tmp_path / "out/markers.csv"):
