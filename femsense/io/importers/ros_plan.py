@@ -58,6 +58,7 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     for stream in choice.inputs:
         columns[stream.topic.name], taken = _input_columns(bag, stream, options)
         fields |= taken
+    notes += _notes_of_twice(columns)
     actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields - {""}))
     points = {}
     for stream in choice.loads:
@@ -90,6 +91,19 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
         scale,
         names,
     )
+
+
+def _notes_of_twice(columns: dict[str, dict[str, tuple[str, str, float]]]) -> list[str]:
+    """Return a note for each input that several topics hold."""
+    topics: dict[str, list[str]] = {}
+    for topic, values in columns.items():
+        for column, _, _ in values.values():
+            topics.setdefault(column, []).append(topic)
+    return [
+        f"{column} stands in {' and '.join(held)}: that of {held[-1]} is taken; --map {held[0]}.NAME={column} takes another's"
+        for column, held in topics.items()
+        if len(held) > 1
+    ]
 
 
 def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
@@ -126,11 +140,14 @@ def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str
                 fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
                 columns[name] = (column, fld, factor)
     if not columns and not any(key in options.columns for key in names):
+        targets = {split_factor(new)[0] for new in options.columns.values() if not new.startswith("load@")}
         prefix = "chamber_" if stream.topic.type.endswith("FluidPressure") else "cable_"
         for name in names:
             usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
             fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
-            columns[name] = (name if name.startswith(("cable_", "chamber_")) else prefix + name, fld, 1.0)
+            column = name if name.startswith(("cable_", "chamber_")) else prefix + name
+            if column not in targets:  # --map takes another topic's for it
+                columns[name] = (column, fld, 1.0)
     return columns, {fld for _, fld, _ in columns.values()}
 
 

@@ -255,3 +255,17 @@ def test_noise_with_the_ending_of_a_bag_is_called_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="it is none") as caught:
         open_source(tmp_path / "take.mcap")
     assert "recover" not in str(caught.value)
+
+
+def test_an_input_that_two_topics_hold_is_named_and_can_be_chosen(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((5, 3)), None, at))
+            bag.write("/commands", at, bag.joints(["m"], at, effort=[1.0]))
+            bag.write("/states", at, bag.joints(["m"], at, effort=[2.0]))
+    source = open_source(tmp_path / "take")
+    assert next(source.frames()).inputs == {"cable_m": 2.0}
+    assert any("/commands and /states: that of /states is taken" in note for note in source.notes)
+    chosen = open_source(tmp_path / "take", Options(columns={"/commands.m": "cable_m"}))
+    assert next(chosen.frames()).inputs == {"cable_m": 1.0}
