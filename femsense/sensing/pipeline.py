@@ -25,6 +25,7 @@ from femsense.model.drive import has_history
 from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
+from femsense.sensing.false_alarms import with_gains_of_free_frames
 from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
@@ -86,7 +87,10 @@ def estimate(
         )
     warn_of_linear_elements(robot.body, where=robot.name)
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
-    sense = sense_as_published if sensor.options.method == "paper" else sense_frame
+    published = sensor.options.method == "paper"
+    sense = sense_as_published if published else sense_frame
+    if not published and not len(sensor.places):
+        sensor = with_gains_of_free_frames(sensor, robot, recording, calibration)
     count = len(recording.time_s)
     with Checkpoint(keep) as checkpoint:
         done = checkpoint.kept(Done) or Done()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -44,8 +45,13 @@ def make_sensor(
     *,
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
+    without: Collection[int] = (),
 ) -> Sensor:
-    """Prepare what stays the same from frame to frame. Raises InputError where nothing says where to look for forces."""
+    """Prepare what stays the same from frame to frame; free frames `without` teach nothing.
+
+    Raises:
+        InputError: nothing says where to look for forces.
+    """
     options = options or SensingOptions()
     recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
     robot = robot.in_recording(recording.label)
@@ -87,11 +93,11 @@ def make_sensor(
         correction_std,
     )
     sensor = replace(sensor, scenery=_scenery(sensor))
-    learned = learn(knowledge, *_free_rows(sensor))
+    learned = learn(knowledge, *_free_rows(sensor, without))
     if not pulls_are_modelled:
         return replace(sensor, knowledge=learned)
     sensor = _better_posed(sensor, learned)
-    return replace(sensor, knowledge=learn(sensor.knowledge, *_free_rows(sensor)))
+    return replace(sensor, knowledge=learn(sensor.knowledge, *_free_rows(sensor, without)))
 
 
 def _corrected(
@@ -205,10 +211,10 @@ def _scenery(sensor: Sensor) -> FloatArray:
     return np.zeros((0, 3))
 
 
-def _free_rows(sensor: Sensor) -> tuple[list[tuple[Rows, FloatArray]], list[tuple[Rows, FloatArray]]]:
+def _free_rows(sensor: Sensor, without: Collection[int]) -> tuple[list[tuple[Rows, FloatArray]], list[tuple[Rows, FloatArray]]]:
     """Return rows and sag of the free frames with clouds, and the same of the means of their points; a frame that gives nothing is left out."""
     result, means = [], []
-    for k, state in free_path(sensor.driven, free_clouds(sensor.recording)):
+    for k, state in free_path(sensor.driven, [k for k in free_clouds(sensor.recording) if k not in without]):
         try:
             scan = scan_of(sensor, k, state)
             if scan is None:

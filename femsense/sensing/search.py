@@ -167,11 +167,12 @@ def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
     """
     gain, _ = evidence(sensor, fit)
     nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
-    if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
+    needed = sensor.knowledge.gain_limit
+    if not len(gain) or gain.max() < needed:
         return []
     found: list[Touch] = []
     for i in np.argsort(-gain):
-        if len(found) == STARTS or gain[i] < max(sensor.knowledge.gain_limit, 0.5 * gain.max()):
+        if len(found) == STARTS or gain[i] < max(needed, 0.5 * gain.max()):
             break
         if all(np.linalg.norm(nodes[i] - t.place) > APART * sensor.size for t in found):
             found.append(make_touch(sensor, nodes[i], source="shape", std_m=ANYWHERE * sensor.size))
