@@ -74,6 +74,8 @@ def from_afar(
                 return best[1:]
         near = best[2].state if best[2].touches else ramps[0][2]
         touches = object_touches(sensor, seen_objects(sensor, k, whole, near), near)
+        if not touches:
+            break
     return best[1:]
 
 
