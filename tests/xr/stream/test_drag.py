@@ -212,7 +212,7 @@ def test_answers_go_on_by_themselves_until_nothing_comes_nearer(served: tuple[Hu
     told = answers(hub)
     drag(hub, target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6)))), armed=False)  # said once
     assert within(10.0, lambda: bool(told) and told[-1]["status"] == "reached")
-    assert len(told) > 2 and {one["status"] for one in told[:-1]} == {"converging"}
+    assert len(told) > 1 and {one["status"] for one in told[:-1]} == {"converging"}
     errors = [one["error_m"] for one in told]
     assert errors == sorted(errors, reverse=True) and told[0]["text"].startswith("converging: ")
 
