@@ -349,12 +349,12 @@ def random_states(robot: fs.Robot) -> FloatArray:
     body, rng = robot.body, np.random.default_rng(11)
     inputs = drive_inputs(robot)
     shares = rng.uniform(size=(60, len(inputs)))
-    scale = 1.0
-    for _ in range(3):  # so much of the limits as moves the nodes by 10 mm on average
+    scale = 0.1
+    for _ in range(6):  # so much of the limits as moves the nodes by 10 mm on average; a larger share may be more than the body bears
         rms = rms_mm(
             np.linalg.norm(np.array([state_of(body, inputs, scale * row) for row in shares[:6]]) - body.mesh.nodes, axis=2)
         )
-        scale = min(1.0, scale * 10.0 / rms)
+        scale = min(1.0, scale * min(10.0 / rms, 2.0))
     return np.array([state_of(body, inputs, scale * row) for row in shares])
 
 
