@@ -350,7 +350,7 @@ def random_states(robot: fs.Robot) -> FloatArray:
     inputs = drive_inputs(robot)
     shares = rng.uniform(size=(60, len(inputs)))
     scale = 0.1
-    for _ in range(6):  # so much of the limits as moves the nodes by 10 mm on average; a larger share may be more than the body bears
+    for _ in range(6):  # so much of the limits as moves the nodes by 10 mm on average, from below: a body may not bear all
         rms = rms_mm(
             np.linalg.norm(np.array([state_of(body, inputs, scale * row) for row in shares[:6]]) - body.mesh.nodes, axis=2)
         )
