@@ -89,9 +89,8 @@ def read_truth(recording: Path) -> tuple[TrueContact, ...]:
     if not file.is_file():
         return ()
     columns_used = ("x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n")
-    table = read_csv(
-        file, required=("frame", *columns_used), optional=("time_s", "contact", "nx", "ny", "nz", "force_n"), prefixes=("rest_",)
-    )
+    optional = ("time_s", "contact", "nx", "ny", "nz", "force_n", "radius_m", "object")
+    table = read_csv(file, required=("frame", *columns_used), optional=optional, prefixes=("rest_",))
     frames, values = table.integers("frame"), table.numbers(columns_used)
     return tuple(TrueContact(int(frame), row[:3], row[3:]) for frame, row in zip(frames, values))
 

@@ -12,7 +12,8 @@ from small_run import make_run
 
 import femsense as fs
 from femsense.core.errors import InputError
-from femsense.sensing.comparison import TrueContact
+from femsense.rig.truth_files import CONTACT_COLUMNS
+from femsense.sensing.comparison import TrueContact, read_truth
 from femsense.sensing.run_arrays import tracks_of
 from femsense.sensing.types import Run
 
@@ -72,6 +73,14 @@ def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
     assert "0 of 0 contacts" in repr(fs.compare(sensed, ()))
     with pytest.raises(InputError, match="no truth beside the recording"):
         fs.compare(sensed, tmp_path)
+
+
+def test_a_truth_as_the_rig_writes_it_is_read(tmp_path: Path) -> None:
+    values = dict.fromkeys(CONTACT_COLUMNS, "0") | {"frame": "4", "x_m": "0.05", "fz_n": "-1", "object": "ball"}
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "contacts.csv").write_text(",".join(values) + "\n" + ",".join(values.values()) + "\n", encoding="utf-8")
+    (true,) = read_truth(tmp_path)
+    assert true.frame == 4 and true.position_m[0] == 0.05 and true.force_n_xyz[2] == -1.0
 
 
 def test_the_page_in_a_notebook(run: Run, tmp_path: Path) -> None:
