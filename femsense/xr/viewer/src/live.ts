@@ -348,7 +348,10 @@ class Robot {
     this.arrivals.push(now);
     while (this.arrivals[0]! < now - RATE_MS) this.arrivals.shift();
     if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
-    this.newest = { time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], field: null };
+    // as long as nobody speaks of forces, nothing estimates them
+    this.newest = {
+      time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], forceless: true, field: null,
+    };
     this.join();
     this.history.push(this.newest);
     while (this.history.length && this.history[0]!.time_s < pose.time - KEPT_S) this.history.shift();
