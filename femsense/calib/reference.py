@@ -20,8 +20,9 @@ from scipy.spatial import cKDTree
 from femsense.calib.calibrate import calibrate
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError, InputError
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.marker_correction import recorded_inputs
-from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
+from femsense.model.observation import make_scene
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
@@ -82,10 +83,7 @@ def _require_markers(recording: Recording, reference: Recording) -> None:
 def _missed(robot: Robot, reference: Recording) -> _Missed:
     calibration = calibrate(robot, reference)
     scene = make_scene(robot, reference, np.unique(reference.marker_frame))
-    pivot = robot.marker_points.mean(axis=0)
-    jet = evaluate_scene(
-        Hypothesis(robot), scene, np.zeros(0), calibration.poses, None, derivative=False, vary_initial=False, pivot=pivot
-    )
+    jet = evaluate_robot(robot, scene, calibration.poses, None)
     missed = np.full((len(scene.frames), len(calibration.poses), len(robot.marker_names), 3), np.nan)
     missed[np.searchsorted(scene.frames, scene.frame), scene.view, scene.marker] = jet.residual
     return _Missed(recorded_inputs(reference)[scene.frames], missed, calibration.poses)

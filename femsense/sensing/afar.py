@@ -29,12 +29,11 @@ from femsense.sensing.types import Fit, Sensor, Start, Touch
 WAYS = (0.05, 0.1, 0.2, 0.3)
 """How far a force moves the body to first order, relative to its diagonal."""
 APART = 0.12
-"""How far apart the places are that are tried, relative to the body's diagonal."""
+"""How far apart the places are where a search begins, relative to the body's diagonal."""
 TRIED = 3
 """So many of the states that fit best are where a fit begins."""
 ANYWHERE = 0.2
-"""How well the place is known beforehand, relative to the body's diagonal."""
-
+"""How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
 THIN = 400
 """Points that the states are compared with, about."""
 ROUNDS = 3

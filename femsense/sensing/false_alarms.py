@@ -44,7 +44,7 @@ def with_gains_of_free_frames(sensor: Sensor, robot: Robot, recording: Recording
             make_sensor(robot, recording, calibration, options=sensor.options, without=asked[fold::FOLDS]), asked[fold::FOLDS]
         )
     ]
-    limit = max(gains, default=0.0) + BEYOND * float(np.std(gains)) if gains else 0.0
+    limit = max(gains) + BEYOND * float(np.std(gains)) if gains else 0.0
     return replace(sensor, knowledge=replace(sensor.knowledge, gain_limit=max(sensor.knowledge.gain_limit, limit)))
 
 

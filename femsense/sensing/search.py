@@ -15,7 +15,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.afar import from_afar
+from femsense.sensing.afar import ANYWHERE, APART, from_afar
 from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std
@@ -26,16 +26,14 @@ from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Start, Touch
 
-ANYWHERE = 0.2
-"""How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
-STARTS, APART = 3, 0.12
-"""From how many candidates a search begins at most, and how far apart they are, relative to the body's diagonal."""
+STARTS = 3
+"""From how many candidates a search begins at most."""
 ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
 """Contacts a frame at most."""
 GIVEN_ROUNDS = 5
-"""How often robot and surroundings are separated at most where the places are given; two or three times are usual."""
+"""How often robot and surroundings are separated at most where the places are given."""
 SETTLED = 0.005
 """They are separated where the number of the robot's points changes by less than this share of it."""
 ROUNDS = 2
@@ -167,12 +165,11 @@ def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
     """
     gain, _ = evidence(sensor, fit)
     nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
-    needed = sensor.knowledge.gain_limit
-    if not len(gain) or gain.max() < needed:
+    if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
         return []
     found: list[Touch] = []
     for i in np.argsort(-gain):
-        if len(found) == STARTS or gain[i] < max(needed, 0.5 * gain.max()):
+        if len(found) == STARTS or gain[i] < max(sensor.knowledge.gain_limit, 0.5 * gain.max()):
             break
         if all(np.linalg.norm(nodes[i] - t.place) > APART * sensor.size for t in found):
             found.append(make_touch(sensor, nodes[i], source="shape", std_m=ANYWHERE * sensor.size))
