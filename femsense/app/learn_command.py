@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ def learn_into(
     end_to_end: bool = False,
     bones: int = 8,
     plane: str | None = None,
+    calibration: Path | None = None,
+    in_robot_frame: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
@@ -36,6 +39,7 @@ def learn_into(
         test: two more files, of another recording: the error is stated on them, that of a corrected model too.
         adapt: a model to correct by `files`, instead of learning anew; it keeps its bones.
         end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
+        calibration, in_robot_frame: as in `read_labelled`.
 
     Raises:
         InputError, DataError: files that do not fit, too few rows.
@@ -51,10 +55,11 @@ def learn_into(
         raise InputError(
             "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
         )
-    used = [*files, *(test or ()), *([] if adapt is None else [adapt])]
+    used = [*files, *(test or ()), *([] if adapt is None else [adapt]), *([] if calibration is None else [calibration])]
     check_target(output, folder=False, kind=MODEL, inputs=used)
-    data = read_labelled(*files)
-    other = None if test is None else read_labelled(*test)
+    read = partial(read_labelled, calibration=calibration, in_robot_frame=in_robot_frame)
+    data = read(*files)
+    other = None if test is None else read(*test)
     if adapt is not None:
         before = load_model(adapt)
         found = drift(before, data)
@@ -72,7 +77,12 @@ def learn_into(
         if model.chain is not None:
             text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
     save_model(model, output)
-    return {"path": str(output), **document, **model.report}, f"{text}\n\nwritten: {output}"
+    return {
+        "path": str(output),
+        "frame": model.frame,
+        **document,
+        **model.report,
+    }, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
 
 
 def report_text(report: dict[str, Any]) -> str:
@@ -99,6 +109,16 @@ def report_text(report: dict[str, Any]) -> str:
     if report["test_outside"] > 0.02:
         lines.append(f"  {100 * report['test_outside']:.0f} % of the held-out rows are outside what was learnt")
     return "\n".join(lines)
+
+
+def frame_text(frame: str) -> str:
+    """Return in which frame of reference a model's markers and bones are, in words."""
+    if frame == "robot":
+        return "  markers and bones are in the robot's frame"
+    return (
+        "  markers and bones are in the frame in which they were measured, not the robot's:"
+        " -c CALIBRATION takes them there, --robot-frame says that they are there"
+    )
 
 
 def _tested(model: ProprioceptiveModel, data: Labelled) -> dict[str, float]:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from femsense.xr.stream.drag_server import DragOptions, DragServer
 
 PASSWORD = "FEMSENSE_PASSWORD"
+WATCH_S = 0.05
+"""How often it is asked whether a source has stopped."""
 PATIENCE_S = 3.0
 """How long a connection may take before it is said that there is none."""
 
@@ -164,8 +166,9 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
     This closes the loop of a drag (see `let_drag`, which comes before).
 
     Raises:
-        InputError: no model, no such source, or a model that knows no marker of the robot.
+        InputError: no model, no such source, or a model that knows no marker of the robot or not its frame.
     """
+    from femsense.xr.proprioception.labelled import ROBOT, WORDS
     from femsense.xr.proprioception.model_file import load_model
     from femsense.xr.stream.readings import readings_of
     from femsense.xr.stream.sensor_source import markers_of_sensors
@@ -179,6 +182,14 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
             found=", ".join(model.marker_names),
             expected=f"one of the markers of {twin.name}: {', '.join(known)}",
             hint="learn from columns that are named as the markers in robot.toml",
+        )
+    if model.frame != ROBOT:
+        raise InputError(
+            "the model's markers are not in the robot's frame",
+            where=str(model_file),
+            found=WORDS[model.frame],
+            expected=WORDS[ROBOT],
+            hint="learn with -c CALIBRATION, or with --robot-frame where they are in it",
         )
     readings = readings_of(source, model.channels, live.stop)
     live.sources[without_password(source)] = lambda: readings.trouble
@@ -266,6 +277,10 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     publisher = Publisher(live.hub, twin, PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror))
     live.publishers.append(publisher)
 
+    def watch() -> None:
+        while thread.is_alive() and not live.stop.wait(WATCH_S):
+            publisher.watch()
+
     def run() -> None:
         if at_once:
             for frame in frames:
@@ -277,6 +292,8 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
     live.threads.append(thread)
     thread.start()
+    if at_once:
+        Thread(target=watch, daemon=True, name=f"femsense-watch-{twin.name}").start()
 
 
 def need_stream(runs: Sequence[Path], sensors: str | None, *, drag: bool) -> None:

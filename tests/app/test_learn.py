@@ -37,10 +37,12 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run(["learn", *files, "-o", str(model), "--bones", "4", "--plane", "0,1,0", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["path"] == str(model) and document["error_mm"] < 0.6 and document["dead"] == ["dark"]
-    assert len(load_model(model).bone_names) == 4
+    assert len(load_model(model).bone_names) == 4 and document["frame"] == "markers"
     assert run(["learn", *other, "-o", str(mended), "--adapt", str(model)]) == 0
     said = capsys.readouterr().out
-    assert "base moved: " in said and "corrected by a rigid motion: " in said and "written: " in said
+    assert (
+        "not the robot's" in said and "base moved: " in said and "corrected by a rigid motion: " in said and "written: " in said
+    )
     assert run(["learn", *other, "-o", str(mended), "--adapt", str(model), "--test", *files, "--json"]) == 0
     tested = json.loads(capsys.readouterr().out)["test"]
     assert list(tested) == ["a", "b", "c"] and all(
@@ -54,6 +56,8 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run(["learn", *files, "--test", *other, "-o", str(model)]) == 0
     said = capsys.readouterr().out
     assert "8 bones along a, b, c, in this order" in said
+    assert run(["learn", *files, "-o", str(model), "--robot-frame"]) == 0
+    assert "bones are in the robot's frame" in capsys.readouterr().out and load_model(model).frame == "robot"
     assert (
         "of the markers: a " in said
         and "40 rows that were held out" in said

@@ -96,7 +96,7 @@ def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, 
 
 
 def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, page: Path) -> None:
-    rest, said = np.outer(np.arange(5.0), [0.0, 0.0, 0.02]), []
+    rest, said, states = np.outer(np.arange(5.0), [0.0, 0.0, 0.02]), [], []
     network = linear_network(np.zeros(1), np.ones(1), np.ones((15, 1)), rest.ravel())
     domain = learn_domain(np.random.default_rng(0).uniform(-2.0, 2.0, (300, 1)))
     chain = ProprioceptiveModel(("bend",), tuple("abcde"), network, (), domain, make_armature(rest))
@@ -109,16 +109,26 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
     with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=page)) as live:
         assert live.trouble == f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting"
 
+        def state() -> object:
+            return json.loads(live.hub.newest()["femsense/m/status"].payload)["state"]
+
         def send() -> None:
-            within(20.0, lambda: len(said) == 1)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                sender.sendto(b"0.5", ("127.0.0.1", port))
-            within(20.0, lambda: len(said) == 2)
+                for count in (1, 3):
+                    within(20.0, lambda count=count: len(said) == count)
+                    states.append(state())
+                    sender.sendto(b"0.5", ("127.0.0.1", port))
+                    within(1.0, lambda: state() == "live")
+                    states.append(state())
+                    within(20.0, lambda count=count: len(said) == count + 1)
             live.stop.set()
 
         Timer(0.1, send).start()
         live.wait(said.append)
-    assert said == [f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting", "readings come"]
+    why = ("nothing has come yet", "they stopped")
+    silences = [f"no readings of udp://127.0.0.1:{port} ({text}), waiting" for text in why]
+    assert said == [silences[0], "readings come", silences[1], "readings come"]
+    assert states == ["stale", "live"] * 2
 
 
 def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +192,8 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
     marker, rest = made.robot.glued_names[0], made.robot.marker_points[0]
     network = linear_network(np.zeros(1), np.ones(1), np.array([[0.0], [0.0], [1e-3]]), rest)  # a millimetre up for each unit
     domain = learn_domain(np.random.default_rng(0).uniform(-2.0, 2.0, (300, 1)))
-    chain = ProprioceptiveModel(("bend",), (marker,), network, (), domain, None)
+    chain = ProprioceptiveModel(("bend",), (marker,), network, (), domain, None, frame="robot")
+    turned = save_model(replace(chain, frame="markers"), tmp_path / "t.onnx")
     model, strange = (
         save_model(chain, tmp_path / "m.onnx"),
         save_model(replace(chain, marker_names=("other",)), tmp_path / "o.onnx"),
@@ -195,6 +206,8 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
         let_drag(live, run, DragOptions())
         with pytest.raises(InputError, match="no marker of the robot"):
             measure_by_sensors(live, str(readings), strange)
+        with pytest.raises(InputError, match="not in the robot's frame"):
+            measure_by_sensors(live, str(readings), turned)
         measure_by_sensors(live, str(readings), model)
         told: dict[str, object] = {}
         end = time.monotonic() + 20.0

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, start_browser
+from browser import CHROMIUM, run_in_browser, start_browser
 from live_bars import Source
-from streams import read_frame
+from streams import read_frame, within
 from xr_bar import write_run_with_mesh
 
 from femsense.xr.stream.hub import Message
-from femsense.xr.stream.payloads import TwinFrame
+from femsense.xr.stream.payloads import TwinFrame, status_bytes
 from femsense.xr.stream.run_source import RunStream, frames_of, open_run
 
 pytest.importorskip("websockets")
@@ -176,6 +177,34 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
     finally:
         source.close()
         browser.kill()
+
+
+LATE = """
+const page = await opened.newPage({ viewport: { width: 700, height: 500 } });
+await page.goto(given[0]);
+await page.waitForFunction(() => femsense.shown.robots.get('bar')?.body?.isStale, null, { timeout: 60000 });
+const early = await page.textContent('#badge');
+console.log(JSON.stringify({ badge: early, state: await page.evaluate(() => document.documentElement.dataset.stream),
+  live: await page.evaluate(() => femsense.shown.robots.get('bar-2').told.state) }));
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_who_comes_late_sees_at_once_that_a_stream_has_stopped(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True)
+    try:
+        assert within(5.0, lambda: source.publishers[0].sent > 0)
+        source.flowing.clear()
+        time.sleep(0.2)
+        source.hub.publish([Message("femsense/bar/status", status_bytes("stale", since_s=time.time() - 100.0))])
+        told = run_in_browser(request.config, LATE, source.server.url)
+    finally:
+        source.close()
+    age = float(told["badge"].removeprefix("stale, ").removesuffix(" s old"))
+    assert told["state"] == "stale" and 100.0 <= age < 200.0 and told["live"] == "live"
 
 
 def check_scene(scene: dict[str, Any], run: RunStream, frame: TwinFrame) -> None:

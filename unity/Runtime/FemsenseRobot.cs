@@ -14,7 +14,14 @@ namespace Femsense
         [Tooltip("The node robot_frame of the loaded mesh, or any transform turned by -90 degrees about x")] public Transform robotFrame;
         [Tooltip("Length of an arrow of one newton [m]")] public float metresPerNewton = 0.05f;
         [Tooltip("A pose that is older is stale [s]")] public float staleAfter = 0.4f;
-        public bool IsStale { get { return Time.unscaledTime - arrived > staleAfter; } }
+        /// <summary>What the sender says of itself: live, stale, ended or lost.</summary>
+        public Status Status { get; private set; }
+        /// <summary>What is said of the newest frame; anything but "ok" is doubtful.</summary>
+        public string FrameStatus { get; private set; }
+        /// <summary>The newest answer to a drag; more follow while it is "converging".</summary>
+        public Reach Reach { get; private set; }
+        public bool IsStale { get { return (Status != null && Status.IsOld) || Time.unscaledTime - arrived > staleAfter; } }
+        public bool IsDoubtful { get { return !string.IsNullOrEmpty(FrameStatus) && FrameStatus != "ok"; } }
         private readonly List<Transform> bones = new List<Transform>();
         private readonly List<LineRenderer> arrows = new List<LineRenderer>();
         private readonly float[] place = new float[3];
@@ -35,7 +42,15 @@ namespace Femsense
             var pose = bytes == null ? null : Pose.Read(bytes);
             if (pose != null) Show(pose);
             var forces = stream.Take("femsense/" + robot + "/force");
-            if (forces != null) Show(JsonUtility.FromJson<Forces>(Encoding.UTF8.GetString(forces)));
+            if (forces != null)
+            {
+                Show(JsonUtility.FromJson<Forces>(Encoding.UTF8.GetString(forces)));
+                FrameStatus = Document.Text(forces, "status");
+            }
+            var status = stream.Take("femsense/" + robot + "/status");
+            if (status != null) Status = Status.Read(status) ?? Status;
+            var reach = stream.Take("femsense/" + robot + "/reach");
+            if (reach != null) Reach = Reach.Read(reach) ?? Reach;
         }
 
         private void Find(Model model)

@@ -1,7 +1,9 @@
 // The bytes of a stream (docs/streaming.md), and the only place where frames of reference are converted. Needs no Unity.
 using System;
 using System.Collections.Generic;
+using System.Globalization;
 using System.Text;
+using System.Text.RegularExpressions;
 
 namespace Femsense
 {
@@ -31,6 +33,63 @@ namespace Femsense
             var pose = new Pose { Seq = BitConverter.ToUInt32(payload, 4), TimeS = BitConverter.ToDouble(payload, 8), Bones = new float[7 * count] };
             Buffer.BlockCopy(payload, 20, pose.Bones, 0, 28 * count);
             return pose;
+        }
+    }
+
+    /// <summary>Values of a flat JSON object, or of the top of a nested one where the name is not in it again.</summary>
+    public static class Document
+    {
+        /// <summary>Returns the text under a name, or null where there is none.</summary>
+        public static string Text(byte[] payload, string name)
+        {
+            var found = Regex.Match(Encoding.UTF8.GetString(payload), "\"" + name + "\"\\s*:\\s*\"((?:[^\"\\\\]|\\\\.)*)\"");
+            return found.Success ? Regex.Unescape(found.Groups[1].Value) : null;
+        }
+
+        /// <summary>Returns the number under a name, or NaN where there is none.</summary>
+        public static double Number(byte[] payload, string name)
+        {
+            var found = Regex.Match(Encoding.UTF8.GetString(payload), "\"" + name + "\"\\s*:\\s*(-?[0-9][0-9.eE+-]*)");
+            double value;
+            return found.Success && double.TryParse(found.Groups[1].Value, NumberStyles.Float, CultureInfo.InvariantCulture, out value) ? value : double.NaN;
+        }
+    }
+
+    /// <summary>Whether a robot streams: live, stale (its sensors say nothing), ended, or lost (its program died).</summary>
+    public sealed class Status
+    {
+        public string State = "";
+        public string Detail = "";
+        /// <summary>When the last pose went out, by the sender's clock [s since 1970]; NaN where it is not said.</summary>
+        public double SinceS = double.NaN;
+
+        /// <summary>Whether what is shown is old, however late it was received.</summary>
+        public bool IsOld { get { return State == "stale" || State == "ended" || State == "lost"; } }
+
+        /// <summary>Returns the status in a message, or null where it holds none.</summary>
+        public static Status Read(byte[] payload)
+        {
+            var state = Document.Text(payload, "state");
+            if (state == null) return null;
+            return new Status { State = state, Detail = Document.Text(payload, "detail") ?? "", SinceS = Document.Number(payload, "since_s") };
+        }
+    }
+
+    /// <summary>An answer to a drag: "converging" while nearer ones follow by themselves; reached, nearest or stopped is the end.</summary>
+    public sealed class Reach
+    {
+        public string Status = "";
+        public string Text = "";
+        public double ErrorM = double.NaN;
+
+        public bool IsFinal { get { return Status != "converging"; } }
+
+        /// <summary>Returns the answer in a message, or null where it holds none.</summary>
+        public static Reach Read(byte[] payload)
+        {
+            var status = Document.Text(payload, "status");
+            if (status == null) return null;
+            return new Reach { Status = status, Text = Document.Text(payload, "text") ?? "", ErrorM = Document.Number(payload, "error_m") };
         }
     }
 

@@ -1,4 +1,4 @@
-// Checks Messages.cs against a transcript that Python wrote: each line is bytes in hexadecimal and the numbers that are in them.
+// Checks Messages.cs against a transcript that Python wrote: each line is bytes in hexadecimal and what is in them.
 // Without Unity: mcs -out:transcript.exe unity/Runtime/Messages.cs unity/Tests/Transcript.cs && mono transcript.exe unity/Tests/transcript.txt
 using System;
 using System.Globalization;
@@ -16,6 +16,13 @@ namespace Femsense
             {
                 var parts = line.Split(' ');
                 var frame = Enumerable.Range(0, parts[0].Length / 2).Select(i => Convert.ToByte(parts[0].Substring(2 * i, 2), 16)).ToArray();
+                if (parts.Length > 2 && parts[2].Contains("="))
+                {
+                    var document = Frames.Read(frame, frame.Length).Single();
+                    if (document.Topic != parts[1] || !Said(document).SequenceEqual(parts.Skip(2))) return Fail(line, string.Join(" ", Said(document)));
+                    checkedLines++;
+                    continue;
+                }
                 var wanted = parts.Skip(2).Select(p => double.Parse(p, CultureInfo.InvariantCulture)).ToArray();
                 var messages = Frames.Read(frame, frame.Length);
                 if (messages.Count != 1 || messages[0].Topic != parts[1]) return Fail(line, "topic");
@@ -49,6 +56,24 @@ namespace Femsense
                 for (int k = 0; k < 4; k++) found[5 + i + k] = turn[k];
             }
             return found;
+        }
+
+        /// <summary>What a status or an answer to a drag says, with _ for blanks.</summary>
+        private static string[] Said(Message message)
+        {
+            if (message.Topic.EndsWith("/reach"))
+            {
+                var reach = Reach.Read(message.Payload);
+                return new[] { "status=" + reach.Status, "final=" + reach.IsFinal, "text=" + reach.Text.Replace(' ', '_'), "error_m=" + Number(reach.ErrorM) };
+            }
+            if (message.Topic.EndsWith("/force")) return new[] { "status=" + Document.Text(message.Payload, "status").Replace(' ', '_') };
+            var status = Status.Read(message.Payload);
+            return new[] { "state=" + status.State, "old=" + status.IsOld, "detail=" + status.Detail.Replace(' ', '_'), "since_s=" + Number(status.SinceS) };
+        }
+
+        private static string Number(double value)
+        {
+            return value.ToString("R", CultureInfo.InvariantCulture);
         }
 
         private static bool Same(double[] a, double[] b)

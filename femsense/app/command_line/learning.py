@@ -30,6 +30,13 @@ def learn(
     plane: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Normal of the plane in which the body bends.", show_default=False)
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "-c", "--calibration", metavar="FILE", help="Take a camera's markers into the robot's frame.", show_default=False
+        ),
+    ] = None,
+    robot_frame: Annotated[bool, typer.Option("--robot-frame", help="The markers are in the robot's frame already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
@@ -44,6 +51,8 @@ def learn(
             end_to_end=end_to_end,
             bones=bones,
             plane=plane,
+            calibration=calibration,
+            in_robot_frame=robot_frame,
             progress=progress,
         )
     return Answer(document, text)

@@ -19,7 +19,7 @@ from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
 from femsense.core.pose import make_pose
 from femsense.xr.proprioception.domain import Domain
-from femsense.xr.proprioception.labelled import Labelled
+from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.linear import train_ridge
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import Network
@@ -114,13 +114,14 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
 
 
 def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
-    """Return the inputs of a model's networks for labelled data. Raises InputError where channels or markers differ."""
+    """Return the inputs of a model's networks for labelled data. Raises InputError, DataError where channels, markers or frames differ."""
     same = (data.channels, data.marker_names) == (model.channels, model.marker_names)
     if not same:
         raise DataError(
             f"other channels or markers: {data.channels}, {data.marker_names}; the model knows {model.channels}, "
             f"{model.marker_names}"
         )
+    check_frame(model.frame, data.frame)
     if len(data) < FEWEST:
         raise DataError(f"{len(data)} rows have readings and all markers; at least {FEWEST} are needed")
     return data.inputs(model.memory_s)

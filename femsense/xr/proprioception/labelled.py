@@ -12,6 +12,10 @@ from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.xr.proprioception.memory import with_memory
 
+ROBOT, AS_MEASURED = "robot", "markers"
+"""Frames of reference: the robot's, or that in which the markers were measured, a camera's for instance."""
+WORDS = {ROBOT: "the robot's frame", AS_MEASURED: "the frame in which markers were measured"}
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Labelled:
@@ -27,6 +31,8 @@ class Labelled:
     marker_names: tuple[str, ...]
     part: IntArray
     """Which recording each row is from, shape (n,)."""
+    frame: str = AS_MEASURED
+    """Of reference: `ROBOT` or `AS_MEASURED`."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -39,7 +45,7 @@ class Labelled:
     def select(self, rows: npt.NDArray[np.bool_] | IntArray) -> Labelled:
         """Return some of the rows."""
         t, x, y = freeze(self.time_s[rows]), freeze(self.readings[rows]), freeze(self.markers[rows])
-        return Labelled(t, x, y, self.channels, self.marker_names, freeze(self.part[rows], np.int64))
+        return Labelled(t, x, y, self.channels, self.marker_names, freeze(self.part[rows], np.int64), self.frame)
 
     def inputs(self, taus: tuple[float, ...]) -> FloatArray:
         """Return readings with their filters, shape (n, (1 + k) c); filters start anew with each recording."""
@@ -54,6 +60,7 @@ def labelled(
     *,
     channels: Sequence[str] | None = None,
     marker_names: Sequence[str] | None = None,
+    frame: str = AS_MEASURED,
 ) -> Labelled:
     """Return readings with markers from arrays; rows without a finite marker or reading are left out.
 
@@ -62,9 +69,10 @@ def labelled(
         readings: shape (n, c).
         markers: [m], shape (n, m, 3).
         channels, marker_names: names; numbers by default.
+        frame: of the markers: "robot", or "markers" for any other that stays fixed to the base.
 
     Raises:
-        InputError: shapes that do not belong together, or times that decrease.
+        InputError: shapes that do not belong together, times that decrease, or an unknown frame.
     """
     t, x, y = (np.asarray(array, dtype=np.float64) for array in (time_s, readings, markers))
     if t.ndim != 1 or x.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or not len(t) == len(x) == len(y):
@@ -80,6 +88,8 @@ def labelled(
         raise InputError(
             "time runs backwards", where=f"time_s[{row}]", found=float(t[row]), expected=f"at least {t[row - 1]:.6g}"
         )
+    if frame not in (ROBOT, AS_MEASURED):
+        raise InputError("unknown frame of reference", where="frame", found=frame, expected=f"{ROBOT} | {AS_MEASURED}")
     good = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=(1, 2)) & np.isfinite(t)
     names = tuple(channels) if channels is not None else tuple(f"channel_{i}" for i in range(x.shape[1]))
     points = tuple(marker_names) if marker_names is not None else tuple(f"marker_{i}" for i in range(y.shape[1]))
@@ -90,16 +100,30 @@ def labelled(
             found=(len(names), len(points)),
             expected=x.shape[1:] + y.shape[1:2],
         )
-    return Labelled(freeze(t[good]), freeze(x[good]), freeze(y[good]), names, points, freeze(np.zeros(good.sum()), np.int64))
+    part = freeze(np.zeros(good.sum()), np.int64)
+    return Labelled(freeze(t[good]), freeze(x[good]), freeze(y[good]), names, points, part, frame)
 
 
 def joined(parts: Sequence[Labelled]) -> Labelled:
-    """Return several recordings as one. Raises InputError where channels or markers differ."""
+    """Return several recordings as one. Raises InputError where channels, markers or frames differ."""
     first = parts[0]
     for other in parts[1:]:
         if (other.channels, other.marker_names) != (first.channels, first.marker_names):
             found, expected = (*other.channels, *other.marker_names), (*first.channels, *first.marker_names)
             raise InputError("recordings of other channels or markers", where="parts", found=found, expected=expected)
+        check_frame(first.frame, other.frame)
     t, x, y = (freeze(np.concatenate([getattr(part, name) for part in parts])) for name in ("time_s", "readings", "markers"))
     number = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return Labelled(t, x, y, first.channels, first.marker_names, freeze(number, np.int64))
+    return Labelled(t, x, y, first.channels, first.marker_names, freeze(number, np.int64), first.frame)
+
+
+def check_frame(known: str, found: str) -> None:
+    """Raise InputError unless markers are in the frame of reference that is known: a motion of the base would be told for it."""
+    if known != found:
+        raise InputError(
+            "markers in another frame of reference",
+            where="markers",
+            found=WORDS[found],
+            expected=WORDS[known],
+            hint="-c CALIBRATION takes a camera's markers into the robot's frame, --robot-frame says that they are in it",
+        )

@@ -13,7 +13,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.domain import learn_domain
-from femsense.xr.proprioception.labelled import Labelled
+from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
 from femsense.xr.proprioception.selection import (
     MEMORIES,
@@ -75,10 +75,11 @@ def learn(
         progress: called with what is done and how much there is.
 
     Raises:
-        InputError: a kind of map that there is not. DataError: too few rows, or readings that never change.
+        InputError: a kind of map that there is not, a test in another frame of reference. DataError: too few rows, or readings that never change.
     """
     options = options or LearnOptions()
     _check(data, options)
+    check_frame(data.frame, data.frame if test is None else test.frame)
     held = rows_kept(len(data)) if test is None else np.zeros(len(data), dtype=bool)
     work, test = data.select(~held), data.select(held) if test is None else test
     kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
@@ -121,7 +122,7 @@ def learn(
         report["bones_mm"] = _bone_error(bones(inputs), chain, test)
     domain = learn_domain(work.readings)
     report["test_outside"] = float(1.0 - domain.inside(test.readings).mean())
-    return ProprioceptiveModel(data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report)
+    return ProprioceptiveModel(data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report, data.frame)
 
 
 def error_interval(errors: FloatArray, *, seed: int = 0) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
 from femsense.xr.proprioception.domain import Domain, Outside
+from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.memory import step_memory, with_memory
 from femsense.xr.proprioception.network import Network
 
@@ -35,6 +36,8 @@ class ProprioceptiveModel:
     """The end-to-end network, from readings to 9 numbers a bone (place, x axis, z axis); None: bones from the markers."""
     report: dict[str, Any] = field(default_factory=dict)
     """How it was learnt, and its errors on what was held out."""
+    frame: str = AS_MEASURED
+    """Of reference of markers and bones: "robot", or "markers", that in which they were measured."""
 
     def __repr__(self) -> str:
         error = self.report.get("error_mm")

@@ -19,6 +19,7 @@ from femsense.io.files import check_target, json_text
 from femsense.io.own_files import MODEL
 from femsense.xr.armature import Armature
 from femsense.xr.proprioception.domain import Domain
+from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import KINDS, Network
 from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, read_onnx, write_onnx
@@ -76,6 +77,7 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
         None if chain is None else _chain(chain),
         _network("bones", document["networks"]["bones"], numbers) if "bones" in document["networks"] else None,
         document["report"],
+        document.get("frame", AS_MEASURED),
     )
 
 
@@ -90,6 +92,7 @@ def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[
         "format": FORMAT,
         "channels": model.channels,
         "markers": model.marker_names,
+        "frame": model.frame,
         "memory_s": model.memory_s,
         "networks": {name: network.kind for name, network in networks.items()},
         "domain": {key: getattr(model.domain, key) for key in DOMAIN},

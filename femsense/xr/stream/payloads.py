@@ -43,6 +43,8 @@ RECEIVED = (DRAG, MEASURED)
 RETAINED = (MODEL, GLB, STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"
+FRAMES = {"robot": "robot: right-handed, Z up", "markers": "markers: as they were measured, not the robot's"}
+"""Frames of reference, and how `model` says them."""
 POSE_HEAD = struct.Struct("<4sIdHH")
 CLOUD_HEAD = struct.Struct("<4sIdI")
 POSE_MAGIC, CLOUD_MAGIC, FIELD_MAGIC = b"FSP1", b"FSC1", b"FSV1"
@@ -109,6 +111,8 @@ class Twin:
     """Of a run that is played over and over; nan: none is."""
     field: FieldKind | None = None
     """What `TwinFrame.field` holds."""
+    frame: str = "robot"
+    """Of reference of all that is sent, one of `FRAMES`; "markers": where these were never brought into the robot's frame."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -231,7 +235,7 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
                 "name": twin.name,
                 "glb": glb_url,
                 "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
-                "frame": "robot: right-handed, Z up",
+                "frame": FRAMES[twin.frame],
                 "length_unit": "m",
                 "force_unit": "N",
                 "pose": "FSP1",
@@ -248,10 +252,10 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
     )
 
 
-def force_bytes(seq: int, frame: TwinFrame) -> bytes:
-    """Return contacts and forces of a moment, robot frame, with standard deviations."""
+def force_bytes(seq: int, frame: TwinFrame, frame_id: str = "robot") -> bytes:
+    """Return contacts and forces of a moment, in the frame of reference `frame_id`, with standard deviations."""
     document: dict[str, Any] = {
-        "header": header(seq, frame.time_s, "robot"),
+        "header": header(seq, frame.time_s, frame_id),
         "frame": frame.frame,
         "status": frame.status,
         "residual_m": frame.residual_m,
@@ -262,10 +266,10 @@ def force_bytes(seq: int, frame: TwinFrame) -> bytes:
     return _json(_known(document))
 
 
-def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Sequence[float]) -> bytes:
+def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Sequence[float], frame_id: str = "robot") -> bytes:
     """Return what drives the robot at a moment."""
     rows = [_known({"name": i.name, "unit": i.unit, "value": float(v)}) for i, v in zip(inputs, values)]
-    return _json({"header": header(seq, time_s, "robot"), "inputs": rows})
+    return _json({"header": header(seq, time_s, frame_id), "inputs": rows})
 
 
 def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike]) -> bytes:
@@ -289,9 +293,12 @@ def in_unity(bones: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return bones * np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0], dtype=np.float32)
 
 
-def status_bytes(state: str, detail: str = "") -> bytes:
-    """Return a status: "live", "ended" (by us) or "lost" (said by the broker in our place)."""
-    return _json({"state": state, "detail": detail})
+def status_bytes(state: str, detail: str = "", since_s: float = float("nan")) -> bytes:
+    """Return a status: "live", "stale" (no poses come), "ended" (by us) or "lost" (said by the broker in our place).
+
+    `since_s`: when the last pose went out [s since 1970]; left out where none did.
+    """
+    return _json(_known({"state": state, "detail": detail, "since_s": since_s}))
 
 
 def read_document(payload: bytes, *, most: int = 1 << 20) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from threading import Event
+from threading import Event, Lock
 
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import (
@@ -31,6 +31,8 @@ from femsense.xr.stream.payloads import (
     topic,
 )
 
+STALE_S = 0.4
+"""What has sent no pose for so long is stale."""
 EARLY = 0.2
 """A frame may come early by this share of the shortest interval: clocks of sources jitter, and 60 Hz should not become 30."""
 
@@ -73,13 +75,15 @@ class Publisher:
         self.options = options or PublishOptions()
         self.sent = 0
         self._has_cloud = False
+        self._lock = Lock()
+        self._came, self._sent_at, self._state = time.monotonic(), float("nan"), ""
         self._pose_limit = RateLimit(self.options.rate_hz)
         self._cloud_limit, self._field_limit = RateLimit(self.options.cloud_rate_hz), RateLimit(self.options.cloud_rate_hz)
         self.announce(twin)
 
     def announce(self, twin: Twin) -> None:
         """Say what streams; also later, where something about it has changed."""
-        self.twin = twin
+        self.twin, self._state = twin, "live"
         glb = topic(twin.name, GLB)
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
         self.hub.publish(
@@ -93,15 +97,42 @@ class Publisher:
     def publish(self, frame: TwinFrame, *, now: float | None = None) -> bool:
         """Send a frame unless the rate forbids it; return whether it was sent."""
         moment = time.monotonic() if now is None else now
-        if not self._pose_limit.allows(moment):
-            return False
+        with self._lock:
+            self._came = moment
+            if not self._pose_limit.allows(moment):
+                return False
+            self._sent_at = time.time()
+            again = [self._status("live")] if self._state == "stale" else []
+            self.hub.publish([*again, *self._messages(frame, moment)])
+            self.sent += 1
+        return True
+
+    def watch(self, *, now: float | None = None) -> None:
+        """Say that it is stale where no frame has come for `STALE_S`; the next frame says that it is live."""
+        moment = time.monotonic() if now is None else now
+        with self._lock:
+            if self._state == "live" and moment - self._came > STALE_S:
+                self.hub.publish([self._status("stale")])
+
+    def end(self, detail: str = "") -> None:
+        """Say that nothing more comes."""
+        with self._lock:
+            self.hub.publish([self._status("ended", detail)])
+
+    def _status(self, state: str, detail: str = "") -> Message:
+        self._state = state
+        since = self._sent_at if state == "stale" else float("nan")
+        return Message(topic(self.twin.name, STATUS), status_bytes(state, detail, since))
+
+    def _messages(self, frame: TwinFrame, moment: float) -> list[Message]:
+        """Return what is sent of a frame at a moment of our clock [s]."""
         seq, name, t = self.sent, self.twin.name, frame.time_s
         messages = [
             Message(topic(name, POSE), pose_bytes(seq, t, frame.bones)),
-            Message(topic(name, FORCE), force_bytes(seq, frame)),
+            Message(topic(name, FORCE), force_bytes(seq, frame, self.twin.frame)),
         ]
         if frame.inputs:
-            messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs)))
+            messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs, self.twin.frame)))
         if self.options.json_mirror:
             messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
         if self._has_cloud and frame.cloud is None:
@@ -112,13 +143,7 @@ class Publisher:
             self._has_cloud = True
         if self.twin.field is not None and frame.field is not None and self._field_limit.allows(moment):
             messages.append(Message(topic(name, FIELD), field_bytes(seq, t, self.twin.field.largest, frame.field)))
-        self.hub.publish(messages)
-        self.sent += 1
-        return True
-
-    def end(self, detail: str = "") -> None:
-        """Say that nothing more comes."""
-        self.hub.publish([Message(topic(self.twin.name, STATUS), status_bytes("ended", detail))])
+        return messages
 
 
 def play(

@@ -30,6 +30,8 @@ LONGEST_LINE = 65_536
 POLL_S = 0.002
 """How often a file is asked whether it has grown."""
 WAIT_S = 0.1
+QUIET_S = 3.0
+"""After which readings have stopped, as it is said to people."""
 
 Reading = tuple[float, FloatArray]
 """Time [s], and one value for each channel, nan where there is none."""
@@ -41,23 +43,25 @@ class Readings(Iterator[Reading]):
     def __init__(self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: "") -> None:
         """Read items; `away` says why the source is not there, or nothing."""
         self._items, self._read, self._away = items, read, away
-        self._came = False
+        self._came = float("nan")
         self._passed = 0
 
     def __next__(self) -> Reading:
         for item in self._items:
             found = self._read(item)
             if found is not None:
-                self._came = True
+                self._came = time.monotonic()
                 return found
             self._passed += 1
         raise StopIteration
 
     @property
     def trouble(self) -> str:
-        """Why no readings come; empty once they do and the source is there."""
-        if self._away() or self._came:
+        """Why no readings come; empty while they do and the source is there."""
+        if self._away():
             return self._away()
+        if np.isfinite(self._came):
+            return "they stopped" if time.monotonic() - self._came > QUIET_S else ""
         return f"lines that came: {self._passed}, none a reading of its channels" if self._passed else "nothing has come yet"
 
     def close(self) -> None:

@@ -30,7 +30,7 @@ def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
         Input(channel, "", float(low), float(high))
         for channel, low, high in zip(model.channels, model.domain.low, model.domain.high)
     )
-    return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs)
+    return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs, frame=model.frame)
 
 
 def frames_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[TwinFrame]:

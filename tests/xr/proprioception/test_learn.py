@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from results import make_calibration
 from scipy.spatial.transform import Rotation
 
+from femsense.calib.files import write_calibration
 from femsense.core.errors import DataError, InputError
+from femsense.core.pose import invert_pose, transform_points
 from femsense.xr.armature import ArmatureOptions
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.drift import adapt, drift
@@ -205,6 +209,61 @@ def test_files_are_read_and_rows_with_hidden_markers_are_left_out(tmp_path: Path
     lines = markers.read_text().splitlines()
     markers.write_text("\n".join(lines[:5] + lines[6:]))
     assert len(read_labelled(sensors, markers)) == 19
+
+
+def test_a_camera_s_markers_come_into_the_robot_s_frame_and_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
+    data, calibration = session(1, rows=20), make_calibration()
+    T = calibration.T_robot_camera
+    seen = labelled(
+        data.time_s,
+        data.readings,
+        transform_points(invert_pose(T), data.markers.reshape(-1, 3)).reshape(data.markers.shape),
+        channels=CHANNELS,
+    )
+    sensors, markers = write_session(tmp_path, seen)
+    assert read_labelled(sensors, markers).frame == "markers"
+    assert read_labelled(sensors, markers, in_robot_frame=True).frame == "robot"
+    file = write_calibration(
+        replace(calibration, poses=(T,), camera_names=("",), joint_covariance=np.eye(6)), tmp_path / "c.json"
+    )
+    declared = (
+        f'format = "femsense-recording-1"\nactuation = "tension"\nactuation_zero = "absolute"\nT_robot_camera = {T.tolist()}\n'
+    )
+    (tmp_path / "other").mkdir()
+    beside = write_session(tmp_path / "other", seen)
+    (tmp_path / "other" / "recording.toml").write_text(declared)
+    for back in (read_labelled(sensors, markers, calibration=file), read_labelled(*beside)):
+        assert back.frame == "robot"
+        np.testing.assert_allclose(back.markers, data.markers, atol=1e-8)
+    with pytest.raises(InputError, match="need no calibration"):
+        read_labelled(sensors, markers, calibration=file, in_robot_frame=True)
+    two = write_calibration(replace(calibration, poses=(T, np.eye(4))), tmp_path / "two.json")
+    with pytest.raises(InputError, match="a camera without a pose"):
+        read_labelled(sensors, markers, calibration=two)
+    rows = [line.split(",", 2) for line in markers.read_text().splitlines()[1:]]
+    cameras = [f"{frame},{name},left,{xyz}" for frame, name, xyz in rows]
+    straight = [
+        f"{7 + i},{name},right," + ",".join(f"{x + 2e-3:.9g}" for x in place)
+        for i, places in enumerate(data.markers)
+        for name, place in zip(data.marker_names, places)
+    ]
+    markers.write_text("\n".join(["frame,marker,camera,x_m,y_m,z_m", *cameras, *straight]) + "\n")
+    np.testing.assert_allclose(read_labelled(sensors, markers, calibration=two).markers, data.markers + 1e-3, atol=1e-8)
+    with pytest.raises(InputError, match="several cameras without their poses"):
+        read_labelled(sensors, markers)
+
+
+def test_frames_of_reference_are_not_mixed(model) -> None:
+    here, robot = session(5), replace(session(5), frame="robot")
+    with pytest.raises(InputError, match=r"another frame of reference[\s\S]*--robot-frame"):
+        joined([here, robot])
+    with pytest.raises(InputError, match="another frame of reference"):
+        drift(model, robot)
+    with pytest.raises(InputError, match="another frame of reference"):
+        learn(here, test=robot, options=LearnOptions(kinds=("ridge",)))
+    with pytest.raises(InputError, match="unknown frame of reference"):
+        labelled([0.0], [[1.0]], [[[0.0, 0.0, 0.0]]], frame="base")
+    assert learn(robot, options=LearnOptions(kinds=("ridge",), memories=((),))).frame == "robot" and model.frame == "markers"
 
 
 @pytest.mark.parametrize(

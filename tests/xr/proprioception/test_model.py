@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ def test_a_model_comes_back_from_its_file(kind: str, memory: tuple[float, ...], 
     )
     assert back.report == {"error_mm": 1.5} and "3 channels → 4 markers" in repr(back) and "1.5 mm" in repr(back)
     np.testing.assert_array_equal(back.domain.low, model.domain.low)
+    assert (back.frame, load_model(save_model(replace(model, frame="robot"), tmp_path / "r.onnx")).frame) == ("markers", "robot")
 
 
 @pytest.mark.parametrize("kind", KINDS)

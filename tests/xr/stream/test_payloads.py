@@ -80,6 +80,14 @@ def test_documents_say_what_is_known_and_leave_out_what_is_not() -> None:
     assert mirror["poses"][1]["position"]["x"] == pytest.approx(-0.3) and mirror["header"]["frame_id"] == "unity"
     for document in (force, model, inputs, mirror):
         assert plain(document)
+    assert json.loads(payloads.status_bytes("stale")) == {"state": "stale", "detail": ""}
+
+
+def test_what_was_never_brought_into_the_robot_s_frame_says_so() -> None:
+    for frame, said in (("robot", "robot: right-handed, Z up"), ("markers", "markers: as they were measured, not the robot's")):
+        assert json.loads(payloads.model_bytes(twin(frame=frame), ""))["frame"] == said
+        assert json.loads(payloads.force_bytes(0, moment(0.0), frame))["header"]["frame_id"] == frame
+        assert json.loads(payloads.inputs_bytes(0, 0.0, (), (), frame))["header"]["frame_id"] == frame
 
 
 def test_topics_are_ours_whatever_the_robot_is_called() -> None:
@@ -101,7 +109,7 @@ def test_documents_are_those_that_the_documentation_shows() -> None:
         "force": payloads.force_bytes(9, frame),
         "inputs": payloads.inputs_bytes(9, 3.5, twin().inputs, (1.5,)),
         "pose_json": payloads.pose_json_bytes(9, 3.5, frame.bones),
-        "status": payloads.status_bytes("live"),
+        "status": payloads.status_bytes("stale", since_s=1764201600.5),
         "measured": payloads.measured_bytes(9, 3.5, {"tip": vector}),
     }
     for kind, payload in sent.items():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import struct
 import threading
+import time
 
 import numpy as np
 from streams import moment, twin
@@ -56,6 +58,38 @@ def test_messages_of_a_moment_go_together_and_too_many_do_not_go() -> None:
     assert sink.topics() == ["pose", "force", "inputs"] and len(sink.batches) == 1
     publisher.end()
     assert b"ended" in hub.newest()["femsense/arm/status"].payload
+
+
+def test_a_source_that_stops_is_stale_until_it_goes_on() -> None:
+    hub, late = Hub(), Kept()
+    publisher = Publisher(hub, twin(frame="markers"))
+
+    def status() -> dict[str, object]:
+        return json.loads(hub.newest()["femsense/arm/status"].payload)
+
+    begun = time.time()
+    publisher.publish(moment(0.0), now=10.0)
+    publisher.watch(now=10.39)
+    assert status()["state"] == "live"
+    publisher.watch(now=10.41)
+    hub.attach(late)
+    assert status()["state"] == "stale" and begun <= float(str(status()["since_s"])) <= time.time()
+    assert late.topics()[:3] == ["glb", "model", "status"]  # who comes late is told before it shows a pose
+    publisher.watch(now=12.0)
+    assert len(late.batches) == 1  # it is said once
+    publisher.publish(moment(1.0), now=13.0)
+    assert status() == {"state": "live", "detail": ""} and late.topics()[-4:] == ["status", "pose", "force", "inputs"]
+    assert b'"frame_id":"markers"' in hub.newest()["femsense/arm/force"].payload
+    publisher.end()
+    publisher.watch(now=20.0)
+    publisher.publish(moment(2.0), now=21.0)
+    assert status()["state"] == "ended"
+
+
+def test_a_source_that_never_began_is_stale_without_a_time() -> None:
+    hub = Hub()
+    Publisher(hub, twin()).watch(now=time.monotonic() + 1.0)
+    assert json.loads(hub.newest()["femsense/arm/status"].payload) == {"state": "stale", "detail": ""}
 
 
 def test_a_field_goes_out_ten_times_a_second_at_most() -> None:

@@ -7,6 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 
@@ -189,6 +190,7 @@ def test_what_is_no_source_is_refused_at_once(source: str) -> None:
 
 def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: Path) -> None:
     twin = sensor_twin(model, "arm")
+    assert (twin.frame, sensor_twin(replace(model, frame="robot"), "arm").frame) == ("markers", "robot")
     mesh = read_glb(twin.glb)
     radius = np.linalg.norm(mesh.skin.rest[:-2, :2], axis=1)
     assert np.ptp(radius) < 1e-6 and mesh.skin.rest[:, 2].min() == pytest.approx(0.0, abs=1e-6)

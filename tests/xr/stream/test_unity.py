@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from glb import ROOT
+from streams import documented, moment
 
 from femsense.xr.stream.hub import Message
-from femsense.xr.stream.payloads import in_unity, pose_bytes
+from femsense.xr.stream.payloads import force_bytes, in_unity, pose_bytes, status_bytes
 from femsense.xr.stream.websocket import pack
 
 UNITY = ROOT / "unity"
@@ -30,7 +33,24 @@ def transcript() -> list[str]:
         numbers = [1000 * k, 0.125 * k, *in_unity(bones).ravel()]
         lines.append(" ".join([pack([Message(topic, pose)]).hex(), topic, *(f"{v:.9g}" for v in numbers)]))
     lines.append(f"{pack([Message('femsense/arm/pose', pose[:-1])]).hex()} femsense/arm/pose")
-    return lines
+    return lines + [f"{pack([Message(name, payload)]).hex()} {name} {said}" for name, payload, said in documents()]
+
+
+def documents() -> list[tuple[str, bytes, str]]:
+    """Topic and payload of what is said about a robot, and how Unity's part has to understand it."""
+    doubtful = replace(moment(0.5, contact=True), status='light = 9 is outside 0 … 1, by "far"')
+    answer = documented("reach") | {"status": "converging", "text": "nearer ones follow", "error_m": 0.00125}
+    arrived = answer | {"status": "reached", "text": "reached to 0.01 mm", "error_m": 1e-05}
+    found = [
+        ("status", status_bytes("live"), "state=live old=False detail= since_s=NaN"),
+        ("status", status_bytes("stale", since_s=1764201600.5), "state=stale old=True detail= since_s=1764201600.5"),
+        ("status", status_bytes("lost", "127.0.0.1:1883"), "state=lost old=True detail=127.0.0.1:1883 since_s=NaN"),
+        ("status", status_bytes("ended"), "state=ended old=True detail= since_s=NaN"),
+        ("force", force_bytes(9, doubtful), 'status=light_=_9_is_outside_0_…_1,_by_"far"'),
+        ("reach", json.dumps(answer).encode(), "status=converging final=False text=nearer_ones_follow error_m=0.00125"),
+        ("reach", json.dumps(arrived).encode(), "status=reached final=True text=reached_to_0.01_mm error_m=1E-05"),
+    ]
+    return [(f"femsense/arm/{kind}", payload, said) for kind, payload, said in found]
 
 
 def test_the_transcript_is_what_is_sent() -> None:
@@ -43,4 +63,4 @@ def test_unity_s_part_reads_the_transcript(tmp_path: Path) -> None:
     sources = [str(UNITY / "Runtime" / "Messages.cs"), str(UNITY / "Tests" / "Transcript.cs")]
     subprocess.run(["mcs", f"-out:{program}", *sources], check=True, capture_output=True, timeout=60)
     done = subprocess.run(["mono", str(program), str(TRANSCRIPT)], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0 and "6 lines agree" in done.stdout, done.stdout
+    assert done.returncode == 0 and "13 lines agree" in done.stdout, done.stdout

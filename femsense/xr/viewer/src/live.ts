@@ -6,7 +6,7 @@ import { Connection, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
 import { amount, frameAt, isDoubtful, type Frame } from "./data";
 import { Dragging } from "./dragging";
-import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
+import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model, type Status } from "./messages";
 import type { Field, Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
@@ -271,7 +271,7 @@ class Robot {
   private field: Field | null = null;
   private painted: Field | null = null; // the field that the body has now
   private arrived = -Infinity; // when the newest pose came [ms of the page]
-  private told = { state: "", detail: "" };
+  private told: Status = { state: "", detail: "", since_s: null };
   private readonly arrivals: number[] = []; // when poses of the last seconds came [ms of the page]
   private gone = false;
 
@@ -326,19 +326,23 @@ class Robot {
 
   /** Returns whether it is live, and that in words. */
   state(now: number, open: boolean): [string, string] {
-    const age = (now - this.arrived) / 1000;
+    const { state, detail, since_s } = this.told;
+    const silent = state === "stale"; // the sender says so: who comes late cannot know how old its first pose is
+    const told = silent && since_s !== null ? Date.now() / 1000 - since_s : 0;
+    const age = Math.max((now - this.arrived) / 1000, told);
     if (!open) return ["lost", "no connection"];
-    if (this.told.state === "ended") return ["ended", "ended"];
-    if (this.told.state === "lost") return ["lost", this.told.detail ? `no connection to ${this.told.detail}` : "source lost"];
+    if (state === "ended") return ["ended", "ended"];
+    if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
     if (!Number.isFinite(age)) return ["waiting", "no pose yet"];
-    if (age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
+    if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
     const span = Math.max(now - this.arrivals[0]!, 500);
     return ["live", `live, ${Math.round((1000 * this.arrivals.length) / span)} Hz`];
   }
 
   about(): string {
     const vertices = this.body?.skins.reduce((sum, s) => sum + (s.geometry.getAttribute("position")?.count ?? 0), 0) ?? 0;
-    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices`;
+    const frame = this.model.inRobotFrame ? "" : " · in the frame of its markers, not the robot's";
+    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}`;
   }
 
   private moved(pose: ReturnType<typeof readPose>): void {

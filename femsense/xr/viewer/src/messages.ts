@@ -11,6 +11,7 @@ export interface Message {
 
 export interface Model {
   name: string;
+  inRobotFrame: boolean; // else that of the markers that it was learnt from
   glb: string;
   digest: string;
   bones: string[];
@@ -27,6 +28,12 @@ export interface Pose {
   seq: number;
   time: number;
   bones: Float32Array; // x y z qx qy qz qw of each, robot frame
+}
+
+export interface Status {
+  state: string;
+  detail: string;
+  since_s: number | null; // when the last pose was sent, by the sender's clock [s since 1970]
 }
 
 export interface Reach {
@@ -96,6 +103,7 @@ export function readModel(payload: Uint8Array): Model | null {
   if (!told || told.schema !== "femsense-model-1") return null;
   return {
     name: String(told.name ?? "robot"),
+    inRobotFrame: !String(told.frame ?? "robot").startsWith("markers"),
     glb: String(told.glb ?? ""),
     digest: String(told.glb_sha256 ?? ""),
     bones: list(told.bones).map((b) => String(b.name)),
@@ -128,9 +136,9 @@ export function readInputs(payload: Uint8Array): (number | null)[] | null {
   return told ? list(told.inputs).map((i) => number(i.value)) : null;
 }
 
-export function readStatus(payload: Uint8Array): { state: string; detail: string } | null {
+export function readStatus(payload: Uint8Array): Status | null {
   const told = document(payload);
-  return told ? { state: String(told.state ?? ""), detail: String(told.detail ?? "") } : null;
+  return told ? { state: String(told.state ?? ""), detail: String(told.detail ?? ""), since_s: number(told.since_s) } : null;
 }
 
 export function readReach(payload: Uint8Array): Reach | null {
