@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,28 +19,49 @@ if TYPE_CHECKING:
 Pair = tuple[Path, Path]
 
 
+@dataclass(frozen=True, slots=True)
+class LearnFiles:
+    """What is learnt from."""
+
+    sensors: Path
+    markers: Path
+    test: Pair | None = None
+    """Two more files, of another recording: the error is stated on them, that of a corrected model too."""
+    adapt: Path | None = None
+    """A model to correct by the first two, instead of learning anew; it keeps its bones."""
+    calibration: Path | None = None
+    in_robot_frame: bool = False
+    """Both as in `read_labelled`."""
+
+    @property
+    def all(self) -> list[Path]:
+        """Every file that is read."""
+        more = [file for file in (self.adapt, self.calibration) if file is not None]
+        return [self.sensors, self.markers, *(self.test or ()), *more]
+
+    def read(self) -> tuple[Labelled, Labelled | None]:
+        """Return the recording, and that of the test. Raises InputError."""
+        from femsense.xr.proprioception.files import read_labelled
+
+        read = partial(read_labelled, calibration=self.calibration, in_robot_frame=self.in_robot_frame)
+        return read(self.sensors, self.markers), None if self.test is None else read(*self.test)
+
+
 def learn_into(
-    files: Pair,
+    files: LearnFiles,
     output: Path,
     *,
-    test: Pair | None = None,
-    adapt: Path | None = None,
     end_to_end: bool = False,
     bones: int = 8,
     plane: str | None = None,
-    calibration: Path | None = None,
-    in_robot_frame: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
 
     Arguments:
-        files: SENSORS.csv and MARKERS.csv.
+        files: what is read.
         output: the ONNX file.
-        test: two more files, of another recording: the error is stated on them, that of a corrected model too.
-        adapt: a model to correct by `files`, instead of learning anew; it keeps its bones.
         end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
-        calibration, in_robot_frame: as in `read_labelled`.
 
     Raises:
         InputError, DataError: files that do not fit, too few rows.
@@ -47,19 +69,16 @@ def learn_into(
     from femsense.xr.armature import ArmatureOptions
     from femsense.xr.proprioception.drift import adapt as adapted
     from femsense.xr.proprioception.drift import drift
-    from femsense.xr.proprioception.files import read_labelled
     from femsense.xr.proprioception.learn import LearnOptions, learn
     from femsense.xr.proprioception.model_file import load_model, save_model
 
+    adapt, test = files.adapt, files.test
     if adapt is not None and (end_to_end or plane is not None):
         raise InputError(
             "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
         )
-    used = [*files, *(test or ()), *([] if adapt is None else [adapt]), *([] if calibration is None else [calibration])]
-    check_target(output, folder=False, kind=MODEL, inputs=used)
-    read = partial(read_labelled, calibration=calibration, in_robot_frame=in_robot_frame)
-    data = read(*files)
-    other = None if test is None else read(*test)
+    check_target(output, folder=False, kind=MODEL, inputs=files.all)
+    data, other = files.read()
     if adapt is not None:
         before = load_model(adapt)
         found = drift(before, data)

@@ -40,19 +40,15 @@ def learn(
     json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
-    from femsense.app.learn_command import learn_into
+    from femsense.app.learn_command import LearnFiles, learn_into
 
     with progress_bar("learn") as progress:
         document, text = learn_into(
-            (sensors, markers),
+            LearnFiles(sensors, markers, test, adapt, calibration, robot_frame),
             output,
-            test=test,
-            adapt=adapt,
             end_to_end=end_to_end,
             bones=bones,
             plane=plane,
-            calibration=calibration,
-            in_robot_frame=robot_frame,
             progress=progress,
         )
     return Answer(document, text)
