@@ -191,13 +191,15 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     on = np.zeros(len(scan.view), dtype=bool)
     on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
     missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those beside a silhouette
-    gap = np.abs(surface.closest(scan.points(poses)[missed])[1])
-    on[missed] = gap < 0.5 * OFF * scan.ray_std(noises)[missed]
-    if not on.any():
+    points = scan.points(poses)
+    on[missed] = surface.gap(points[missed]) < 0.5 * OFF * scan.ray_std(noises)[missed]
+    own = np.flatnonzero(on)
+    if not len(own):
         return scan
-    tree = cKDTree(scan.points(poses))
-    around = tree.query(tree.data, k=min(AROUND, len(on)))[1].reshape(len(on), -1)
-    mine = on & (on[around].mean(axis=1) > 0.5)
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    around = tree.query(points[own], k=min(AROUND, len(on)))[1].reshape(len(own), -1)
+    mine = np.zeros(len(on), dtype=bool)
+    mine[own] = on[around].mean(axis=1) > 0.5
     return replace(
         scan,
         camera_points=scan.camera_points[mine],

@@ -13,7 +13,8 @@ from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.prepare import make_sensor, scan_of
-from femsense.sensing.search import evidence, segmented
+from femsense.sensing.search import evidence
+from femsense.sensing.separation import segmented
 from femsense.sensing.types import Sensor
 
 FOLDS = 4

@@ -30,7 +30,8 @@ from femsense.sensing.judge import OK, behind_body, beside_markers, objects_know
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
-from femsense.sensing.search import explain, segmented
+from femsense.sensing.search import explain
+from femsense.sensing.separation import segmented
 from femsense.sensing.states import foretold, free_state
 from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import (

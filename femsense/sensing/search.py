@@ -7,20 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.calib.scan import REACH, Scan, parted
+from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
-from femsense.pointcloud.rays import Surface
 from femsense.sensing.afar import ANYWHERE, APART, from_afar
-from femsense.sensing.forces import fit_forces, no_forces
+from femsense.sensing.forces import fit_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std
 from femsense.sensing.places import given_touches, object_touches, said_free
-from femsense.sensing.prepare import condensed_at
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
@@ -32,16 +30,10 @@ ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
 """Contacts a frame at most."""
-GIVEN_ROUNDS = 5
-"""How often robot and surroundings are separated at most where the places are given."""
-SETTLED = 0.005
-"""They are separated where the number of the robot's points changes by less than this share of it."""
 ROUNDS = 2
 """How often a place is looked for again with the state that its force makes."""
 NEARBY = 0.03
 """The search takes the answers of a state whose nodes are nearer than this share of the body's diagonal: they rank places, and do not weigh forces."""
-SOME = 500
-"""Points that tell which of two states is closer to all of them."""
 THIN = 2000
 """Rows that the search uses at most."""
 
@@ -62,8 +54,8 @@ def explain(
     """
     if scan is None or len(sensor.places):
         touches = given_touches(sensor)
-        fit = fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before) if touches else None
-        return scan, _better(free, fit), free
+        fit = fit_forces(sensor, k, scan, touches, free, start=start_from(previous, touches), before=before) if touches else None
+        return scan, better(free, fit), free
     if said_free(sensor, k):
         return scan, free, free
     again = _held(sensor, k, scan, shapes, free, previous, before)
@@ -71,83 +63,18 @@ def explain(
         return scan, again, free
     fit = _with_objects(sensor, k, scan, shapes, free, free if again is None else again, before)
     scan, fit, free = from_afar(sensor, k, whole, scan, fit, free, before)
-    return scan, _with_hidden(sensor, k, scan, fit, free, before), free
+    return scan, with_hidden(sensor, k, scan, fit, free, before), free
 
 
-def segmented(
-    sensor: Sensor,
-    k: int,
-    scan: Scan | None,
-    alone: Equilibrium,
-    previous: SensedFrame | None,
-    before: tuple[FloatArray, ...] | None,
-) -> tuple[Scan | None, Fit]:
-    """Return the scan with robot and surroundings apart, neighbouring points averaged, and the fit without forces to what is the robot's.
-
-    Where colour has not separated them, the shape is explained first, with all points; what then lies off the surface is something else.
-    `alone` is the state without forces.
-    """
-    response, near = None if previous is None else previous.free_response, foretold(previous, alone)
-    if scan is None:
-        return None, no_forces(sensor, k, None, alone, response)
-    few = condensed_at(sensor, scan, near if _closer(sensor, scan, near, alone) else alone)
-    free = no_forces(sensor, k, few, alone, response)
-    if scan.segmented:
-        return few, free
-    state, last = alone, scan
-    # what is taken for the robot at first still holds some of what touches it, or lacks what moved far
-    rounds = GIVEN_ROUNDS if len(sensor.places) else ROUNDS
-    for _ in range(0 if said_free(sensor, k) else rounds):
-        fit = _by_shape(sensor, k, few, free, previous, before)
-        state = fit.state
-        if not fit.touches:
-            break
-        own = _parted(sensor, scan, state)
-        few = condensed_at(sensor, own, state)
-        free = no_forces(sensor, k, few, alone, free.response)
-        if len(sensor.places) and abs(len(own.view) - len(last.view)) < SETTLED * len(own.view):
-            return few, free
-        last = own
-    few = condensed_at(sensor, _parted(sensor, scan, state), state)
-    return few, no_forces(sensor, k, few, alone, free.response)
-
-
-def _closer(sensor: Sensor, scan: Scan, near: Equilibrium, alone: Equilibrium) -> bool:
-    """Return whether most points lie closer to one state than to another: what touched in the frame before may be gone."""
-    if near is alone:
-        return True
-    points = scan.points(sensor.calibration.poses)[:: max(1, len(scan.view) // SOME)]
-    first, second = (Surface(state.positions, sensor.surface.triangles).gap(points) for state in (near, alone))
-    return bool(np.median(first) <= np.median(second))
-
-
-def _by_shape(
-    sensor: Sensor,
-    k: int,
-    scan: Scan,
-    free: Fit,
-    previous: SensedFrame | None,
-    before: tuple[FloatArray, ...] | None,
+def with_hidden(
+    sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None, *, most: int = MOST
 ) -> Fit:
-    """Return what explains the shape: forces at the given places, else hidden ones."""
-    if not len(sensor.places):
-        return _with_hidden(sensor, k, scan, free, free, before)
-    touches = given_touches(sensor)
-    return _better(free, _try(sensor, k, scan, touches, free, _start(previous, touches), before))
-
-
-def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
-    surface = Surface(state.positions, sensor.surface.triangles)
-    return parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
-
-
-def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
-    """Return the fit with contacts that the shape alone betrays, one after the other."""
-    for _ in range(MOST - len(fit.touches)):
+    """Return the fit with contacts that the shape alone betrays, one after the other, until there are so many."""
+    for _ in range(most - len(fit.touches)):
         start = Start(fit.state, np.vstack([fit.forces, np.zeros((1, 3))]), fit.response)
         more = fit
         for found in find_hidden(sensor, fit):
-            more = _better(more, _try(sensor, k, scan, [*fit.touches, found], free, start, before))
+            more = better(more, attempt(sensor, k, scan, [*fit.touches, found], free, start, before))
             if more is not fit and left_over(sensor, more) <= sensor.knowledge.misfit_limit:
                 break
         more = _significant(sensor, k, scan, more, free, before)
@@ -243,7 +170,7 @@ def _with_objects(
             if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)
         ]
         start = _start_of(sensor, fit, [*found, *own])
-        fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
+        fit = better(free, attempt(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
     return _significant(sensor, k, scan, fit, free, before)
 
 
@@ -262,7 +189,7 @@ def _held(
     near = foretold(previous, free.state)
     held, kept = held_on(sensor, previous.touches, object_touches(sensor, shapes, near), previous.sure, gone=not shapes)
     forces = np.vstack([previous.forces, np.zeros((1, 3))])[kept]
-    again = _try(sensor, k, scan, held, free, Start(near, forces, previous.response, firm=True), before) if held else None
+    again = attempt(sensor, k, scan, held, free, Start(near, forces, previous.response, firm=True), before) if held else None
     if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit or again.cost >= free.cost:
         return None
     return again
@@ -353,11 +280,11 @@ def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before
         if not kept:
             return free
         start = Start(fit.state, np.delete(fit.forces, weakest, axis=0), fit.response)
-        fit = _better(free, _try(sensor, k, scan, kept, free, start, before))
+        fit = better(free, attempt(sensor, k, scan, kept, free, start, before))
     return fit
 
 
-def _try(
+def attempt(
     sensor: Sensor,
     k: int,
     scan: Scan,
@@ -372,12 +299,12 @@ def _try(
         return None
 
 
-def _better(free: Fit, fit: Fit | None) -> Fit:
+def better(free: Fit, fit: Fit | None) -> Fit:
     """Return the fit, unless it explains no more than no contact at all."""
     return free if fit is None or fit.cost >= free.cost else fit
 
 
-def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> Start | None:
+def start_from(previous: SensedFrame | None, touches: Sequence[Touch]) -> Start | None:
     if previous is None or len(previous.touches) != len(touches):
         return None
     return Start(previous.state, previous.forces, previous.response)

@@ -1,0 +1,62 @@
+"""Robot and surroundings apart where no colour tells them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import arm
+from touched_arm import touched
+
+from femsense.calib.calibrate import calibrate
+from femsense.sensing.pipeline import sense_frame
+from femsense.sensing.prepare import make_sensor, scan_of
+from femsense.sensing.separation import segmented
+from femsense.sensing.types import SensedFrame, Sensor
+
+FORCE = np.array([0.0, 0.0, -0.05])
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sensor, SensedFrame, int]:
+    """Return a sensor without colours, its frame in which a ball pushes, and how many points of the arm coloured clouds show there."""
+    folder: Path = tmp_path_factory.mktemp("ball")
+    seen = touched(folder, FORCE, ball=True)
+    calibration = calibrate(arm(), seen)
+    colored = sense_frame(make_sensor(arm(), seen, calibration), 3, None)
+    sensor = make_sensor(replace(arm(), color_rgb=None), seen, calibration)
+    return sensor, sense_frame(sensor, 3, None), colored.report.matched
+
+
+def test_a_touch_is_found_and_the_robot_seen_whole(pushed):
+    _, frame, count = pushed
+    assert frame.report.status == "ok"
+    assert frame.contacts[0].force_n == pytest.approx(0.05, rel=0.08)
+    assert frame.report.matched == pytest.approx(count, rel=0.03)
+
+
+def test_the_contacts_of_the_frame_before_tell_what_is_the_robots(pushed):
+    """The state that they foretell is where the next frame begins: no search, a fraction of the work."""
+    sensor, frame, _ = pushed
+    scan = scan_of(sensor, 3, frame.state)
+    assert scan is not None and not scan.segmented
+    work = []
+    for previous in (None, frame):
+        began = time.process_time()
+        few, _ = segmented(sensor, 3, scan, frame.free_state, previous, None)
+        work.append(time.process_time() - began)
+        assert few is not None
+        assert few.measured.sum() == pytest.approx(frame.report.matched, rel=0.1)
+    assert work[1] < 0.5 * work[0]
+
+
+def test_contacts_that_are_gone_tell_nothing(pushed):
+    """Frame 2 is free again: the body is seen where the inputs have it, all of it."""
+    sensor, frame, _ = pushed
+    frames = replace(sensor, recording=replace(sensor.recording, free=None))
+    after = sense_frame(frames, 2, frame)
+    assert after.report.status == "ok" and not after.contacts
+    assert after.report.matched > 0.95 * frame.report.matched
