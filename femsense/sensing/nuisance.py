@@ -171,15 +171,15 @@ def learn(
     if not frames:
         return knowledge
     first = _Prior.of(knowledge, frames[0][1])
-    weighed = frames
+    shown = frames
     for _ in range(2):  # the second time with what the first left
-        weighed = [(_weighed(knowledge, rows), sag) for rows, sag in frames]
-        grams = [_gram(knowledge, rows, sag) for rows, sag in weighed]
+        shown = [(weighed(knowledge, rows), sag) for rows, sag in frames]
+        grams = [_gram(knowledge, rows, sag) for rows, sag in shown]
         knowledge = first.posterior(_fit_field(knowledge, grams, first), grams)
-        rough = knowledge.rough * max(1.0, _scatter(knowledge, weighed))
-        knowledge = replace(knowledge, together=_together(knowledge, weighed), rough=rough)
-    knowledge = _alike(knowledge, [_gram(knowledge, _weighed(knowledge, rows), sag) for rows, sag in frames])
-    clouds = [(_weighed(knowledge, rows), sag) for rows, sag in judged or frames if rows.of_clouds]
+        rough = knowledge.rough * max(1.0, _scatter(knowledge, shown))
+        knowledge = replace(knowledge, together=_together(knowledge, shown), rough=rough)
+    knowledge = _alike(knowledge, [_gram(knowledge, weighed(knowledge, rows), sag) for rows, sag in frames])
+    clouds = [(weighed(knowledge, rows), sag) for rows, sag in judged or frames if rows.of_clouds]
     if not clouds:
         return knowledge
     misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in clouds])
@@ -277,7 +277,7 @@ def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
 
 
-def _weighed(knowledge: Knowledge, rows: Rows) -> Rows:
+def weighed(knowledge: Knowledge, rows: Rows) -> Rows:
     """Return rows as they are to be weighed: rough, and together."""
     return replace(rows, std=knowledge.rough * rows.std, together=knowledge.together) if rows.of_clouds else rows
 

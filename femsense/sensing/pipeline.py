@@ -29,7 +29,7 @@ from femsense.sensing.false_alarms import with_gains_of_free_frames
 from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
-from femsense.sensing.prepare import make_sensor, scan_of
+from femsense.sensing.prepare import prepare, scan_of
 from femsense.sensing.search import explain
 from femsense.sensing.separation import segmented
 from femsense.sensing.states import foretold, free_state
@@ -87,11 +87,13 @@ def estimate(
             stacklevel=2,
         )
     warn_of_linear_elements(robot.body, where=robot.name)
-    sensor = make_sensor(robot, recording, calibration, at=at, options=options)
+    prepared = prepare(robot, recording, calibration, at=at, options=options)
+    sensor = prepared.sensor
     published = sensor.options.method == "paper"
     sense = sense_as_published if published else sense_frame
     if not published and not len(sensor.places):
-        sensor = with_gains_of_free_frames(sensor, robot, recording, calibration)
+        sensor = with_gains_of_free_frames(prepared)
+    del prepared  # its rows
     count = len(recording.time_s)
     with Checkpoint(keep) as checkpoint:
         done = checkpoint.kept(Done) or Done()

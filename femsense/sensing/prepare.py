@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -45,13 +45,56 @@ def make_sensor(
     *,
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
-    without: Collection[int] = (),
 ) -> Sensor:
-    """Prepare what stays the same from frame to frame; free frames `without` teach nothing.
+    """Prepare what stays the same from frame to frame, free frames included.
 
     Raises:
         InputError: nothing says where to look for forces.
     """
+    return prepare(robot, recording, calibration, at=at, options=options).sensor
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FreeFrame:
+    """What a free frame shows."""
+
+    state: Equilibrium
+    """Without its factor."""
+    rows: Rows
+    """Of every point."""
+    means: Rows
+    """Of the means of points, by which frames are judged."""
+    markers: tuple[Rows, ...]
+    """Of its markers, where pulls are to be told beside the pose."""
+    moves: FloatArray
+    """As `sag_at` has it [m], shape (1 + a + c, n, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Prepared:
+    """A sensor, and what taught it."""
+
+    sensor: Sensor
+    first: Knowledge
+    """What was known before the free frames."""
+    free: dict[int, FreeFrame]
+    """Free frames by their number in the recording."""
+
+    def without(self, frames: Collection[int]) -> Sensor:
+        """Return the sensor as it were if some free frames taught nothing."""
+        taught = [one for k, one in self.free.items() if k not in frames]
+        return replace(self.sensor, knowledge=_taught(self.first, taught))
+
+
+def prepare(
+    robot: Robot,
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    at: npt.ArrayLike | None = None,
+    options: SensingOptions | None = None,
+) -> Prepared:
+    """Return a sensor with the free frames that taught it. Arguments and errors as for `make_sensor`."""
     options = options or SensingOptions()
     recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
     robot = robot.in_recording(recording.label)
@@ -93,11 +136,13 @@ def make_sensor(
         correction_std,
     )
     sensor = replace(sensor, scenery=_scenery(sensor))
-    learned = learn(knowledge, *_free_rows(sensor, without))
-    if not pulls_are_modelled:
-        return replace(sensor, knowledge=learned)
-    sensor = _better_posed(sensor, learned)
-    return replace(sensor, knowledge=learn(sensor.knowledge, *_free_rows(sensor, without)))
+    free = _free_frames(sensor)
+    learned = _taught(knowledge, free.values())
+    if pulls_are_modelled:
+        sensor = _better_posed(sensor, learned)
+        knowledge, free = sensor.knowledge, _free_frames(sensor)
+        learned = _taught(knowledge, free.values())
+    return Prepared(replace(sensor, knowledge=learned), knowledge, free)
 
 
 def _corrected(
@@ -211,10 +256,16 @@ def _scenery(sensor: Sensor) -> FloatArray:
     return np.zeros((0, 3))
 
 
-def _free_rows(sensor: Sensor, without: Collection[int]) -> tuple[list[tuple[Rows, FloatArray]], list[tuple[Rows, FloatArray]]]:
-    """Return rows and sag of the free frames with clouds, and the same of the means of their points; a frame that gives nothing is left out."""
-    result, means = [], []
-    for k, state in free_path(sensor.driven, [k for k in free_clouds(sensor.recording) if k not in without]):
+def _taught(knowledge: Knowledge, frames: Collection[FreeFrame]) -> Knowledge:
+    """Return what free frames teach (see `learn`)."""
+    shown = [(rows, one.moves) for one in frames for rows in (one.rows, *one.markers)]
+    return learn(knowledge, shown, [(one.means, one.moves) for one in frames])
+
+
+def _free_frames(sensor: Sensor) -> dict[int, FreeFrame]:
+    """Return what the free frames with clouds show; a frame that gives nothing is left out."""
+    result = {}
+    for k, state in free_path(sensor.driven, free_clouds(sensor.recording)):
         try:
             scan = scan_of(sensor, k, state)
             if scan is None:
@@ -227,6 +278,7 @@ def _free_rows(sensor: Sensor, without: Collection[int]) -> tuple[list[tuple[Row
         except FemsenseError:
             continue
         moves = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
-        result += [(replace(rows, through=through), moves), *((own, moves) for own in _marked(sensor, k, state))]
-        means.append((replace(few, through=through), moves))
-    return result, means
+        own = tuple(_marked(sensor, k, state))
+        few, rows = (replace(one, through=through) for one in (few, rows))
+        result[k] = FreeFrame(replace(state, factor=None), rows, few, own, moves)
+    return result

@@ -22,7 +22,7 @@ from femsense.sensing.places import given_touches, object_touches, said_free
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Fit, SensedFrame, Sensor, Start, Touch
+from femsense.sensing.types import Fit, Rows, SensedFrame, Sensor, Start, Touch
 
 STARTS = 3
 """From how many candidates a search begins at most."""
@@ -105,19 +105,32 @@ def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
 
 def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N]."""
-    n, rows = len(fit.state.positions), fit.rows
+    n = len(fit.state.positions)
     response = response_at(sensor, fit.state, fit.response)
-    normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
+    held = np.zeros((len(fit.rows.std), 0))
+    if fit.touches:
+        loads = np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])
+        held = fit.rows.functional(response.tangent.respond(loads))
+    return evidence_of(sensor, fit.state, fit.rows, response.sag, held)
+
+
+def evidence_of(
+    sensor: Sensor, state: Equilibrium, rows: Rows, sag: FloatArray, held: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N].
+
+    Arguments:
+        state: where it is asked for.
+        rows: of the frame at that state.
+        sag: how the nodes move with the modulus and the pulls, as `sag_at` has it.
+        held: how the rows answer to the forces of the contacts that are there, shape (r, 3m) [m/N].
+    """
+    normals = vertex_normals(state.positions, sensor.surface.triangles)[sensor.candidates]
     frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
-    answers = _answers(sensor, fit.state)
-    columns, known = nuisance_columns(sensor.knowledge, rows, response.sag)
+    answers = _answers(sensor, state)
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag)
     residual = rows.residual - known
-    other = (
-        [rows.functional(response.tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
-        if fit.touches
-        else []
-    )
-    columns = np.hstack([columns, *(sensor.options.force_std_n * o for o in other)])
+    columns = np.hstack([columns, sensor.options.force_std_n * held])
     std = robust_std(rows, residual)
     thin = np.arange(0, len(std), max(1, len(std) // THIN))
     share = len(std) / len(thin)

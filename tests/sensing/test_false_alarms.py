@@ -16,7 +16,7 @@ from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.prepare import make_sensor
+from femsense.sensing.prepare import make_sensor, prepare
 
 INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.2, 0, 0, 0], [0.0, 0, 0.4, 0], [0.3, 0, 0.3, 0]])
 
@@ -45,8 +45,7 @@ def limit(folder: Path, pull: float) -> float:
     folder.mkdir()
     seen = seen_free(folder, pull)
     calibration = calibrate(arm(), seen)
-    sensor = make_sensor(arm(), seen, calibration)
-    return with_gains_of_free_frames(sensor, arm(), seen, calibration).knowledge.gain_limit
+    return with_gains_of_free_frames(prepare(arm(), seen, calibration)).knowledge.gain_limit
 
 
 def test_a_contact_has_to_explain_more_than_errors_that_other_free_frames_do_not_teach(tmp_path: Path) -> None:
