@@ -91,10 +91,15 @@ def _volumes(p: Array, t: Array) -> Array:
     return np.linalg.det(edge) / 6
 
 
+def _graded(length: float, cells: int) -> Array:
+    """Ends of cells that are finer at the clamp, where the strain is singular: with even ones the slab was 2.7 % stiffer, and the bar 1.2 %."""
+    return np.asarray(length * np.linspace(0.0, 1.0, cells + 1) ** 1.6)
+
+
 def bar(rng: np.random.Generator) -> Body:
     """A cantilever 100 × 20 × 20 mm with a cable above and one below its axis; truth: 27-node bricks."""
     points, tets = _kuhn(np.linspace(0, 0.1, 15), np.linspace(-0.01, 0.01, 4), np.linspace(-0.01, 0.01, 4))
-    truth = skfem.MeshHex.init_tensor(np.linspace(0, 0.1, 17), np.linspace(-0.01, 0.01, 5), np.linspace(-0.01, 0.01, 5))
+    truth = skfem.MeshHex.init_tensor(_graded(0.1, 16), np.linspace(-0.01, 0.01, 5), np.linspace(-0.01, 0.01, 5))
     tendons = [
         Tendon(name, np.array([[x, 0.0, side * 0.006] for x in (0.095, 0.065, 0.035)]), np.array([-0.02, 0.0, side * 0.006]))
         for name, side in (("up", 1), ("down", -1))
@@ -178,7 +183,7 @@ def pad(rng: np.random.Generator) -> Body:
 def slab(rng: np.random.Generator) -> Body:
     """A plate 110 × 64 × 13 mm clamped along one edge, with two cables near its upper face; truth: 27-node bricks."""
     points, tets = _kuhn(np.linspace(0, 0.11, 15), np.linspace(-0.032, 0.032, 9), np.linspace(-0.0065, 0.0065, 3))
-    truth = skfem.MeshHex.init_tensor(np.linspace(0, 0.11, 13), np.linspace(-0.032, 0.032, 8), np.linspace(-0.0065, 0.0065, 4))
+    truth = skfem.MeshHex.init_tensor(_graded(0.11, 16), np.linspace(-0.032, 0.032, 9), np.linspace(-0.0065, 0.0065, 4))
     tendons = [
         Tendon(name, np.array([[x, y, 0.004] for x in (0.1, 0.07, 0.035)]), np.array([-0.02, y, 0.004]))
         for name, y in (("left", 0.018), ("right", -0.018))
