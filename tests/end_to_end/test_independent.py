@@ -12,6 +12,7 @@ from helpers import ROOT
 skfem = pytest.importorskip("skfem")
 sys.path.append(str(ROOT / "benchmarks"))
 
+from independent import bodies  # noqa: E402
 from independent.cases import Case, Touch  # noqa: E402
 from independent.equilibrium import Problem  # noqa: E402
 from independent.grade import grade  # noqa: E402
@@ -63,6 +64,19 @@ def test_a_cable_beside_the_axis_bends_the_bar_by_its_moment() -> None:
     again = problem.solve(held, problem.at_rest())
     assert again.tension[0] == pytest.approx(tension, rel=1e-4)
     assert np.abs(again.x - state.x).max() < 1e-7
+
+
+def test_the_truth_yields_as_on_a_finer_mesh() -> None:
+    body = bodies.bar(np.random.default_rng(0))
+    side = np.linspace(-SIDE / 2, SIDE / 2, 5)
+    finer = skfem.MeshHex.init_tensor(LENGTH * np.linspace(0, 1, 23) ** 1.8, side, side)
+    sunk = []
+    for mesh in (body.truth, finer):
+        solid = Solid(mesh, body.young, body.poisson, body.density, np.zeros(3), body.fixed)
+        problem, face = Problem(solid, []), _face(solid)
+        pull = np.asarray(face.T @ np.tile([0.0, 0.0, 1 / 25], (25, 1)))
+        sunk.append(float((face @ problem.yielding(problem.at_rest(), pull[:, :, None])[:, :, 0])[:, 2].mean()))
+    assert sunk[0] == pytest.approx(sunk[1], rel=0.005)
 
 
 def test_forces_and_stiffness_are_derivatives_of_the_energy() -> None:
