@@ -91,6 +91,14 @@ class Surface:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
         return np.asarray(self._scene.compute_distance(_tensor(points)).numpy(), dtype=np.float64)
 
+    def signed_gap(self, points: FloatArray, *, within: float) -> FloatArray:
+        """Return how far points (k, 3) lie outside the surface [m], shape (k,): < 0 inside; beyond `within` both count as outside."""
+        gap = self.gap(points)
+        near = np.flatnonzero(gap < within)
+        inside = near[self._scene.compute_occupancy(_tensor(points[near])).numpy() > 0.5]
+        gap[inside] *= -1.0
+        return gap
+
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
         """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m],
         their triangles (k,) and barycentric weights (k, 3)."""

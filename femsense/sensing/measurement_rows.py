@@ -78,9 +78,17 @@ def seen_through(sensor: Sensor, scan: Scan, state: Equilibrium) -> float:
         return 0.0
     hits = Surface(state.positions, sensor.surface.triangles).cast(points, origins, reach=np.inf)
     depth = np.linalg.norm(points - origins, axis=1)[hits.index]
-    std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[hits.index], depth)])
+    std = depth_std(sensor, depth, scan.others_view[hits.index])
     behind = hits.distance < -np.maximum(OFF * std * hits.cosine, BEHIND * sensor.size)
     return float(behind.sum() / (scan.measured.sum() + behind.sum()))
+
+
+def depth_std(sensor: Sensor, depth: FloatArray, view: IntArray) -> FloatArray:
+    """Return the noise of points at some depths (k,) [m], each of its camera (k,), shape (k,) [m]."""
+    std = np.empty(len(depth))
+    for v, noise in enumerate(sensor.knowledge.noises):
+        std[view == v] = noise.std(depth[view == v])
+    return std
 
 
 def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:

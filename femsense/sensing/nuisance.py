@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -349,9 +351,23 @@ class _Prior:
 
 
 def _fit_field(knowledge: Knowledge, grams: list[FloatArray], first: _Prior) -> Knowledge:
-    """Return the sizes of the shared errors that are likeliest for these frames."""
-    tried = [replace(knowledge, bias_m=float(b), model_share=float(s)) for b in BIAS_STEPS for s in SHARE_STEPS]
-    return min(tried, key=lambda one: first.evidence(one, grams) + _beforehand(one))
+    """Return the sizes of the shared errors that are likeliest for these frames: from those at hand uphill over the grid."""
+
+    def sized(i: int, j: int) -> Knowledge:
+        return replace(knowledge, bias_m=float(BIAS_STEPS[i]), model_share=float(SHARE_STEPS[j]))
+
+    @cache
+    def unlikely(i: int, j: int) -> float:
+        return first.evidence(sized(i, j), grams) + _beforehand(sized(i, j))
+
+    grid, sizes = (BIAS_STEPS, SHARE_STEPS), (knowledge.bias_m, knowledge.model_share)
+    here = tuple(int(np.abs(np.log(steps / size)).argmin()) for steps, size in zip(grid, sizes))
+    while True:
+        around = product(*(range(max(i - 1, 0), min(i + 2, len(steps))) for i, steps in zip(here, grid)))
+        best = min(around, key=lambda at: unlikely(*at))
+        if best == here:
+            return sized(*here)
+        here = best
 
 
 def _beforehand(knowledge: Knowledge) -> float:

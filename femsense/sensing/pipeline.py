@@ -145,8 +145,8 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     if status == OK and fit.rows.of_clouds:
         status = beside_markers(sensor, k, fit)
     if status == OK and not len(sensor.places):
-        found = object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
-        status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *found]))
+        seen = [] if fit.touches else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
+        status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *seen]))
     report = FrameReport(
         number,
         stamp,

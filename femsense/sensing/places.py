@@ -18,6 +18,7 @@ from femsense.model.robot import Robot
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
 from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape
 from femsense.pointcloud.rays import Surface
+from femsense.sensing.measurement_rows import depth_std
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
 
@@ -62,20 +63,20 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
     low, high = state.positions.min(axis=0) - reach, state.positions.max(axis=0) + reach
     close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     gap = np.full(len(points), np.inf)
-    gap[close] = Surface(state.positions, sensor.surface.triangles).closest(points[close])[1]
+    gap[close] = Surface(state.positions, sensor.surface.triangles).signed_gap(points[close], within=reach)
     near = np.flatnonzero(gap < reach)
     if len(near) < 3:
         return []
-    origins = np.array([T[:3, 3] for T in poses])[scan.others_view]
-    depth = np.linalg.norm(points - origins, axis=1)
-    std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[near], depth[near])])
+    points, gap, view = points[near], gap[near], scan.others_view[near]
+    origins = np.array([T[:3, 3] for T in poses])[view]
+    std = depth_std(sensor, np.linalg.norm(points - origins, axis=1), view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
-        points[near],
+        points,
         std,
-        origins[near],
-        gap[near],
+        origins,
+        gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else fit_shape,
     )

@@ -126,7 +126,7 @@ def evidence_of(
         held: how the rows answer to the forces of the contacts that are there, shape (r, 3m) [m/N].
     """
     normals = vertex_normals(state.positions, sensor.surface.triangles)[sensor.candidates]
-    frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
+    frames = np.concatenate([normals[:, None], np.linalg.svd(normals[:, None])[2][:, 1:]], axis=1)  # rows: normal, tangents
     answers = _answers(sensor, state)
     columns, known = nuisance_columns(sensor.knowledge, rows, sag)
     residual = rows.residual - known
