@@ -1,7 +1,7 @@
 """Forces from clouds against their truth: the published method beside what is done here, with places found and given.
 
     python benchmarks/sensing.py FOLDER …                    # recordings of another program (`data/touches`)
-    python benchmarks/sensing.py --rates [--points N]        # raw cloud → force, by stage (`data/diamond`, tet4)
+    python benchmarks/sensing.py --rates [--keep FOLDER]     # raw cloud → force, by stage (`data/diamond`)
 
 A folder holds robot/, recording/ and truth.json: {"contacts": [{"frame", "point" [m, deformed], "force" [N], "rest" [m,
 where known]}, …]}, made by another program.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,13 @@ def main() -> None:
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--rates", action="store_true")
     parser.add_argument("--points", type=int, default=30_000, help="with --rates: of each cloud")
+    parser.add_argument(
+        "--keep", type=Path, help="with --rates: where recordings and rows stay; those that are there are not made again"
+    )
     asked = parser.parse_args()
     if asked.rates:
-        print_rates(asked.points)
+        with tempfile.TemporaryDirectory() as name:
+            print_rates(asked.points, asked.keep or Path(name))
         return
     print("| case | place | method | error of force (median) | (95 %) | place [mm] | missed | false | within 95 % | ms a frame |")
     print("|---|---|---|---|---|---|---|---|---|---|")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
+import shutil
 import time
 import tomllib
 from dataclasses import replace
@@ -19,35 +19,49 @@ from femsense.core.parallel import one_blas_thread
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.io.files import write_toml
 from femsense.pointcloud.cloud import PointCloud
+from femsense.sensing.false_alarms import with_gains_of_free_frames
 from femsense.sensing.pipeline import sense_frame
-from femsense.sensing.prepare import make_sensor
+from femsense.sensing.prepare import prepare
 from femsense.sensing.types import SensedFrame
 
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
-FREE, TOUCHED = 3, 8
+FREE, TOUCHED = 4, 8
 PLACE = [0.0, -0.0429, 0.0906]
 STAGES = ("equilibrium", "scan", "rows", "places", "forces")
 
 
-def print_rates(points: int) -> None:
-    """Print a table: median processor time of each stage over touched frames, of untouched ones, and frames a second.
+def print_rates(points: int, folder: Path) -> None:
+    """Print a table: seconds before the first frame, then the median processor time of each stage over touched frames, of untouched ones, and frames a second.
 
     Linear elements meet a body of the same linear elements, made by the rig. Quadratic ones meet a body of quadratic elements on another mesh, of
-    another law, made by another program (`independent`).
+    another law, made by another program (`independent`). Recordings and rows that are in the folder are taken from there.
     """
     print(f"data/diamond, {points} points a frame, one touch; processor time [ms], medians of touched frames")
     print("beside: the paper 143 (7 Hz, all of it), SOFA 16-19 (its quadratic programme alone)")
-    print("| | on the robot | equilibrium | scan | rows | places | forces | together | rate | untouched | not ok |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        robot = _linear(folder / "robot")
-        simulate(robot, _script(), folder / "rig")
-        for label, one in (("tet4", robot), ("tet4, no colour", replace(robot, color_rgb=None))):
-            print(_row(label, one, _thinned(folder / "rig", points), FREE), flush=True)
-        make(next(case for case in CASES if case.name == "diamond-normal"), folder / "other", 1, diamond=DIAMOND)
-        recording = _thinned(folder / "other" / "recording", points)
-        print(_row("tet10", load_robot(folder / "other" / "robot"), recording, FREE_BY_ANOTHER), flush=True)
+    print("| | ready [s] | on the robot | equilibrium | scan | rows | places | forces | together | rate | untouched | not ok |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    for label in ("tet4", "tet4, no colour", "tet10"):
+        row = folder / f"{label.replace(', ', '-').replace(' ', '-')}-{points}.txt"
+        if not row.exists():
+            row.write_text(_row(label, *_made(label, points, folder)) + "\n", encoding="utf-8")
+        print(row.read_text(encoding="utf-8"), end="", flush=True)
+
+
+def _made(label: str, points: int, folder: Path) -> tuple[Robot, Recording, int]:
+    """Return robot, recording and its number of free frames, made where they are not in the folder yet."""
+    made = folder / ("other" if label == "tet10" else "rig")
+    if not (made / "made").exists():
+        shutil.rmtree(made, ignore_errors=True)
+        if label == "tet10":
+            make(next(case for case in CASES if case.name == "diamond-normal"), made, 1, diamond=DIAMOND)
+        else:
+            made.mkdir(parents=True)
+            simulate(_linear(made / "robot"), _script(), made / "recording")
+        _thin(made / "recording", points)
+        (made / "made").touch()
+    robot = load_robot(made / "robot")
+    robot = replace(robot, color_rgb=None) if label.endswith("no colour") else robot
+    return robot, load_recording(made / "recording"), FREE_BY_ANOTHER if label == "tet10" else FREE
 
 
 def _linear(folder: Path) -> Robot:
@@ -78,19 +92,21 @@ def _script() -> dict[str, Any]:
     }
 
 
-def _thinned(folder: Path, points: int) -> Recording:
-    """Return a recording whose clouds have so many points at most, drawn at random."""
+def _thin(folder: Path, points: int) -> None:
+    """Leave so many points at most in each cloud of a recording, drawn at random."""
     for file in sorted((folder / "clouds").glob("*.ply")):
         cloud = read_cloud(file)
         kept = np.sort(np.random.default_rng(0).choice(len(cloud.points), min(points, len(cloud.points)), replace=False))
         write_cloud(file, PointCloud(cloud.points[kept], None if cloud.colors is None else cloud.colors[kept]))
-    return load_recording(folder)
 
 
 @one_blas_thread()
 def _row(label: str, robot: Robot, recording: Recording, free: int) -> str:
     """Return a row of the table: frames from `free` on are touched, the first of them finds the contact and does not count."""
-    sensor = make_sensor(robot, recording, calibrate(robot, recording))
+    calibration = calibrate(robot, recording)
+    began = time.process_time()
+    sensor = with_gains_of_free_frames(prepare(robot, recording, calibration))
+    ready = time.process_time() - began
     last: SensedFrame | None = None
     seen: dict[bool, list[SensedFrame]] = {False: [], True: []}
     times: dict[bool, list[float]] = {False: [], True: []}
@@ -108,6 +124,4 @@ def _row(label: str, robot: Robot, recording: Recording, free: int) -> str:
     bad = sum(f.report.status != "ok" or not f.contacts for f in seen[True])
     met = int(np.median([f.report.matched for f in seen[True]]))
     told = " | ".join(f"{value:.0f}" for value in stages)
-    return (
-        f"| {label} | {met} | {told} | {together:.0f} | {1000.0 / together:.1f} Hz | {untouched:.0f} | {bad}/{len(seen[True])} |"
-    )
+    return f"| {label} | {ready:.1f} | {met} | {told} | {together:.0f} | {1000.0 / together:.1f} Hz | {untouched:.0f} | {bad}/{len(seen[True])} |"
