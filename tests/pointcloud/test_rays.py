@@ -34,3 +34,10 @@ def test_a_ray_that_misses_counts_by_the_closest_face_that_looks_at_the_camera()
     assert len(surface.cast(beside, camera, reach=0.01).index) == 0
     assert surface.near(beside, camera, reach=0.05).index.tolist() == [0]
     assert len(surface.near(beside, -camera, reach=0.05).index) == 0
+
+
+def test_points_inside_have_a_negative_distance_and_those_far_off_are_outside():
+    corner = Surface(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    points = np.array([[0.1, 0.2, 0.2], [-0.2, 0.2, 0.2]])
+    np.testing.assert_allclose(corner.signed_gap(points, within=0.3), [-0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(corner.signed_gap(points, within=0.05), [0.1, 0.2], atol=1e-6)
