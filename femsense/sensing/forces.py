@@ -19,7 +19,7 @@ from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import misfit_of, nuisance_columns
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import solve_with
-from femsense.sensing.touches import make_touch, touch_normal, within_cones
+from femsense.sensing.touches import make_touch, pressed, touch_normal, within_cones
 from femsense.sensing.types import Fit, Response, Sensor, Start, Touch
 
 TRIES = 4
@@ -96,7 +96,8 @@ class _Frame:
     def _from_start(self, here: Iterate, free: Fit, start: Start) -> tuple[Iterate, Linearisation] | None:
         """Return a given start where it costs less than the free state, which need not be linearised then."""
         forces = within_cones(self.sensor, here.touches, start.forces, start.state)
-        there = self._settled(replace(here, forces=forces, state=start.state))
+        touches = tuple(pressed(self.sensor, touch, force) for touch, force in zip(here.touches, forces))
+        there = self._settled(replace(here, touches=touches, forces=forces, state=start.state))
         if there is None:
             return None
         cost = free.cost + prior_cost(here, np.zeros((len(forces), 3)))
@@ -180,6 +181,7 @@ def _moved(sensor: Sensor, here: Iterate, linear: Linearisation, step: ForceStep
             touch = replace(moved, expected=touch.expected)
         touches.append(touch)
     forces = within_cones(sensor, tuple(touches), here.forces + (step.forces - here.forces), here.state)
+    touches = [pressed(sensor, touch, force) for touch, force in zip(touches, forces)]
     move = np.tensordot((forces - here.forces).ravel(), linear.moves, axes=1)
     factor = linear.response.tangent.factor if linear.response.tangent.factor.negative == 0 else None
     state = replace(here.state, positions=here.state.positions + move, factor=factor)

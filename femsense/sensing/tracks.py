@@ -12,7 +12,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.judge import unspoken
 from femsense.sensing.law import law_std
 from femsense.sensing.nuisance import response_std
-from femsense.sensing.touches import touch_normal
+from femsense.sensing.touches import contact_radius, touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
 SAME = 0.15
@@ -45,7 +45,7 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
                 source=touch.source,
                 track=-1,
                 position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0))),
-                radius_m=_patch_radius(sensor, touch.object_radius_m, size),
+                radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
         )
@@ -99,12 +99,3 @@ def _tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach
             contacts[i] = replace(contacts[i], track=before[j].track)
             taken.add(j)
     return contacts
-
-
-def _patch_radius(sensor: Sensor, radius: float, force: float) -> float:
-    """Return the radius of the patch by Hertz: a³ = 3 F R (1 − ν²) / (4 E), of a rigid ball on a flat; half an edge where R is not known."""
-    material = sensor.robot.body.material
-    if not np.isfinite(radius):
-        return 0.5 * sensor.surface.edge
-    modulus, poisson = float(np.median(material.young_modulus)), float(np.median(material.poisson_ratio))
-    return float(np.cbrt(0.75 * force * radius * (1.0 - poisson**2) / modulus))

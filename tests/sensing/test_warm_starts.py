@@ -17,7 +17,7 @@ from femsense.sensing.prepare import condensed_at, make_sensor, scan_of
 from femsense.sensing.responses import response_at
 from femsense.sensing.search import held_on, nothing_new
 from femsense.sensing.states import foretold, free_state
-from femsense.sensing.touches import make_touch
+from femsense.sensing.touches import contact_radius, make_touch, pressed
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
 FORCE = np.array([0.0, 0.0, -0.15])
@@ -93,3 +93,16 @@ def test_a_response_is_lent_to_states_near_by_alone(pushed):
     near, far = (replace(state, positions=state.positions + share * sensor.size) for share in (5e-5, 2e-4))
     assert response_at(sensor, near, here) is here
     assert response_at(sensor, far, here) is not here
+
+
+def test_a_patch_is_as_wide_as_hertz_has_it(pushed: tuple[Sensor, SensedFrame]) -> None:
+    sensor, nodes = pushed[0], pushed[0].robot.body.mesh.nodes
+    touch = make_touch(sensor, AWAY, source="cloud", radius=0.03)
+    assert pressed(sensor, touch, np.zeros(3)).patch is touch.patch  # a point, as the mesh has it
+    wide = pressed(sensor, touch, np.array([0.0, 0.0, -40.0]))
+    a = contact_radius(sensor, 0.03, 40.0)
+    assert a**3 == pytest.approx(0.75 * 40.0 * 0.03 * (1 - 0.45**2) / float(sensor.robot.body.material.young_modulus[0]))
+    middle = wide.patch.mean(nodes)
+    square = wide.patch.weights @ ((nodes[wide.patch.nodes] - middle) ** 2).sum(axis=1)
+    assert square == pytest.approx(0.4 * a**2, rel=0.15)
+    assert pressed(sensor, wide, np.array([0.0, 0.0, -41.0])) is wide
