@@ -85,6 +85,7 @@ def learn_into(
         model = adapted(before, data)
         text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
         document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+        document |= {"channel": found.channel, "channel_shift": found.channel_shift} if found.channel else {}
         if other is not None:
             tested = _tested(model, other)
             document["test"] = tested
@@ -162,7 +163,12 @@ def _adapted_text(found: dict[str, Any]) -> str:
 
 
 def _correction_text(by: str) -> str:
-    words = {"base": "a rigid motion", "zeros": "other zeros of the sensors", "line": "a linear map"}
+    words = {
+        "base": "a rigid motion",
+        "channel": "another zero of one channel",
+        "zeros": "other zeros of the sensors",
+        "line": "a linear map",
+    }
     return " and ".join(words[part.split()[0]] for part in by.split(","))
 
 

@@ -16,7 +16,7 @@ from streams import read_frame, within
 from xr_bar import write_run_with_mesh
 
 from femsense.xr.stream.hub import Message
-from femsense.xr.stream.payloads import TwinFrame, status_bytes
+from femsense.xr.stream.payloads import TwinFrame, pose_bytes, status_bytes
 from femsense.xr.stream.run_source import RunStream, frames_of, open_run
 
 pytest.importorskip("websockets")
@@ -184,27 +184,72 @@ const page = await opened.newPage({ viewport: { width: 700, height: 500 } });
 await page.goto(given[0]);
 await page.waitForFunction(() => femsense.shown.robots.get('bar')?.body?.isStale, null, { timeout: 60000 });
 const early = await page.textContent('#badge');
-console.log(JSON.stringify({ badge: early, state: await page.evaluate(() => document.documentElement.dataset.stream),
-  live: await page.evaluate(() => femsense.shown.robots.get('bar-2').told.state) }));
+const forces = () => page.evaluate(() => ['#sum', '#plot', '#contacts', '#curve', '#forces'].map((id) => document.querySelector(id).checkVisibility()));
+const spoken = await forces();
+await page.click('#robots button:has-text("mute")');
+await page.waitForFunction(() => femsense.shown.robots.get('mute').shown);
+await page.waitForTimeout(300);
+const unspoken = await forces();
+console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.evaluate(() => document.documentElement.dataset.stream),
+  live: await page.evaluate(() => femsense.shown.robots.get('bar-2').told.state),
+  rate: await page.evaluate(async (bytes) => {                 // a page that is busy takes few poses: one of ten here, every 100 ms
+    const robot = femsense.shown.robots.get('bar-2'), pose = new Uint8Array(bytes), head = new DataView(pose.buffer);
+    for (let seq = 100000; seq < 100100; seq += 10) {
+      head.setUint32(4, seq, true);
+      robot.take('pose', pose);
+      await new Promise((done) => setTimeout(done, 100));
+    }
+    return robot.state(performance.now(), true)[1];
+  }, JSON.parse(given[1])),
+  edges: await page.evaluate(async () => {                     // the picture is pushed aside until the label would be cut
+    const { stage, robots } = femsense.shown, { body } = robots.get('bar'), { camera } = stage;
+    const arrow = body.arrows.arrows[0], { sprite, canvas } = arrow.label, found = [];
+    for (const aside of [-600, 600]) {
+      camera.setViewOffset(700, 500, aside, 0, 700, 500);
+      camera.updateProjectionMatrix();
+      body.arrows.face(camera, stage.pixelHeight, stage.room);
+      const pen = canvas.getContext('2d'), written = pen.getImageData(0, canvas.height / 2, canvas.width, 1).data;
+      const shown = [...Array(canvas.width).keys()].filter((i) => written[4 * i + 3] > 0);
+      const parent = sprite.parent.getWorldScale(camera.position.clone()).x;
+      for (const i of [shown[0], shown[shown.length - 1]]) {
+        const corner = sprite.getWorldPosition(camera.position.clone()).applyMatrix4(camera.matrixWorldInverse);
+        corner.x += (i / canvas.width - sprite.center.x) * sprite.scale.x * parent;
+        found.push(corner.applyMatrix4(camera.projectionMatrix).x);
+      }
+    }
+    return found;
+  }) }));
 await opened.close();
 """
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_who_comes_late_sees_at_once_that_a_stream_has_stopped(
+def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_and_no_label_is_cut(
     request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
 ) -> None:
-    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True)
+    run = open_run(write_run_with_mesh(tmp_path / "bar"))
+    source = Source(run, built_page, still=True)
+    touched = list(frames_of(run, rate_hz=23 / 2.0, loop=False))[11]
+    source.last = touched
     try:
+        time.sleep(0.2)
         assert within(5.0, lambda: source.publishers[0].sent > 0)
         source.flowing.clear()
         time.sleep(0.2)
         source.hub.publish([Message("femsense/bar/status", status_bytes("stale", since_s=time.time() - 100.0))])
-        told = run_in_browser(request.config, LATE, source.server.url)
+        known = source.hub.newest()
+        mute = {kind: known[f"femsense/bar/{kind}"].payload for kind in ("glb", "model", "pose")}
+        mute["model"] = mute["model"].replace(b'"name":"bar"', b'"name":"mute"')
+        source.hub.publish([Message(f"femsense/mute/{kind}", payload) for kind, payload in mute.items()])
+        told = run_in_browser(request.config, LATE, source.server.url, json.dumps(list(pose_bytes(0, 0.0, touched.bones))))
     finally:
         source.close()
     age = float(told["badge"].removeprefix("stale, ").removesuffix(" s old"))
     assert told["state"] == "stale" and 100.0 <= age < 200.0 and told["live"] == "live"
+    assert 40 < float(told["rate"].removeprefix("live, ").removesuffix(" Hz")) < 110  # what is sent: ten times what arrives
+    assert all(told["spoken"]) and not any(told["unspoken"])  # nobody speaks of forces of the third robot
+    side = 1.0 - 2 * 10 / 700  # a label stays in the picture, ten pixels from its edges
+    assert told["edges"][1] == pytest.approx(side, abs=0.01) and told["edges"][2] == pytest.approx(-side, abs=0.01)
 
 
 def check_scene(scene: dict[str, Any], run: RunStream, frame: TwinFrame) -> None:

@@ -17,6 +17,7 @@ import {
   SpriteMaterial,
   SRGBColorSpace,
   Vector3,
+  type Box2,
   type Camera,
 } from "three";
 import { newtons, type Contact, type Vector } from "./data";
@@ -24,6 +25,7 @@ import { newtons, type Contact, type Vector } from "./data";
 const COLOR = 0xff9c33;
 const UP = new Vector3(0, 1, 0);
 const LONGEST = 0.42; // arrow, of the body's size
+const HANGING = [0.5, -0.25] as const; // a label stands above its point
 const LABEL_HEIGHT = 0.046; // of the distance to the viewer
 
 export class ForceArrows {
@@ -63,9 +65,9 @@ export class ForceArrows {
     });
   }
 
-  /** Keeps labels readable: their size follows the distance to the viewer. */
-  face(camera: Camera, height: number): void {
-    for (const arrow of this.arrows) arrow.face(camera, height);
+  /** Keeps labels readable: their size follows the distance to the viewer, and they stay in the room between the panels. */
+  face(camera: Camera, height: number, room: Box2 | null): void {
+    for (const arrow of this.arrows) arrow.face(camera, height, room);
   }
 }
 
@@ -130,8 +132,9 @@ class Arrow {
     this.label.write(newtons(contact.force_n, contact.std_n));
   }
 
-  face(camera: Camera, height: number): void {
+  face(camera: Camera, height: number, room: Box2 | null): void {
     this.label.scaleTo(camera, height);
+    this.label.keepIn(camera, room);
   }
 }
 
@@ -144,11 +147,16 @@ function sideways(force: Vector3, std: Vector | null): number {
   return Math.sqrt(Math.max(0, total - inLine) / 2);
 }
 
+function between(low: number, value: number, high: number): number {
+  return Math.max(low, Math.min(high, value));
+}
+
 export class Label {
   readonly sprite: Sprite;
   private readonly canvas = document.createElement("canvas");
   private readonly texture: CanvasTexture;
   private text = "";
+  private share = 1; // of the picture's width that is written on
 
   constructor() {
     this.canvas.width = 512;
@@ -156,7 +164,7 @@ export class Label {
     this.texture = new CanvasTexture(this.canvas);
     this.texture.colorSpace = SRGBColorSpace;
     this.sprite = new Sprite(new SpriteMaterial({ map: this.texture, depthTest: false, transparent: true, toneMapped: false }));
-    this.sprite.center.set(0.5, -0.25);
+    this.sprite.center.set(...HANGING);
     this.sprite.renderOrder = 10;
   }
 
@@ -168,6 +176,7 @@ export class Label {
     pen.clearRect(0, 0, width, height);
     pen.font = '600 52px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif';
     const half = Math.min(width, pen.measureText(text).width + 52) / 2;
+    this.share = (2 * half) / width;
     pen.fillStyle = "rgb(13 17 23 / 82%)";
     pen.beginPath();
     pen.roundRect(width / 2 - half, 4, 2 * half, height - 8, 28);
@@ -186,5 +195,22 @@ export class Label {
     const height = share * distance;
     const parent = this.sprite.parent!.getWorldScale(new Vector3()).x;
     this.sprite.scale.set((height * this.canvas.width) / this.canvas.height / parent, height / parent, 1);
+  }
+
+  /** Moves what is written into a part of the picture, which is −1 … 1 wide and high; null: it stays above its point. */
+  keepIn(camera: Camera, room: Box2 | null): void {
+    this.sprite.center.set(...HANGING);
+    if (!room || !this.sprite.visible) return;
+    const place = this.sprite.getWorldPosition(new Vector3());
+    const parent = this.sprite.parent!.getWorldScale(new Vector3()).x;
+    const depth = -place.clone().applyMatrix4(camera.matrixWorldInverse).z;
+    const projection = camera.projectionMatrix.elements;
+    const width = (this.sprite.scale.x * parent * projection[0]!) / depth;
+    const height = (this.sprite.scale.y * parent * projection[5]!) / depth;
+    place.project(camera);
+    const { center } = this.sprite;
+    const half = this.share / 2;
+    center.x = between(0.5 + half - (room.max.x - place.x) / width, center.x, 0.5 - half + (place.x - room.min.x) / width);
+    center.y = between(1 - (room.max.y - place.y) / height, center.y, (place.y - room.min.y) / height);
   }
 }

@@ -272,7 +272,7 @@ class Robot {
   private painted: Field | null = null; // the field that the body has now
   private arrived = -Infinity; // when the newest pose came [ms of the page]
   private told: Status = { state: "", detail: "", since_s: null };
-  private readonly arrivals: number[] = []; // when poses of the last seconds came [ms of the page]
+  private readonly arrivals: { at: number; seq: number }[] = []; // when poses of the last seconds came [ms of the page], and their numbers
   private gone = false;
 
   constructor(
@@ -321,7 +321,7 @@ class Robot {
       body.setStale(stale);
       stage.touch();
     }
-    body.arrows.face(stage.camera, stage.pixelHeight);
+    body.arrows.face(stage.camera, stage.pixelHeight, stage.room);
   }
 
   /** Returns whether it is live, and that in words. */
@@ -335,13 +335,19 @@ class Robot {
     if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
     if (!Number.isFinite(age)) return ["waiting", "no pose yet"];
     if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
-    const span = Math.max(now - this.arrivals[0]!, 500);
-    return ["live", `live, ${Math.round((1000 * this.arrivals.length) / span)} Hz`];
+    return ["live", this.rate()];
+  }
+
+  /** How many poses a second the source sends, counted by their numbers: a page that is busy drawing takes fewer, in bursts. */
+  private rate(): string {
+    const [first, last] = [this.arrivals[0]!, this.arrivals[this.arrivals.length - 1]!];
+    const span = last.at - first.at;
+    return span < RATE_MS / 4 ? "live" : `live, ${Math.round((1000 * (last.seq - first.seq)) / span)} Hz`;
   }
 
   about(): string {
     const vertices = this.body?.skins.reduce((sum, s) => sum + (s.geometry.getAttribute("position")?.count ?? 0), 0) ?? 0;
-    const frame = this.model.inRobotFrame ? "" : " · in the frame of its markers, not the robot's";
+    const frame = this.model.inRobotFrame ? "" : " · markers' frame";
     return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}`;
   }
 
@@ -349,8 +355,9 @@ class Robot {
     if (!pose) return;
     const now = performance.now();
     this.arrived = now;
-    this.arrivals.push(now);
-    while (this.arrivals[0]! < now - RATE_MS) this.arrivals.shift();
+    if (pose.seq < (this.arrivals[this.arrivals.length - 1]?.seq ?? 0)) this.arrivals.length = 0; // it counts anew
+    this.arrivals.push({ at: now, seq: pose.seq });
+    while (this.arrivals[0]!.at < now - RATE_MS) this.arrivals.shift();
     if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
     // as long as nobody speaks of forces, nothing estimates them
     this.newest = {

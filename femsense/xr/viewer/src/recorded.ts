@@ -69,7 +69,7 @@ class Player {
 
   step(seconds: number): void {
     if (this.playing && this.duration > 0) this.seek((this.time + this.speed * seconds) % this.duration);
-    this.body.arrows.face(this.stage.camera, this.stage.pixelHeight);
+    this.body.arrows.face(this.stage.camera, this.stage.pixelHeight, this.stage.room);
   }
 
   /** Shows a time [s]. */

@@ -2,6 +2,7 @@
 
 import {
   ACESFilmicToneMapping,
+  Box2,
   Box3,
   DirectionalLight,
   Fog,
@@ -16,6 +17,7 @@ import {
   PMREMGenerator,
   Scene,
   ShadowMaterial,
+  Vector2,
   Vector3,
   WebGLRenderer,
 } from "three";
@@ -165,6 +167,14 @@ export class Stage {
   /** Height of the view in pixels; 0 in a headset. */
   get pixelHeight(): number {
     return this.renderer.xr.isPresenting ? 0 : this.canvas.clientHeight;
+  }
+
+  /** What the panels leave free of the picture, which is −1 … 1 wide and high; null in a headset. */
+  get room(): Box2 | null {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (this.renderer.xr.isPresenting || !width || !height) return null;
+    const { left, right, top, bottom } = free(width, height);
+    return new Box2(new Vector2((2 * left) / width - 1, (2 * bottom) / height - 1), new Vector2(1 - (2 * right) / width, 1 - (2 * top) / height));
   }
 
   /** Brings back the view of the screen after a headset had its own. */

@@ -1,0 +1,196 @@
+"""What may have become of a model on another day, as corrections of its network, from simple to less simple:
+
+    channel:   y' = f(x − o eᵢ)       one sensor reads something else (o and i are found)
+    base:      y' = R y + t           the same robot, seen from elsewhere
+    zeros:     y' = f(x − o)          sensors with other zeros (their prior: a tenth of the channel's spread)
+    line:      y' = f(x) + C z + d    what else a linear map of the readings can say
+
+Each is fitted to some blocks of labelled frames and judged on the others. A less simple one is taken only where it predicts those
+better, beyond what chance does in 95 of 100 cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from femsense.calib.rigid import fit_rigid
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.errors import DataError
+from femsense.core.pose import make_pose
+from femsense.xr.proprioception.linear import train_ridge
+from femsense.xr.proprioception.network import Network
+from femsense.xr.proprioception.selection import marker_rms
+
+BLOCKS = 4
+BETTER = 0.9
+"""Times the error without it that a correction must reach on frames it was not fitted to."""
+RESAMPLES = 1000
+RESAMPLED = 12
+"""Parts in time of the frames that are drawn again and again: neighbours are alike."""
+ZERO_STD = 0.1
+"""Of a sensor's zero, in spreads of its channel."""
+ZERO_STEPS = 3
+SCANNED = 12
+"""Shifts of a channel that are tried, over its range to either side, before the best is refined."""
+SCAN_ROWS = 200
+CORRECTIONS = ("none", "channel", "base", "channel, base", "zeros", "base, zeros", *(f"base, line {x}" for x in (0.01, 0.1, 1.0)))
+"""From simple to less simple."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """One channel that reads something else."""
+
+    channel: int
+    by: float
+    """In the unit of the channel; > 0: it reads too much."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frames:
+    """Labelled frames beside the network that is to predict them."""
+
+    network: Network
+    inputs: FloatArray
+    """Readings and their filters, shape (n, d)."""
+    targets: FloatArray
+    """Coordinates of markers [m], shape (n, 3 m)."""
+    reach: FloatArray
+    """How far each channel ranged when the model was learnt, shape (c,)."""
+
+    def select(self, rows: BoolArray) -> Frames:
+        """Return some of the frames."""
+        return replace(self, inputs=self.inputs[rows], targets=self.targets[rows])
+
+    def errors(self, name: str) -> FloatArray:
+        """Return the errors of a correction on blocks in time that it was not fitted to [m], shape (n, 3 m)."""
+        errors = np.empty_like(self.targets)
+        for held in _blocks(len(self.targets)):
+            network = corrected(self.select(~held), name)
+            errors[held] = network(self.inputs[held]) - self.targets[held]
+        return errors
+
+
+def explain(frames: Frames) -> tuple[str, dict[str, float]]:
+    """Return the correction that explains labelled frames, and the error of each on frames it was not fitted to [m]."""
+    errors = {name: frames.errors(name) for name in CORRECTIONS}
+    chosen = CORRECTIONS[0]
+    for name in CORRECTIONS[1:]:
+        if is_better(errors[name], errors[chosen]):
+            chosen = name
+    return chosen, {name: marker_rms(found) for name, found in errors.items()}
+
+
+def is_better(errors: FloatArray, than: FloatArray, *, seed: int = 0) -> bool:
+    """Whether errors are smaller than others of the same frames, shape (n, 3 m), by a tenth, and not by chance.
+
+    Parts in time are drawn again and again (Künsch 1989), the same of both; in 95 of 100 drawings they have to be smaller.
+    """
+    if marker_rms(errors) >= BETTER * marker_rms(than):
+        return False
+    gained = (than**2 - errors**2).sum(axis=1)
+    parts = np.array([part.sum() for part in np.array_split(gained, min(RESAMPLED, len(gained)))])
+    drawn = np.random.default_rng(seed).integers(len(parts), size=(RESAMPLES, len(parts)))
+    return bool(np.quantile(parts[drawn].sum(axis=1), 0.05) > 0.0)
+
+
+def corrected(frames: Frames, name: str) -> Network:
+    """Return the network with a correction that is fitted to frames; see `CORRECTIONS`."""
+    now, steps = frames, [part.strip() for part in name.split(",")]
+    for step in steps:
+        if step == "channel":
+            found = shift_of(now, moved="base" in steps)
+            now = replace(now, network=_with_shift(now.network, found, len(now.reach)))
+        else:
+            now = replace(now, network=_step(now, step))
+    return now.network
+
+
+def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
+    """Return the channel and the shift that explain frames best: a scan of each channel, then the best three refined.
+
+    moved: whether the base may have moved as well; a rigid motion is then taken off for each shift that is tried.
+    """
+    from scipy.optimize import minimize_scalar
+
+    some = frames.select(np.isin(np.arange(len(frames.inputs)), np.linspace(0, len(frames.inputs) - 1, SCAN_ROWS).astype(int)))
+    shares = np.linspace(-1.0, 1.0, 2 * SCANNED + 1)
+
+    def left(i: int, by: float) -> float:
+        predicted = _with_shift(some.network, Shift(i, by), len(some.reach))(some.inputs)
+        T = rigid_motion(predicted, some.targets) if moved else np.eye(4)
+        return marker_rms((predicted.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]).reshape(predicted.shape) - some.targets)
+
+    scans = [(*min((left(i, s * width), s * width) for s in shares), i) for i, width in enumerate(frames.reach)]
+    found = []
+    for _, start, i in sorted(scans)[:3]:
+        half = frames.reach[i] / SCANNED
+        if half > 0:
+            near = minimize_scalar(
+                partial(left, i),
+                bounds=(start - half, start + half),
+                method="bounded",
+                options={"xatol": 1e-3 * half},
+            )
+            found.append((float(near.fun), Shift(i, float(near.x))))
+    return min(found, key=lambda item: item[0])[1] if found else Shift(0, 0.0)
+
+
+def rigid_motion(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the rigid motion that takes the markers of all rows to where they are, shape (4, 4)."""
+    a, b = after.reshape(-1, 3), before.reshape(-1, 3)
+    try:
+        return fit_rigid(a, b)
+    except DataError:  # all on a line: no more than a shift is known
+        return make_pose(np.eye(3), (a - b).mean(axis=0))
+
+
+def _step(frames: Frames, step: str) -> Network:
+    network, inputs, targets = frames.network, frames.inputs, frames.targets
+    if step == "base":
+        T, points = rigid_motion(network(inputs), targets), targets.shape[1] // 3
+        turned = np.asarray(np.kron(np.eye(points), T[:3, :3]), dtype=np.float64)
+        return network.followed_by(turned, np.tile(T[:3, 3], points))
+    if step == "zeros":
+        return _with_zeros(network, inputs, targets)
+    if step.startswith("line"):
+        left = train_ridge(network.normalised(inputs), targets - network(inputs), penalty=float(step.split()[1]))
+        C = left.C * left.scale
+        return network.with_linear(C, left.d - C @ left.centre)
+    return network
+
+
+def _with_shift(network: Network, shift: Shift, channels: int) -> Network:
+    """Return the network for readings of which one channel, and its filters, read too much."""
+    centre = network.centre.copy()
+    centre[shift.channel :: channels] += shift.by
+    return replace(network, centre=centre)
+
+
+def _blocks(count: int) -> Iterator[BoolArray]:
+    block = np.arange(count) * BLOCKS // count
+    for number in range(BLOCKS):
+        yield block == number
+
+
+def _with_zeros(network: Network, inputs: FloatArray, targets: FloatArray) -> Network:
+    """Return the network whose sensors have other zeros, found by Gauss–Newton steps with a prior."""
+    noise = max(marker_rms(network(inputs) - targets) / 10.0, 1e-6)
+    spread = np.where(network.scale > 0, 1.0 / np.where(network.scale > 0, network.scale, 1.0), 0.0)
+    if network.kind == "radial":
+        spread = spread * np.median(np.abs(network.normalised(inputs)))
+    offset = np.zeros(len(spread))
+    for _ in range(ZERO_STEPS):
+        base = network(inputs - offset)
+        columns = [(network(inputs - offset - 1e-4 * step) - base).ravel() / 1e-4 for step in np.diag(spread)]
+        J = np.stack(columns, axis=1) / noise
+        left = (targets - base).ravel() / noise
+        share = np.divide(offset, spread, out=np.zeros_like(offset), where=spread > 0)
+        system = J.T @ J / len(inputs) + np.eye(len(spread)) / (ZERO_STD**2 * len(inputs))
+        gradient = J.T @ left / len(inputs) - share / (ZERO_STD**2 * len(inputs))
+        offset = offset + spread * np.linalg.solve(system, gradient)
+    return replace(network, centre=network.centre + offset)
