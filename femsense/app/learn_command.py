@@ -85,7 +85,7 @@ def learn_into(
         model = adapted(before, data)
         text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
         document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
-        document |= {"channel": found.channel, "channel_shift": found.channel_shift} if found.channel else {}
+        document["shifts"] = found.shifts
         if other is not None:
             tested = _tested(model, other)
             document["test"] = tested

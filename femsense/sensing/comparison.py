@@ -10,9 +10,11 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.io.result_folder import read_document
 from femsense.io.tables import read_csv
 from femsense.sensing.types import ContactForce, Run
 
+TRUTH = "femsense-truth-1"
 SAME_PLACE = 0.1
 """A contact is the true one if it is closer than this times the robot's size."""
 
@@ -72,11 +74,12 @@ def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
         truth: the folder of a recording of the virtual rig, or true contacts.
 
     Raises:
-        InputError: a recording without a truth.
+        InputError: a recording without a truth, or one that the run is not of.
     """
     if isinstance(truth, str | Path):
         if not (Path(truth) / "truth" / "contacts.csv").is_file():
             raise InputError("no truth beside the recording", where=truth, expected="a folder that femsense simulate wrote")
+        _check_recording(run, Path(truth))
         truth = read_truth(Path(truth))
     size = float(np.linalg.norm(np.ptp(run.states.rest_nodes_m, axis=0)))
     pairs = [(true, found) for true in truth if (found := _nearest(run.contacts, true, SAME_PLACE * size)) is not None]
@@ -93,6 +96,39 @@ def read_truth(recording: Path) -> tuple[TrueContact, ...]:
     table = read_csv(file, required=("frame", *columns_used), optional=optional, prefixes=("rest_",))
     frames, values = table.integers("frame"), table.numbers(columns_used)
     return tuple(TrueContact(int(frame), row[:3], row[3:]) for frame, row in zip(frames, values))
+
+
+def _check_recording(run: Run, truth: Path) -> None:
+    """Raise InputError unless a run is of the recording beside a truth, or of a copy of it."""
+    own = run.recording_folder
+    if own is not None and own.resolve() == truth.resolve():
+        return
+    document = truth / "truth" / "truth.json"
+    robot = read_document(document, TRUTH).get("robot") if document.is_file() else run.robot.name
+    if robot != run.robot.name:
+        raise InputError(
+            "the truth of another robot", where=truth, found=robot, expected=f"{run.robot.name}, which the run is of"
+        )
+    here, there = truth / "frames.csv", None if own is None else own / "frames.csv"
+    same = _times(here) >= {(frame.frame, round(frame.time_s, 6)) for frame in run.frames}
+    if there is not None and there.is_file():
+        same = same and there.read_bytes() == here.read_bytes()
+    if not same:
+        raise InputError(
+            "the truth of another recording",
+            where=truth,
+            found="frames at other times or under other inputs",
+            expected=f"the recording that the run is of: {own or 'not known any more'}",
+        )
+
+
+def _times(frames: Path) -> set[tuple[int, float]]:
+    """Return number and time of each frame of a recording."""
+    if not frames.is_file():
+        return set()
+    table = read_csv(frames, required=("frame", "time_s"), prefixes=("",))
+    times = table.numbers(("time_s",))[:, 0]
+    return {(int(frame), round(float(time), 6)) for frame, time in zip(table.integers("frame"), times)}
 
 
 def _nearest(contacts: Sequence[ContactForce], true: TrueContact, reach: float) -> ContactForce | None:

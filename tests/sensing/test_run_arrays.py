@@ -75,6 +75,31 @@ def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
         fs.compare(sensed, tmp_path)
 
 
+def test_a_truth_of_another_recording_or_robot_is_refused(run: Run, tmp_path: Path) -> None:
+    own, copy, other, faster, foreign = (tmp_path / name for name in ("own", "copy", "other", "faster", "foreign"))
+    rows = [f"{frame.frame},{frame.time_s},3.25" for frame in run.frames]
+    for folder, robot, text in (
+        (own, run.robot.name, rows),
+        (copy, run.robot.name, rows),
+        (other, run.robot.name, [row.replace("3.25", "4.5") for row in rows]),
+        (faster, run.robot.name, [row.replace(",", ",9", 1) for row in rows]),
+        (foreign, "arm", rows),
+    ):
+        (folder / "truth").mkdir(parents=True)
+        (folder / "truth" / "contacts.csv").write_text("frame,x_m,y_m,z_m,fx_n,fy_n,fz_n\n", encoding="utf-8")
+        (folder / "truth" / "truth.json").write_text(f'{{"format": "femsense-truth-1", "robot": "{robot}"}}', encoding="utf-8")
+        (folder / "frames.csv").write_text("\n".join(["frame,time_s,tension_top", *text, "99,99,0"]) + "\n", encoding="utf-8")
+    known = replace(run, recording_folder=own)
+    assert fs.compare(known, own).contacts_true == fs.compare(known, copy).contacts_true == 0
+    assert fs.compare(replace(run, recording_folder=None), other).contacts_true == 0  # nothing says that it is not
+    for folder, said in ((other, "another recording"), (faster, "another recording"), (foreign, "another robot")):
+        with pytest.raises(InputError, match=f"the truth of {said}"):
+            fs.compare(known, folder)
+    (faster / "frames.csv").unlink()
+    with pytest.raises(InputError, match="the truth of another recording"):
+        fs.compare(known, faster)
+
+
 def test_a_truth_as_the_rig_writes_it_is_read(tmp_path: Path) -> None:
     values = dict.fromkeys(CONTACT_COLUMNS, "0") | {"frame": "4", "x_m": "0.05", "fz_n": "-1", "object": "ball"}
     (tmp_path / "truth").mkdir()

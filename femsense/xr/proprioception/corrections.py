@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from femsense.calib.rigid import fit_rigid
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
-from femsense.core.pose import make_pose
+from femsense.core.pose import make_pose, transform_points
 from femsense.xr.proprioception.linear import train_ridge
 from femsense.xr.proprioception.network import Network
 from femsense.xr.proprioception.selection import marker_rms
@@ -37,6 +36,7 @@ ZERO_STEPS = 3
 SCANNED = 12
 """Shifts of a channel that are tried, over its range to either side, before the best is refined."""
 SCAN_ROWS = 200
+REFINED = 3
 CORRECTIONS = ("none", "channel", "base", "channel, base", "zeros", "base, zeros", *(f"base, line {x}" for x in (0.01, 0.1, 1.0)))
 """From simple to less simple."""
 
@@ -111,7 +111,14 @@ def corrected(frames: Frames, name: str) -> Network:
 
 
 def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
-    """Return the channel and the shift that explain frames best: a scan of each channel, then the best three refined.
+    """Return the channel and the shift that explain frames best; see `shifts_of`."""
+    return shifts_of(frames, moved=moved)[0]
+
+
+def shifts_of(frames: Frames, *, moved: bool = False) -> tuple[Shift, ...]:
+    """Return the shift of one channel that explains frames best, then those of other channels that explain them as well.
+
+    Each channel's shift is scanned over its range; the best three are refined.
 
     moved: whether the base may have moved as well; a rigid motion is then taken off for each shift that is tried.
     """
@@ -119,25 +126,21 @@ def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
 
     some = frames.select(np.isin(np.arange(len(frames.inputs)), np.linspace(0, len(frames.inputs) - 1, SCAN_ROWS).astype(int)))
     shares = np.linspace(-1.0, 1.0, 2 * SCANNED + 1)
-
-    def left(i: int, by: float) -> float:
-        predicted = _with_shift(some.network, Shift(i, by), len(some.reach))(some.inputs)
-        T = rigid_motion(predicted, some.targets) if moved else np.eye(4)
-        return marker_rms((predicted.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]).reshape(predicted.shape) - some.targets)
-
-    scans = [(*min((left(i, s * width), s * width) for s in shares), i) for i, width in enumerate(frames.reach)]
+    scans = [(*min((_left(some, Shift(i, s * wide), moved), s * wide) for s in shares), i) for i, wide in enumerate(frames.reach)]
     found = []
-    for _, start, i in sorted(scans)[:3]:
+    for _, start, i in sorted(scans)[:REFINED]:
         half = frames.reach[i] / SCANNED
         if half > 0:
             near = minimize_scalar(
-                partial(left, i),
+                lambda by, i=i: _left(some, Shift(i, by), moved),
                 bounds=(start - half, start + half),
                 method="bounded",
                 options={"xatol": 1e-3 * half},
             )
             found.append((float(near.fun), Shift(i, float(near.x))))
-    return min(found, key=lambda item: item[0])[1] if found else Shift(0, 0.0)
+    shifts = [shift for _, shift in sorted(found, key=lambda item: item[0])] or [Shift(0, 0.0)]
+    best, *others = (_errors_without(some, shift, moved) for shift in shifts)
+    return (shifts[0], *(shift for shift, errors in zip(shifts[1:], others) if not is_better(best, errors)))
 
 
 def rigid_motion(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -169,6 +172,17 @@ def _with_shift(network: Network, shift: Shift, channels: int) -> Network:
     centre = network.centre.copy()
     centre[shift.channel :: channels] += shift.by
     return replace(network, centre=centre)
+
+
+def _errors_without(frames: Frames, shift: Shift, moved: bool) -> FloatArray:
+    """Return the errors where one channel has another zero, and the base has moved [m], shape (n, 3 m)."""
+    predicted = _with_shift(frames.network, shift, len(frames.reach))(frames.inputs)
+    T = rigid_motion(predicted, frames.targets) if moved else np.eye(4)
+    return np.asarray(transform_points(T, predicted.reshape(-1, 3)).reshape(predicted.shape) - frames.targets)
+
+
+def _left(frames: Frames, shift: Shift, moved: bool) -> float:
+    return marker_rms(_errors_without(frames, shift, moved))
 
 
 def _blocks(count: int) -> Iterator[BoolArray]:

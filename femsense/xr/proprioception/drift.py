@@ -11,7 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
-from femsense.xr.proprioception.corrections import Frames, corrected, explain, is_better, rigid_motion, shift_of
+from femsense.xr.proprioception.corrections import Frames, corrected, explain, is_better, rigid_motion, shift_of, shifts_of
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.learn import error_interval
@@ -38,10 +38,8 @@ class Drift:
     shift_mm: float
     """How far the middle of the markers moves by it."""
     turn_deg: float
-    channel: str
-    """The one that shifted; empty where none did alone."""
-    channel_shift: float
-    """How much it reads too much, in its unit; else nan."""
+    shifts: dict[str, float]
+    """The channel that alone shifted, and how much it reads too much, in its unit; then others that explain it as well."""
     left_mm: float
     """With all that explains the frames, on frames that it was not fitted to."""
     outside: float
@@ -55,11 +53,9 @@ class Drift:
         lines = [f"{self.verdict}: {self.error_mm:.2f} mm here, {self.stated_mm:.2f} mm when it was learnt"]
         if self.verdict != "holds":
             lines.append(f"a rigid motion of {self.shift_mm:.2f} mm and {self.turn_deg:.2f}° leaves {self.rigid_mm:.2f} mm")
-        if self.verdict != "holds" and self.channel:
-            side = "high" if self.channel_shift > 0 else "low"
-            lines.append(
-                f"{self.channel} reads {abs(self.channel_shift):.4g} too {side}; without that {self.left_mm:.2f} mm are left"
-            )
+        if self.verdict != "holds" and self.shifts:
+            said = [f"{name} reads {abs(by):.4g} too {'high' if by > 0 else 'low'}" for name, by in self.shifts.items()]
+            lines.append(f"{', or '.join(said)}; without that {self.left_mm:.2f} mm are left")
         if self.outside > 0.0:
             named = ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in self.channels.items())
             lines.append(f"outside what was learnt in {100 * self.outside:.0f} % of the rows: {named}")
@@ -77,7 +73,7 @@ def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
     stated = float(model.report.get("error_mm", 0.0))
     chosen, left = explain(frames)
     T, middle = rigid_motion(predicted, frames.targets), predicted.reshape(-1, 3).mean(axis=0)
-    shifted = shift_of(frames, moved="base" in chosen) if "channel" in chosen else None
+    shifts = shifts_of(frames, moved="base" in chosen) if "channel" in chosen else ()
     inside = model.domain.inside(data.readings)
     names = [item.channel for row in data.readings[~inside] for item in model.check(row)]
     counts = {name: names.count(name) / len(data) for name in dict.fromkeys(names)}
@@ -88,8 +84,7 @@ def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
         rigid_mm=1e3 * left["base"],
         shift_mm=1e3 * float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)),
         turn_deg=float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))),
-        channel="" if shifted is None else model.channels[shifted.channel],
-        channel_shift=float("nan") if shifted is None else shifted.by,
+        shifts={model.channels[shift.channel]: shift.by for shift in shifts},
         left_mm=1e3 * left[chosen],
         outside=float(1.0 - inside.mean()),
         channels=dict(sorted(counts.items(), key=lambda item: -item[1])),

@@ -15,6 +15,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.core.pose import invert_pose, transform_points
 from femsense.xr.armature import ArmatureOptions
 from femsense.xr.proprioception.bayes import train_bayesian
+from femsense.xr.proprioception.corrections import is_better
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.files import read_labelled
 from femsense.xr.proprioception.labelled import Labelled, joined, labelled
@@ -141,14 +142,67 @@ def test_another_day_is_recognised_and_a_few_frames_correct_it(model) -> None:
     assert found.verdict == "base moved" and "base moved" in found.text
     assert found.turn_deg == pytest.approx(np.degrees(np.hypot(0.1, 0.2)), abs=0.7)
     zeroed = session(5, zero=0.15)
-    assert "map changed" in drift(model, zeroed).verdict
+    assert drift(model, zeroed).verdict == "one channel shifted"
     few = np.zeros(len(same), dtype=bool)
     few[::15] = True
-    for day, by in ((same, "none"), (moved, "base"), (zeroed, "zeros")):
+    for day, by in ((same, "none"), (moved, "base"), (zeroed, "channel")):
         mended = adapt(model, day.select(few))
         rest = day.select(~few & mended.domain.inside(day.readings))
         error = 1e3 * marker_rms(mended.network(rest.inputs(mended.memory_s)) - rest.targets)
         assert mended.report["adapted"]["by"] == by and error < 2.0 * model.report["error_mm"]
+
+
+@pytest.mark.parametrize(("channel", "by"), [("left", 0.15), ("left", -0.05), ("right", 0.3), ("right", 0.1)])
+def test_a_channel_that_shifted_is_named_with_how_much(model, channel: str, by: float) -> None:
+    same = session(5)
+    readings = same.readings + by * (np.array(CHANNELS) == channel)
+    few, rest = np.arange(0, len(same), 15), np.arange(7, len(same), 15)
+    day = labelled(same.time_s, readings, same.markers, channels=CHANNELS)
+    found = drift(model, day.select(few))
+    assert found.verdict == "one channel shifted" and list(found.shifts) == [channel]
+    assert found.shifts[channel] == pytest.approx(by, abs=0.02) and found.left_mm < 0.8 * found.rigid_mm
+    assert f"{channel} reads {abs(found.shifts[channel]):.4g} too {'high' if by > 0 else 'low'}" in found.text
+    mended = adapt(model, day.select(few))
+    left = day.select(rest)
+    assert mended.report["adapted"]["by"] == "channel"
+    assert 1e3 * marker_rms(mended.network(left.inputs(())) - left.targets) < 2.0 * model.report["error_mm"]
+    assert mended.domain.inside(left.readings).mean() > 0.9
+
+
+def test_a_channel_that_shifted_on_a_base_that_moved_and_a_map_that_changed_are_told_apart(model) -> None:
+    same = session(7)
+    few = np.arange(0, len(same), 15)
+    T, shift = Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix(), np.array([0.004, -0.003, 0.0])
+    offset, gain = np.array([0.15, 0, 0, 0, 0]), np.array([1.2, 1, 1, 1, 1])
+    both = labelled(same.time_s, same.readings + offset, same.markers @ T.T + shift, channels=CHANNELS)
+    found = drift(model, both.select(few))
+    assert found.verdict == "one channel shifted and base moved" and list(found.shifts) == ["left"]
+    assert found.shifts["left"] == pytest.approx(0.15, abs=0.02)
+    two = np.array([0.1, -0.2, 0, 0, 0])
+    for readings in (same.readings * gain, same.readings + two):
+        found = drift(model, labelled(same.time_s, readings, same.markers, channels=CHANNELS).select(few))
+        assert found.verdict == "map changed" and found.shifts == {}
+
+
+def test_channels_that_explain_a_day_alike_are_all_named(model) -> None:
+    twin = np.array([[1.0, 0.0], [0.0, 0.0]])  # two channels that read the same
+    rng = np.random.default_rng(3)
+    bend = np.sin(0.11 * np.arange(200)) * np.sin(0.023 * np.arange(200) + 1)
+    readings = np.stack([bend, bend], axis=1) + 0.002 * rng.normal(size=(200, 2))
+    markers = bent(10.0 + 6.0 * bend, 0.0 * bend) + 2e-4 * rng.normal(size=(200, 4, 3))
+    time = 0.05 * np.arange(200)
+    simple = learn(labelled(time, readings, markers), options=LearnOptions(kinds=("ridge",), memories=((),)))
+    found = drift(simple, labelled(time, readings + 0.3 * twin[0], markers).select(np.arange(0, 200, 5)))
+    assert set(found.shifts) == {"channel_0", "channel_1"} and ", or " in found.text
+
+
+def test_chance_alone_makes_no_correction_better() -> None:
+    rng = np.random.default_rng(0)
+    small, large = 1e-3 * rng.normal(size=(2, 24, 6)) * np.array([1.0, 1.5])[:, None, None]
+    assert is_better(small, large) and not is_better(large, small) and not is_better(small, 1.05 * small)
+    burst = small.copy()
+    burst[:2] *= 8.0  # one moment that was bad
+    assert marker_rms(small) < 0.9 * marker_rms(burst) and not is_better(small, burst)
 
 
 def test_an_interval_of_an_error_covers_it_and_knows_that_neighbours_are_alike() -> None:
