@@ -31,7 +31,8 @@ const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stan
 
 /** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
 function free(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
-  if (width <= 820 && height > 480) return { left: 10, right: 10, top: 80 + 0.3 * height, bottom: 180 };
+  const tabs = document.querySelector("#robots:not([hidden])") ? 42 : 0;
+  if (width <= 820 && height > 480) return { left: 10, right: 10, top: 80 + tabs + 0.3 * height, bottom: 180 };
   return { left: 20, right: height > 480 ? 310 : 290, top: 70, bottom: 100 };
 }
 
