@@ -37,7 +37,9 @@ await page.waitForFunction(() => {
   return robots.length === 2 && robots.every((r) => r.body && r.shown);
 }, null, { timeout: 60000 });
 await page.waitForFunction(() => document.querySelector('#sum').textContent.includes('±'), null, { timeout: 60000 });
-say({ text: await page.evaluate(() => document.body.innerText), clock: await page.textContent('#clock'), meters: await page.locator('[role=meter]').count() });
+const live = await page.waitForFunction(
+  () => document.querySelector('#badge').textContent.startsWith('live') && document.body.innerText, null, { timeout: 60000 });
+say({ text: await live.jsonValue(), clock: await page.textContent('#clock'), meters: await page.locator('[role=meter]').count() });
 await told();
 await page.waitForFunction(() => femsense.shown.robots.get('bar').shown?.frame === 999, null, { timeout: 60000 });
 await page.selectOption('#paint', 'stress');

@@ -130,14 +130,6 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
     return data.inputs(model.memory_s)
 
 
-def _verdict(stated: float, before: float, rigid: float) -> str:
-    if before <= AS_BEFORE * stated:
-        return "holds"
-    if rigid <= AS_BEFORE * stated:
-        return "base moved"
-    return "base moved and map changed" if rigid < 0.5 * before else "map changed"
-
-
 def _frames(model: ProprioceptiveModel, data: Labelled) -> Frames:
     return Frames(model.network, model_inputs(model, data), data.targets, model.domain.high - model.domain.low)
 
