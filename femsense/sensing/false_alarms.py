@@ -28,10 +28,8 @@ def with_gains_of_free_frames(prepared: Prepared) -> Sensor:
     asked = [free[i] for i in np.unique(np.linspace(0, len(free) - 1, min(MOST, len(free))).round().astype(int))]
     if len(asked) < FOLDS:
         return sensor
-    gains = []
-    for fold in range(FOLDS):
-        others = prepared.without(asked[fold::FOLDS])
-        gains += [_gain(others, prepared.free[k]) for k in asked[fold::FOLDS]]
+    others = [prepared.without(asked[fold::FOLDS]) for fold in range(FOLDS)]
+    gains = [_gain(others[i % FOLDS], prepared.free[k]) for i, k in enumerate(asked)]
     limit = max(gains) + BEYOND * float(np.std(gains))
     return replace(sensor, knowledge=replace(sensor.knowledge, gain_limit=max(sensor.knowledge.gain_limit, limit)))
 

@@ -264,8 +264,8 @@ def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> fl
     for rows, sag in (frame for frame in frames if frame[0].of_clouds):
         z = np.clip(whitened_rest(knowledge, rows, sag), -HUBER, HUBER)
         cells = np.floor(rows.place / (CELL * knowledge.length)).astype(np.int64)
-        _, group = np.unique(cells, axis=0, return_inverse=True)
-        sums += float((np.bincount(group.ravel(), z) ** 2).sum())
+        cells -= cells.min(axis=0)
+        sums += float((np.bincount(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), z) ** 2).sum())
         squares += float((z**2).sum())
     return max(1.0, sums / max(squares, 1e-12))
 
