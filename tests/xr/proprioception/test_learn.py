@@ -179,9 +179,14 @@ def test_a_channel_that_shifted_on_a_base_that_moved_and_a_map_that_changed_are_
     assert found.verdict == "one channel shifted and base moved" and list(found.shifts) == ["left"]
     assert found.shifts["left"] == pytest.approx(0.15, abs=0.02)
     two = np.array([0.1, -0.2, 0, 0, 0])
-    for readings in (same.readings * gain, same.readings + two):
-        found = drift(model, labelled(same.time_s, readings, same.markers, channels=CHANNELS).select(few))
+    for readings, by in ((same.readings * gain, "base, line 0.01"), (same.readings + two, "zeros")):
+        day = labelled(same.time_s, readings, same.markers, channels=CHANNELS)
+        found = drift(model, day.select(few))
         assert found.verdict == "map changed" and found.shifts == {}
+        mended, rest = adapt(model, day.select(few)), day.select(few[:-1] + 7)
+        assert mended.report["adapted"]["by"] == by
+        error = 1e3 * marker_rms(mended.network(rest.inputs(())) - rest.targets)
+        assert error < 0.6 * 1e3 * marker_rms(model.network(rest.inputs(())) - rest.targets)
 
 
 def test_channels_that_explain_a_day_alike_are_all_named(model) -> None:
