@@ -53,35 +53,23 @@ BASE = Switch("all rules")
 SEARCH = (
     Switch("sweeps_for", {"sweeps_for": -INF}),
     Switch("held_gain", {"held_gain": -1e9}),
-    Switch("held_counts", {"held_counts": 0.0}),
-    Switch("above_mesh", {"above_mesh": 0.0, "above_mesh_if_sure": 0.0}),
+    Switch("above_mesh", {"above_mesh": 0.0}),
     Switch("plainly_worse", {"plainly_worse": INF}),
-    Switch(
-        "evidence alone", {"sweeps_for": -INF, "held_gain": -1e9, "held_counts": 0.0, "above_mesh": 0.0, "plainly_worse": INF}
-    ),
-    Switch("sure", {"sure": INF}),
-    Switch("held_chance", {"held_chance": 0.0}),
+    Switch("evidence alone", {"sweeps_for": -INF, "held_gain": -1e9, "above_mesh": 0.0, "plainly_worse": INF}),
     Switch("swap", {"swap": INF}),
     Switch("places", {}, {"starts": 1, "rounds": 0}),
-    Switch("apart", {"apart": INF}),
-    Switch("white_share", {"white_share": 0.0}),
     Switch("mesh_turns", {"mesh_turns": 0.0}),
     Switch("mesh_varies", {"mesh_varies": 0.0, "mesh_varies_held": 0.0}),
     Switch("mesh error", {"mesh_share": 1e-6, "mesh_varies": 0.0, "mesh_varies_held": 0.0, "mesh_turns": 0.0}),
-    Switch("mesh_elsewhere", {"mesh_elsewhere": INF}),
 )
 """Rules of the search, each with a search of its own."""
 VERDICT = (
     Switch("relevant", {"relevant": 0.0}),
-    Switch("offsets_above_mesh", {"offsets_above_mesh": 0.0}),
     Switch("explained", {"explained": -INF}),
     Switch("lacks", {"lacks": INF}),
-    Switch("likely_noise", {"likely_noise": INF}),
+    Switch("resolved", {"resolved": INF}),
     Switch("noisy", {"noisy": 1.0}),
     Switch("alike", {"alike": INF}),
-    Switch("refuted", {"refuted": 0.0}),
-    Switch("next_to_nothing", {"next_to_nothing": 0.0}),
-    Switch("many_numbers", {"many_numbers": 100}),
     Switch("significant", {"significant": 2.0}),
 )
 """Rules of the verdict, on what one search found."""

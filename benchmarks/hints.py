@@ -85,7 +85,7 @@ def main() -> None:
                     flush=True,
                 )
                 top = [max(scores.values(), default=-np.inf) for scores in (hinted, own)]
-                missed += top[0] <= DEFAULTS.promising < DEFAULTS.evidence < top[1]
+                missed += top[0] <= DEFAULTS.evidence < top[1]
                 far += [abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys()]
                 near += [
                     abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys() if min(hinted[n], own[n]) < DEFAULTS.evidence

@@ -118,8 +118,6 @@ class GaussNewtonOptions:
     enough: float = 0.0
     """What counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0:
     all that `tolerance` says."""
-    spare: float = 0.0
-    """A fit ends where the predicted gain of a whole step is less than this: what is asked next is worth more."""
     learning: Learning = field(default_factory=Learning)
     """How it learns from its own steps."""
 
@@ -183,12 +181,7 @@ def gauss_newton(
             status = STOPPED_EARLY
             break
         expected_residual = not slope.own and error == 1.0 and pace.next <= rule.still
-        if (
-            expected_residual
-            or (whole < rule.spare and slope.sure is not None)
-            or idle > 1
-            or (small and (slope.own or slope.sure or idle))
-        ):
+        if expected_residual or idle > 1 or (small and (slope.own or slope.sure or idle)):
             status = CONVERGED
             break
         if at_end:

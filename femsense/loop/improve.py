@@ -1,11 +1,6 @@
-"""Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data,
-hand back a better model.
+"""Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data, hand back a better model.
 
-The order of things: split by sweeps; calibrate the declared model (that is "before");
-fit what calibration may always move (poses, initial inputs, modulus, input offsets), on quadratic elements where linear ones are
-declared; estimate the discretisation error; estimate the noise; screen; refit the best few in full nonlinearity; accept one if
-BIC, its physical range, the sweeps that are left out and the held-out data agree;
-start again from the better model until nothing passes.
+docs/closing-the-loop.md says what follows what, and why.
 """
 
 from __future__ import annotations

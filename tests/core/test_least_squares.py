@@ -392,19 +392,3 @@ def test_a_fit_whose_steps_promise_less_than_half_of_what_is_missing_is_given_up
         gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=7.1)).status == "stopped early"
     )  # tried, and no better than that
     assert gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=9.1)).cost[-1] == pytest.approx(9.0)
-
-
-def test_a_fit_with_something_better_to_do_ends_where_steps_promise_less_than_that() -> None:
-    start, ends, asked = np.array([0.6, 0.2, 0.1]), [], []
-    for spare in (0.0, 1e-3, 1e3):
-        evaluate, seen = counted(1.0)
-        ends.append(gauss_newton(evaluate, start, options=GaussNewtonOptions(spare=spare)))
-        asked.append(len(seen))
-    least = ends[0].cost[-1]
-    assert asked[2] == 1 < asked[1] < asked[0] and all(fit.status == "converged" for fit in ends)
-    assert least < ends[1].cost[-1] <= least + 1e-3
-    evaluate, seen = counted(1.0)
-    fit = gauss_newton(
-        evaluate, start, borrowed=np.zeros((30, 3)), options=GaussNewtonOptions(spare=0.001)
-    )  # what was borrowed says that nothing can be gained
-    assert seen[:2] == [False, True] and fit.cost[-1] <= least + 1e-3

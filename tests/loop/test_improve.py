@@ -340,7 +340,7 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
 
 
 def test_noise_that_no_camera_has_is_said():
-    data = SimpleNamespace(robot=arm((4, 1, 1)))
+    data = SimpleNamespace(robot=arm((4, 1, 1)), thresholds=DEFAULTS)
     assert by_noise(data, Repeatability(1e-3, 3, True, "")) == ""
     assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Repeatability(2e-3, 3, True, ""))
 

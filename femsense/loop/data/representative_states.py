@@ -10,7 +10,7 @@ from femsense.loop.data.sampled_states import drive_table, ranges
 from femsense.loop.data.trial import Trial
 from femsense.model.recording import Recording
 
-FEWEST = 12
+FEWEST = 16
 """They are as many at least."""
 SAME = 1e-9
 """States whose inputs and loads differ by less, in units of their ranges, are one."""

@@ -37,8 +37,6 @@ from femsense.pointcloud.sheets import Crossings, Sheets, fit_sheet, joined
 
 SURFACE_POINTS = 140
 """Points of the surface; a camera sees less than half of them at once."""
-FEWEST_POINTS = 12
-"""With fewer off sharp edges those on edges count too."""
 VOXEL = 0.01
 """Edge of the cells that measured points are averaged over, in diagonals of the body."""
 RADIUS = 3.5
@@ -54,20 +52,17 @@ AROUND = 16
 LOPSIDED = 0.5
 """Largest distance of their mean from the place, in their mean distance: it is 0.64 on a straight border."""
 REACH = 0.1
-"""Largest distance of the measured surface from the model's, in diagonals."""
+"""Largest distance of the measured surface from the model's, in diagonals; and of the robot's points where colours do not tell."""
 FACING = 0.35
 """Smallest cosine between a normal and the ray to the camera."""
 SMOOTH = 0.06
 """Distance over which errors go together, in diagonals."""
-NEAR = 0.08
-"""Largest distance of the robot's points from the declared model where colours do not tell, in diagonals: it may be that far off."""
 PLANE = 1.5
 """Half the thickness of a floor or wall beside the robot, in cells."""
 STANDS_OUT = 5.0
 """A row farther from its neighbours in the frame than this many of their usual differences is left out."""
-NEIGHBOURS = 6
 FEWEST_ROWS = 8
-"""Rows that a frame needs."""
+"""Rows that a frame needs, neighbours that a row is compared with, and points off sharp edges without which those on edges count, too."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,7 +96,7 @@ def with_surface(robot: Robot) -> Robot:
     surface = body_surface(robot.body.mesh)
     nodes = robot.body.mesh.nodes
     flat = spread_features(robot.body, SURFACE_POINTS, among=flat_nodes(surface, nodes))
-    chosen = flat if len(flat) >= FEWEST_POINTS else spread_features(robot.body, SURFACE_POINTS)
+    chosen = flat if len(flat) >= FEWEST_ROWS else spread_features(robot.body, SURFACE_POINTS)
     return robot.with_surface_points(nodes[chosen])
 
 
@@ -166,7 +161,7 @@ def _robot_points(
     else:
         nodes = np.unique(triangles)
         normals = vertex_normals(state.positions, triangles)[nodes]
-        own, _ = segment_by_model(placed, state.positions[nodes], normals, NEAR * size, plane_m=PLANE * voxel)
+        own, _ = segment_by_model(placed, state.positions[nodes], normals, REACH * size, plane_m=PLANE * voxel)
     return as_measured(own.points, np.zeros(len(own), dtype=np.int64), [pose], robot.observation)
 
 
@@ -288,7 +283,7 @@ def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
     for k in scene.frames:
         rows = np.flatnonzero(scene.frame == k)
         at = robot.marker_points[scene.marker[rows]]
-        near = np.asarray(cKDTree(at).query(at, k=min(NEIGHBOURS + 1, len(rows)))[1])[:, 1:]
+        near = np.asarray(cKDTree(at).query(at, k=min(FEWEST_ROWS + 1, len(rows)))[1])[:, 1:]
         apart[rows] = heights[rows] - np.median(heights[rows][near], axis=1)
     usual = 1.4826 * float(np.median(np.abs(apart)))
     keep = np.abs(apart) <= STANDS_OUT * max(usual, 2e-4)

@@ -25,9 +25,6 @@ LENGTHS = 0.3, 0.6, 1.2, 2.4
 """Lengths of the kernel that are tried, in ranges of an input."""
 RATIOS = 1.0, 3.0, 10.0, 30.0, 100.0, 300.0
 """Ratios s²/σ² that are tried."""
-LIKELIER = 3.0
-"""A correction must be likelier by this log-likelihood than none, since its length and ratio are chosen, and one of all inputs together than one of each by
-itself, which carries over to inputs that were not pulled together."""
 
 
 def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
@@ -39,7 +36,7 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
         return None
     number = np.asarray(number).reshape(-1)
     plain = _Model(rows, np.zeros((len(number), 0)))
-    best, chosen = plain.likelihood(1.0)[0], None
+    best, chosen, likelier = plain.likelihood(1.0)[0], None, 0.5 * data.thresholds.evidence
     for kernel, length in product(KERNELS if states.shape[1] > 1 else KERNELS[1:], LENGTHS):
         gram = kernel_of(kernel, length, states, states)
         values, vectors = np.linalg.eigh(gram)
@@ -50,7 +47,8 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
             basis = vectors[:, kept] / np.sqrt(values[kept])
             found = _Model(rows, (gram @ basis)[number])
             value = found.likelihood(ratio)[0]
-            if value > best + (LIKELIER if chosen is None or chosen[0] != kernel else 0.0):
+            # its length and ratio are chosen, and a kernel of each input by itself carries over to inputs that were not pulled together
+            if value > best + (likelier if chosen is None or chosen[0] != kernel else 0.0):
                 best, chosen = value, (kernel, length, ratio, basis, found)
     if chosen is None:
         return None

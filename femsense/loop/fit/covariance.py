@@ -22,7 +22,7 @@ from femsense.loop.data.trial import Trial
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, half_inverse, sweep_rows
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
-from femsense.loop.fit.noise_components import Noise
+from femsense.loop.fit.noise_components import NEAR_STD, Noise
 from femsense.model.effects.base import KnownLength, known_length
 
 RINGS, SPOKES = 160, 48
@@ -153,7 +153,7 @@ def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArra
         terms.append((effect, seed, (*parameters, *more)))
         null += [*fitted.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
         moving += [True] * len(parameters) + [False] * len(more)
-        known += [min(p.known, data.thresholds.seed_std) for p in (*parameters, *more)]
+        known += [min(p.known, NEAR_STD) for p in (*parameters, *more)]
         at += len(parameters)
     mask = np.array(moving, dtype=bool)
     if mask.all():

@@ -157,19 +157,14 @@ def _by_moves(data: Data, fitted: FittedModel) -> Data:
     return replace(data, train=train, held=held)
 
 
-def errs_alike(data: Data, before: FittedModel, after: FittedModel) -> bool:
+def errs_alike(before: FittedModel, after: FittedModel) -> bool:
     """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
-    pull, or what the camera sees, and the states are nearly the same."""
+    pull, or what the camera sees."""
     old = before.fit.hypothesis
     added, _, mask = some_terms(after, [name for name in after.fit.hypothesis.names if name not in old.names])
     robot = added.robot_at(after.fit.coordinates[mask])
-    if any(
-        getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING
-    ):
-        return False
-    rest = robot.body.mesh.nodes
-    pairs = [(a.states[k].positions, b.states[k].positions) for a, b in zip(before.fit.jets, after.fit.jets) for k in a.states]
-    return rms_of([b - a for a, b in pairs]) <= data.thresholds.mesh_elsewhere * rms_of([a - rest for a, _ in pairs])
+    kept = (f.name for f in fields(BodyModel) if f.name not in PULLING)
+    return all(getattr(robot.body, name) is getattr(old.robot.body, name) for name in kept)
 
 
 def _on_firm_clamp(robot: Robot) -> Robot:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
@@ -72,29 +73,10 @@ def fit_model(
     prior: Prior,
     noise: Noise,
     coordinates: FloatArray,
-    *,
-    own: FloatArray | None = None,
-    max_iterations: int = 12,
-    known: list[SceneJet] | None = None,
-    near: list[SceneJet] | None = None,
-    worth: float = np.inf,
-    spare: float = 0.0,
+    **how: Unpack[FitHow],
 ) -> FittedModel:
     """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
-    fit = fit_jointly(
-        hypothesis,
-        prior,
-        data.train,
-        noise,
-        data.placement_std,
-        coordinates,
-        own=own,
-        max_iterations=max_iterations,
-        known=known,
-        near=near,
-        worth=worth,
-        spare=spare,
-    )
+    fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **how)
     held = held_out(data, fit, noise)
     return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
 
@@ -104,22 +86,11 @@ def jets_without(fitted: FittedModel, keep: BoolArray) -> list[SceneJet]:
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in fitted.fit.jets]
 
 
-def keeping(
-    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
-) -> FittedModel:
+def keeping(data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, *, worth: float = np.inf) -> FittedModel:
     """Return a fitted model with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
-    return fit_model(
-        data,
-        hypothesis,
-        prior,
-        noise,
-        fitted.fit.coordinates[mask],
-        own=own_of(fitted),
-        max_iterations=max_iterations,
-        near=jets_without(fitted, mask),
-        worth=worth,
-    )
+    start, near = fitted.fit.coordinates[mask], jets_without(fitted, mask)
+    return fit_model(data, hypothesis, prior, noise, start, own=own_of(fitted), near=near, worth=worth)
 
 
 def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
@@ -160,18 +131,8 @@ def roughly_keeping(
 ) -> FittedModel:
     """Return a fitted model with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
-    trials = [t.part(f) for t, f in zip(data.train, frames)]
-    fit = fit_jointly(
-        hypothesis,
-        prior,
-        trials,
-        noise,
-        data.placement_std,
-        fitted.fit.coordinates[mask],
-        own=own_of(fitted),
-        max_iterations=ROUGHLY,
-    )
-    return FittedModel(fit, [], float("nan"))
+    part = replace(data, train=[t.part(f) for t, f in zip(data.train, frames)], held=[], held_of=[])
+    return fit_model(part, hypothesis, prior, noise, fitted.fit.coordinates[mask], own=own_of(fitted), max_iterations=ROUGHLY)
 
 
 def found_in(fitted: FittedModel) -> list[str]:
@@ -270,16 +231,6 @@ def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) 
     """Return the mean square of whitened residuals; 1 is noise."""
     rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
     return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
-
-
-def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
-    """Return the whitened sum of squares of the difference between two models on held-out data."""
-    return float(
-        sum(
-            (whiten(noise.whitener(t.groups, t.mesh_error), b - a) ** 2).sum()
-            for t, b, a in zip(data.held, before.held_residuals, after.held_residuals)
-        )
-    )
 
 
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TypedDict
 
 import numpy as np
 
@@ -316,6 +317,16 @@ SERVES = 0.25
 """Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
 
 
+class FitHow(TypedDict, total=False):
+    """From where a fit begins and how far it goes: keyword arguments of `fit_jointly`."""
+
+    own: FloatArray | None
+    max_iterations: int
+    known: list[SceneJet] | None
+    near: list[SceneJet] | None
+    worth: float
+
+
 def fit_jointly(
     hypothesis: Hypothesis,
     prior: Prior,
@@ -329,7 +340,6 @@ def fit_jointly(
     known: list[SceneJet] | None = None,
     near: list[SceneJet] | None = None,
     worth: float = np.inf,
-    spare: float = 0.0,
 ) -> JointFit:
     """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
 
@@ -344,7 +354,6 @@ def fit_jointly(
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
         worth: χ² above which the fit is not worth derivatives of its own at the end.
-        spare: the fit ends where the predicted decrease of χ² of a step is less than this.
 
     Raises:
         DataError: no equilibrium at the start.
@@ -374,7 +383,6 @@ def fit_jointly(
             worth=worth,
             trusted=TRUSTED,
             enough=GAIN,
-            spare=spare,
         ),
     )
     return problem.outcome(fit)

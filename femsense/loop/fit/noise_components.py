@@ -1,17 +1,9 @@
-"""The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left.
+"""The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left (docs/closing-the-loop.md, 4).
 
     Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 
-for each axis alike, but for the last term: a marker that is glued elsewhere than declared turns with the body, Gᵢ being what a shift of its place at
-rest moves it by (`Groups.turns`). Rows of a cloud are one number each, along the measured normal nᵢ at the point Xᵢ of the body at rest, where the
-body's own is Nᵢ. What is common to two of them shows in both as far as their normals agree: errors of the camera those in space, errors
-of the body those of the body, which turn with it. Errors of neighbouring points of the body are alike:
-
-    Σᵢⱼ = s² δᵢⱼ + (Nᵢ·Nⱼ) ρᵢⱼ (h² [same state] + m²) + (nᵢ·nⱼ) (f² [same frame] + r² [same sweep]),  ρᵢⱼ = exp(−|Xᵢ − Xⱼ|² / 2 ℓ²).
-
-The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the
-richest linear model leaves, so that no effect under test counts as noise. Jitter within a hold is not the noise: a state
-that is measured five times repeats its error five times, and the term h² says so.
+The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the richest linear model leaves, so that no
+effect under test counts as noise.
 """
 
 from __future__ import annotations
@@ -30,14 +22,13 @@ from scipy.optimize import minimize
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.parallel import each
 from femsense.loop.data.trial import COMPONENTS, Groups
-from femsense.loop.thresholds import DEFAULTS
 
 ROUNDING = 1e-12
 """Directions of fields with less of the largest square are rounding."""
 FLOOR = 2e-6
 """No camera's markers are better than this [m]."""
-CLOUD_START = 5e-4
-"""Noise of clouds along the normal before it is estimated [m]."""
+UNTOLD = 5e-4
+"""Noise until it is estimated [m]: of a marker along each axis, of clouds along the normal."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -48,7 +39,7 @@ class Noise:
     """Of markers, along each axis."""
     source: str
     """Where they come from, in words."""
-    surface: dict[str, float] = field(default_factory=lambda: {"white": CLOUD_START})
+    surface: dict[str, float] = field(default_factory=lambda: {"white": UNTOLD})
     """Of clouds, along the normal."""
     assumed: float | None = None
     """What a marker is taken to repeat to along each axis where nothing tells it [m]; None: its white part."""
@@ -164,12 +155,11 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
 
 
 NEAR_STD = float(np.log(2.0))
+"""What is known beforehand is known to a factor of two: the logarithm of that."""
 FLAT = 1e-6
 """Relative decrease of the likelihood at which the estimate of the noise ends: a hundredth of a log-likelihood of ten thousand."""
-MAX_REML_ROWS = 700
-"""Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
-MAX_CLOUD_ROWS = 500
-"""The same of clouds, whose points are thinned out as well."""
+MAX_REML_ROWS = 500
+"""Rows that the estimate of the noise uses at most; more are thinned out by whole frames, of clouds by points as well."""
 
 
 def estimate_noise(
@@ -178,7 +168,6 @@ def estimate_noise(
     extra: list[FloatArray],
     groups: list[Groups],
     before: dict[str, float] | None = None,
-    white_share: float = DEFAULTS.white_share,
     most: Mapping[str, float] | None = None,
 ) -> Noise:
     """Return the components of the noise by restricted maximum likelihood.
@@ -189,7 +178,6 @@ def estimate_noise(
         extra: columns of what might be in the data besides, shape (k, c, q), the likeliest first; these count as explained.
         groups: of each recording.
         before: components [m] of an earlier estimate with a poorer model; the new one stays near it (a factor of two, softly), where the data leave it open.
-        white_share: white noise is no less than this share of what repeats of a state scatter by.
         most: component → what it may be at most [m].
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
@@ -200,8 +188,7 @@ def estimate_noise(
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
     lowest = np.log(np.maximum(1e-3 * scale, FLOOR))
     highest = np.log([max(min(3.0 * scale, (most or {}).get(n, np.inf)), 2.0 * np.exp(lowest)) for n in names])
-    low = [float(np.log(max(white_share * jitter, np.exp(lowest)))) if n == "white" else lowest for n in names]
-    bounds = list(zip(low, highest))
+    bounds = [(lowest, h) for h in highest]
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
     likelihood = Likelihood(names, residuals, basis, groups, near)
 
@@ -327,8 +314,7 @@ def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
 def _thinned(
     residuals: list[FloatArray], nuisance: list[FloatArray], extra: list[FloatArray], groups: list[Groups]
 ) -> tuple[list[FloatArray], list[FloatArray], list[FloatArray], list[Groups]]:
-    most = MAX_REML_ROWS if all(g.surface is None for g in groups) else MAX_CLOUD_ROWS
-    step = int(np.ceil(sum(len(r) for r in residuals) / most))
+    step = int(np.ceil(sum(len(r) for r in residuals) / MAX_REML_ROWS))
     if step <= 1:
         return residuals, nuisance, extra, groups
     keep = [_spread_rows(g, step) for g in groups]

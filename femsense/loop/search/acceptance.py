@@ -12,7 +12,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, span_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import PASSES, RefitRecord
@@ -38,24 +38,15 @@ def acceptance_test(
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
-    acts = held_shift(
-        data, fitted, made, noise
-    )  # what `held` is on average for the true effect, with a variance of four times that
-    wanted = min(decides.held_gain * gain * held_share(data), acts - decides.held_chance * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    surely = better > decides.sure * std_error
-    if surely:
-        wanted = min(wanted, 0.0)
     fit_objection = _objection(made, candidate, score, decides)
     if fit_objection is None and np.isfinite(std_error) and better <= decides.sweeps_for * std_error:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
-    if fit_objection is None and held < wanted:
+    if fit_objection is None and held < decides.held_gain * gain * held_share(data):
         fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
-    if fit_objection is None and score + decides.held_counts * held <= decides.evidence:  # what was not fitted speaks against it
+    if fit_objection is None and score + held <= decides.evidence:  # what was not fitted speaks against it
         fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
-    sure = sure_beyond_mesh(better, std_error, held, gain * held_share(data), decides)
-    least = decides.above_mesh_if_sure if sure else decides.above_mesh
-    if fit_objection is None and moved < least * mesh:
+    if fit_objection is None and moved < decides.above_mesh * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
     if fit_objection is None and plainly_worse(fitted, made, decides):
         fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
@@ -94,11 +85,6 @@ def surely_predicts(refitted: Refit) -> float:
     gain, std = refitted.record.cv_gain, refitted.record.cv_std
     assert gain is not None and std is not None
     return gain - (std if np.isfinite(std) else 0.0)
-
-
-def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float, decides: Thresholds) -> bool:
-    """Return whether left-out sweeps (gain ± std_error) and held-out data (gain, against what is expected of them) are sure together."""
-    return better > decides.sure * std_error and held * better > 2.0 * decides.sure * std_error * expected
 
 
 def _taken_over(before: FittedModel, after: FittedModel, decides: Thresholds) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 
@@ -13,16 +14,16 @@ from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
-from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.joint_fit import FitHow, Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
-from femsense.loop.fit.noise_components import Noise
+from femsense.loop.fit.noise_components import UNTOLD, Noise
 from femsense.loop.search.search_state import Progress
 from femsense.loop.search.swaps import History
 from femsense.model.effects import OF_BODY
-from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
 
-START = Noise({"white": 5e-4}, "start")
+START = Noise({"white": UNTOLD}, "start")
 """The noise until it is estimated."""
 STEPS = 12
 """Steps of a fit with the noise that was told, at most: to the end or, on large meshes, to where what is left to gain is spared."""
@@ -99,30 +100,12 @@ def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False
     return data, fitted
 
 
-def fitted_again(
-    data: Data,
-    fitted: FittedModel,
-    noise: Noise,
-    *,
-    known: list[SceneJet] | None = None,
-    near: list[SceneJet] | None = None,
-    spare: float = 0.0,
-) -> FittedModel:
+def fitted_again(data: Data, fitted: FittedModel, noise: Noise, **how: Unpack[FitHow]) -> FittedModel:
     """Return a fitted model fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
-    fit, own = fitted.fit, own_of(fitted)
+    fit, how["own"] = fitted.fit, own_of(fitted)
 
     def refitted(steps: int) -> FittedModel:
-        return fit_model(
-            data,
-            fit.hypothesis,
-            fit.prior,
-            noise,
-            fit.coordinates,
-            own=own,
-            max_iterations=steps,
-            known=known,
-            near=near,
-            spare=spare,
-        )
+        how["max_iterations"] = steps
+        return fit_model(data, fit.hypothesis, fit.prior, noise, fit.coordinates, **how)
 
     return as_far_as_held_out_states_converge(refitted, STEPS)

@@ -1,32 +1,29 @@
-"""Linear meshes: effects are sought with quadratic elements, and at the end it is asked whether these are needed.
+"""Linear meshes: effects are sought with quadratic elements, and at the end it is asked whether the data miss these: linear ones lock, and what is found
+beside them stands for their error as well.
 
-Linear elements lock, which looks like a stiff body, a small Poisson's ratio, or a clamp that does not give: what is found beside them stands for
-their error as well. Whether quadratic elements of the same mesh err less is no question that data have to answer; whether these data show the
-difference is one, and it is asked when everything else is in the model.
-
-Where a recording was computed on the declared mesh, calibration alone shows that: linear elements then leave plainly less than quadratic ones. Effects are
-sought on the declared mesh, which is no worse than it shows itself, and takes a tenth of the time.
+Where calibration shows that a recording was computed on the declared linear elements, effects are sought on these.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
 from femsense.loop.data.representative_states import FEWEST, spread_states
+from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, span_of
-from femsense.loop.fit.noise_components import Noise
+from femsense.loop.fit.joint_fit import FitHow
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.calibration import START, calibrated_on, calibrated_pose
-from femsense.loop.search.refit import FORGONE, beyond
+from femsense.loop.search.refit import beyond
 from femsense.loop.search.screening import Candidate, penalty
 from femsense.loop.search.search_state import Search, no_equilibrium
-from femsense.loop.search.subsampling import representative_cases
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
@@ -86,9 +83,9 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
     """
     candidate = _candidate(names, search.n_effective)
     record = RefitRecord(MESH.name, QUADRATIC, step=1)
-    worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + data.thresholds.evidence) + FORGONE[0])
+    worth = beyond(search.final.fit, candidate.cost + data.thresholds.evidence)
     try:
-        without = _on(data, data.robot_as_declared, search.history[0][1], search.final, search.noise, worth=worth)
+        without = _on(data, data.robot_as_declared, search, worth=worth)
         record = acceptance_test(data, without, candidate, search.final, record, search.noise).record
     except FemsenseError:
         record = replace(record, verdict=PASSES)  # without them it has no equilibrium
@@ -104,12 +101,10 @@ def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
     return Candidate(MESH, QUADRATIC, (), [], [], np.zeros((0, 0)), np.zeros((0, 0)), 1.0, nothing, np.inf, np.inf, cost, nothing)
 
 
-def _on(
-    data: Data, mesh_of: Robot, linear: FittedModel, final: FittedModel, noise: Noise, *, worth: float = np.inf, steps: int = 12
-) -> FittedModel:
-    """Return a model fitted on the mesh of another robot: what calibration may move from where it was on linear elements, effects from where they are.
-    Raises DataError."""
-    fit, robot = final.fit, mesh_of
+def _on(data: Data, mesh_of: Robot, search: Search, **how: Unpack[FitHow]) -> FittedModel:
+    """Return the last model of a search fitted on the mesh of another robot: what calibration may move from where it was on linear elements, effects from
+    where they are. Raises DataError."""
+    fit, linear, robot = search.final.fit, search.history[0][1], mesh_of
     others = tuple((effect, seed) for effect, seed in fit.hypothesis.settled if effect is not MESH)
     for effect, seed in others:
         robot = effect.apply(robot, seed)
@@ -118,18 +113,19 @@ def _on(
         if name in fit.hypothesis.names:
             start[span_of(fit, name)] = linear.fit.coordinates[span_of(linear.fit, name)]
     hypothesis = replace(fit.hypothesis, robot=robot, settled=others)
-    own = fit.fit.theta[: fit.own]
-    return fit_model(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
+    how["own"] = fit.fit.theta[: fit.own]
+    return fit_model(data, hypothesis, fit.prior, search.noise, start, **how)
 
 
 def _refined(data: Data, search: Search, seed: Entry) -> RefitRecord:
     """Return what became of refined linear elements, tried in some states."""
-    cases = representative_cases(data, search.final, search.noise)
+    frames = [spread_states(t, FEWEST)[0] for t in data.train]
+    part = replace(data, train=[t.part(f) for t, f in zip(data.train, frames)], held=[], held_of=[])
+    pairs = zip(data.train, frames, search.final.fit.jets)
+    there = rms_of([jet.residual[np.isin(t.scene.frame, f)] for t, f, jet in pairs])
     try:
-        made = _on(
-            cases.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], cases.fitted, search.noise, steps=ROUGHLY
-        )
-        verdict = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {cases.fitted.fit.chi2:.0f}"
+        left = _on(part, MESH.apply(data.robot_as_declared, seed), search, max_iterations=ROUGHLY).fit.rms
+        verdict = f"in some of the states they leave {1e3 * left:.2f} mm, quadratic ones {1e3 * there:.2f} mm"
     except FemsenseError as error:
         verdict = no_equilibrium(error)
     return RefitRecord(MESH.name, seed, verdict, step=1)

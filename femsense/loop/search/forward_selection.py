@@ -16,19 +16,15 @@ from femsense.loop.fit.fitted_model import (
     own_of,
     problem_of,
 )
-from femsense.loop.fit.joint_fit import JointFit, Prior
+from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, surely_predicts
 from femsense.loop.search.location_search import climbed, lies_on_body, located
-from femsense.loop.search.refit import FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
+from femsense.loop.search.refit import evidence, refit, tried, with_term, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
 from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
-from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 from femsense.loop.thresholds import Effort, Thresholds
-
-BEHIND = "stopped early: in some of the states another one explains more by far"
-"""Verdict on a candidate that is not refitted to all states."""
 
 
 def select_next(
@@ -64,25 +60,17 @@ def _refitted(
     """Return the refits of a shortlist, and what became of each candidate that was refitted: the number of a refit is that of its record."""
     refits: dict[int, Refit] = {}
     records: list[RefitRecord] = []
-    cases = representative_cases(data, fitted, noise)
-    scouts, decides = _scouted(data, cases, listed, noise, say), data.thresholds
-    for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
-        ahead = [r for r in refits.values() if r.record.passes and explains(data, r.fitted)]
-        say(f"refitting with {candidate.effect.name}")
-        record = RefitRecord(candidate.effect.name, candidate.seed)
-        settled = has_settled(data, candidate, ahead)
+    evident = data.thresholds.evidence
+    for candidate in listed:
+        name = candidate.effect.name
+        say(f"refitting with {name}")
+        record = RefitRecord(name, candidate.seed)
+        others = [
+            r.score for r in refits.values() if r.record.passes and r.candidate.effect.name != name
+        ]  # what bends one form bends both
+        wanted = max([evident, *(score - 2.0 * evident for score in others)])
         try:
-            scout, _ = scouts.get(id(candidate), (None, 0.0))
-            lead = max(ahead, key=lambda r: r.score, default=None)
-            behind, begin = _in_some_states(cases, candidate, lead, noise, settled, scout)
-            if behind:
-                records.append(replace(record, verdict=BEHIND))
-                continue
-            others = [
-                r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
-            ]  # what bends one form bends both
-            wanted = max([decides.evidence, *(score - 2.0 * decides.evidence for score in others)])
-            made = refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
+            made = refit(data, fitted, candidate, noise, wanted=wanted)
         except FemsenseError as error:
             records.append(replace(record, verdict=no_equilibrium(error)))
             continue
@@ -94,58 +82,6 @@ def _refitted(
 def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
     """Return records with those of refits in their places."""
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
-
-
-def has_settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
-    """Return whether what a refit ends with is the last word on it: others explain the data, and it has no place or time to move."""
-    effect = candidate.effect
-    return (
-        bool(ahead)
-        and not effect.nearby(data.robot, candidate.seed)
-        and not effect.polish(data.robot, data.control, candidate.seed)
-    )
-
-
-def _scouted(
-    data: Data, cases: RepresentativeCases, listed: Sequence[Candidate], noise: Noise, say: Progress
-) -> dict[int, tuple[JointFit, float]]:
-    """Return how the leading ones of a shortlist fit some of the states, with their dBIC there, each under its `id`; none of them where these do not
-    tell it of all, or spare no time."""
-    best, evident = max(c.score for c in listed), data.thresholds.evidence
-    leading = [c for c in listed if cases.spares and c.score >= data.effort.leading * best]
-    there = [own for c in leading if (own := cases.candidate(c, noise)) is not None]
-    if len(leading) < 2 or len(there) < len(leading):
-        return {}
-    scouts, lead = dict[int, tuple[JointFit, float]](), -np.inf
-    for candidate, own in zip(leading, there):
-        say(f"refitting with {candidate.effect.name} in some states")
-        made = tried(cases.data, cases.fitted, own, noise, max(evident, lead - 2.0 * evident))
-        if made is None:  # where it does not fit, all states decide
-            continue
-        score = evidence(cases.fitted.fit, made.fit) - own.cost
-        scouts[id(candidate)] = made.fit, score
-        lead = max(lead, score) if explains(data, made) else lead
-    return scouts
-
-
-def _in_some_states(
-    cases: RepresentativeCases, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool, scout: JointFit | None
-) -> tuple[bool, JointFit | None]:
-    """Return whether a candidate that is fitted in some of the states, as a scout already or now, stays as far behind another one there as ends a refit,
-    where these spare time; and where that fit ended."""
-    own = cases.candidate(candidate, noise) if cases.spares else None
-    if own is None:
-        return False, None
-    base, wanted = cases.fitted.fit, -np.inf
-    if ahead is not None:
-        leading, evident = cases.of(ahead.fitted.fit, noise), cases.data.thresholds.evidence
-        wanted = max(evident, evidence(base, leading) - ahead.candidate.cost - 2.0 * evident)
-    if scout is None:
-        made = tried(cases.data, cases.fitted, own, noise, wanted, settled=settled)
-        scout = None if made is None else made.fit
-    if scout is None:  # where it does not fit, all states decide
-        return False, None
-    return scout.chi2 > worth_of(base, own, wanted, settled), scout
 
 
 def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
@@ -228,7 +164,7 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
     hypothesis, prior = with_term(fitted.fit, form.effect, form.seed, form.parameters)
     try:
         coordinates = np.concatenate([winner.fitted.fit.coordinates[:split], own])
-        price = (form.cost - winner.candidate.cost + data.thresholds.evidence - FORGONE[0]) / FORGONE[1]
+        price = form.cost - winner.candidate.cost + data.thresholds.evidence
         predicted = linear_gain(winner.fitted.fit, problem_of(data, winner.fitted.fit, noise), form.raw, form.placements)
         if predicted < data.thresholds.hinted * price:
             return None
@@ -240,7 +176,7 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
 
 def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
     """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.promising))
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.evidence))
     chosen: list[Candidate] = []
     for name in names[: effort.refits if first else (effort.refits + 1) // 2]:
         forms = _forms(table, name)

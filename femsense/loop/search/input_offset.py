@@ -6,16 +6,10 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import beyond_mesh
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of
+from femsense.loop.fit.fitted_model import FittedModel, keeping, span_of
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import (
-    discretisation_rms,
-    held_share,
-    moved_by,
-    sure_beyond_mesh,
-)
+from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.refit import evidence
 from femsense.model.effects import OF_INPUTS
 from femsense.model.effects.base import range_units
@@ -54,9 +48,4 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
     if moved >= declared:
         return None
-    better, std_error = sweeps_predicted(data.train, without.fit, fitted.fit)
-    held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
-    decides, expected = data.thresholds, held_share(data) * evidence(without.fit, fitted.fit)
-    sure = sure_beyond_mesh(better, std_error, held, expected, decides)
-    least = decides.above_mesh_if_sure if sure else decides.offsets_above_mesh
-    return without if moved_by(without, fitted) > least * discretisation_rms(data, without) else None
+    return without if moved_by(without, fitted) > data.thresholds.above_mesh * discretisation_rms(data, without) else None

@@ -16,9 +16,8 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without,
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
-from femsense.loop.search.refit import refit_from, tried
+from femsense.loop.search.refit import tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
-from femsense.loop.search.subsampling import representative_cases
 from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
 from femsense.model.robot import Robot
@@ -30,7 +29,9 @@ def located(
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
     evident = data.thresholds.evidence
-    begun = [made, *fitted_at(data, fitted, candidate, made, ends, noise)]
+    others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
+    tries = [tried(data, fitted, other, noise) for other in others]
+    begun = [made, *(one for one in tries if one is not None and one.fit.fit.status != STOPPED_EARLY)]
     moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
         if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * evident:
@@ -40,34 +41,16 @@ def located(
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 
-def fitted_at(
-    data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
-) -> list[FittedModel]:
-    """Return fits of a candidate that begin where climbs end; where some of the states spare time, of those ends only that explain as much as the
-    best in these, with what was `made` from the candidate's own seed among them."""
-    cases = representative_cases(data, fitted, noise)
-    if cases.spares:
-        near = [fit for end in ends if (fit := tried(cases.data, cases.fitted, end, noise)) is not None]
-        least = min([cases.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
-        begins = [one for one in near if one.fit.chi2 < least + 2.0 * data.thresholds.evidence]
-        there = [refit_from(data, fitted, one.fit, noise) for one in begins]
-    else:
-        others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
-        there = [tried(data, fitted, other, noise) for other in others]
-    return [one for one in there if one is not None and one.fit.fit.status != STOPPED_EARLY]
-
-
 def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> list[Candidate]:
     """Return where the best seeds come to, the best first and none of them where it starts, when each goes from neighbour to
-    neighbour: a soft place here and a stiff one there look alike when the modulus is open. Some of the states show the way."""
-    cases = representative_cases(data, fitted, noise)
+    neighbour: a soft place here and a stiff one there look alike when the modulus is open."""
     asked, known = list[Entry](), list[Candidate]()
-    answers: list[Answers] = [{} for _ in cases.data.train]
+    answers: list[Answers] = [{} for _ in data.train]
 
     def at(seeds: Sequence[Entry]) -> list[Candidate]:
         fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
         asked.extend(fresh)
-        known.extend(_screen_seeds(cases.data, cases.fitted, start, fresh, noise, answers) if fresh else [])
+        known.extend(_screen_seeds(data, fitted, start, fresh, noise, answers) if fresh else [])
         return [c for c in known if c.seed in seeds]
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
@@ -91,36 +74,28 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
 
 def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:
     """Return whether two places do the same for the same: a soft one here and a stiff one there may look alike, but do not say the same."""
-    near = np.linalg.norm(a.step - b.step) <= decides.same_step * np.linalg.norm(b.step)
-    return confounding(a, b) >= decides.same_field and bool(near)
+    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= decides.alike
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate, share: float, decides: Thresholds) -> list[float]:
-    """Return by how much the steps of those that explain nearly as much as the best scatter, in so large a share of the data."""
-    less = max(share * decides.evidence, decides.as_good_places * best.gain)
-    steps = [c.step for c in seen if c.gain >= best.gain - less]
+def _scatter(seen: Sequence[Candidate], best: Candidate, decides: Thresholds) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best scatter."""
+    steps = [c.step for c in seen if c.gain >= best.gain - decides.evidence]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
 def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, list[float]]:
     """Return a fitted model whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
     has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
-    its parameters scatters over the seeds that explain as much but for little. Some of the states show which neighbour it may be."""
+    its parameters scatters over the seeds that explain as much but for little."""
     while True:
         *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
-        cases = representative_cases(data, fitted, noise)
-        share = float(np.mean(np.concatenate(cases.rows))) if cases.spares else 1.0
-        asked = (cases.data, cases.fitted) if cases.spares else (data, fitted)
-        around = _seeds_instead(*asked, noise, effect.nearby(data.robot, seed))
+        around = _seeds_instead(data, fitted, noise, effect.nearby(data.robot, seed))
         here = next((c for c in around if c.seed == seed), None)
         if here is None:  # it does nothing to these markers
             return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
-        scatter = _scatter(around, best, share, data.thresholds)
-        if best.gain < here.gain + share * data.thresholds.swap:
-            return fitted, scatter
-        there = _seeds_instead(data, fitted, noise, [best.seed]) if cases.spares else [best]
-        made = _moved(data, fitted, there[0], noise) if there else None
+        scatter = _scatter(around, best, data.thresholds)
+        made = _moved(data, fitted, best, noise) if best.gain >= here.gain + data.thresholds.swap else None
         if made is None or made.fit.chi2 > fitted.fit.chi2 - data.thresholds.swap:
             return fitted, scatter
         fitted = made
@@ -198,5 +173,5 @@ def lies_on_body(
         if p.unit == "m" and isinstance(p.part, int):
             places.setdefault(p.key, []).append(p.value(float(v)))
     points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
-    most = decides.beside_body * robot.body.reach
+    most = decides.resolved * robot.body.reach
     return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= most).all())

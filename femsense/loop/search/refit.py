@@ -11,18 +11,13 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
-from femsense.loop.fit.joint_fit import JointFit, Prior
+from femsense.loop.fit.joint_fit import FitHow, JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
 from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
-
-LEFT = 0.5
-"""What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
-FORGONE = 2.0, 1.25
-"""A refit is stopped early where the evidence in sight is too little by this much and this factor."""
 
 
 def evidence(before: JointFit, after: JointFit) -> float:
@@ -50,14 +45,10 @@ def refit(
     noise: Noise,
     *,
     wanted: float | None = None,
-    settled: bool = False,
-    begin: JointFit | None = None,
 ) -> FittedModel:
-    """Joint fit with one more effect, started where a fit to some of the states ended (`begin`),
-    else from its linear step. Raises DataError where no start helps.
+    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
 
-    Where the dBIC would stay well below what is wanted (by default `Thresholds.evidence`), or below it at all if it is `settled`,
-    the fit is stopped early on its way.
+    Where the dBIC would stay below what is wanted (by default `Thresholds.evidence`), the fit is stopped early on its way.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
@@ -66,7 +57,7 @@ def refit(
     directed = known_length(candidate.parameters) is not None
     free = not candidate.effect.discrete and not directed  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    worth = worth_of(fitted.fit, candidate, data.thresholds.evidence if wanted is None else wanted, settled)
+    worth = within(fitted.fit, candidate.cost + (data.thresholds.evidence if wanted is None else wanted))
     if adds_history(fitted.fit, candidate, start):
         worth = np.inf
 
@@ -77,24 +68,11 @@ def refit(
         try:
             theta = _declared(data, fitted, hypothesis, noise) if share is None else fitted.fit.fit.theta + share * answer
             coordinates = np.concatenate([theta[fitted.fit.own :], null + part * (start - null)])
-            return fit_model(
-                data,
-                hypothesis,
-                prior,
-                noise,
-                coordinates,
-                own=theta[: fitted.fit.own],
-                max_iterations=10,
-                known=known,
-                near=near,
-                worth=worth,
-            )
+            how = FitHow(own=theta[: fitted.fit.own], max_iterations=10, known=known, near=near, worth=worth)
+            return fit_model(data, hypothesis, prior, noise, coordinates, **how)
         except DataError:
             return None
 
-    going_on = None if begin is None else refit_from(data, fitted, begin, noise, worth)
-    if going_on is not None:
-        return going_on
     for share in _shares(candidate, free):
         made = started_at(share)
         if made is not None and (made.fit.fit.status == STOPPED_EARLY or made.fit.chi2 <= fitted.fit.chi2 + 1.0):
@@ -112,40 +90,12 @@ def adds_history(fit: JointFit, candidate: Candidate, values: FloatArray) -> boo
     return has_history(Hypothesis(fitted, (term,)).robot_at(values)) and not has_history(fitted)
 
 
-def refit_from(data: Data, fitted: FittedModel, begin: JointFit, noise: Noise, worth: float = np.inf) -> FittedModel | None:
-    """Return the fit to all states of a hypothesis that was fitted to some of them, from where that ended; None where it has no equilibrium, or does
-    not help."""
-    coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
-    for trial, jet in zip(data.train, begin.jets):
-        trial.starts_on(begin.hypothesis.robot.body.mesh).update(jet.states)
-    try:
-        made = fit_model(
-            data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth, spare=LEFT
-        )
-    except DataError:
-        return None
-    return made if made.fit.chi2 <= fitted.fit.chi2 + 1.0 else None
-
-
-def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
-    """Return the χ² above which a refit of a candidate is stopped early: its dBIC is wanted to be so much."""
-    return within(fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
-
-
 def _shares(candidate: Candidate, free: bool) -> tuple[float | None, ...]:
     """Return the shares of the linear step from which a refit may start, in order: that step may go too far. None: from what is declared, where a
     discrete alternative does not fit from where calibration has gone without it."""
     if candidate.effect.discrete:
         return (1.0, None) if candidate.gain < np.inf else (None, 1.0)
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
-
-
-def explains(data: Data, fitted: FittedModel | None) -> bool:
-    """Return whether a model leaves little more than the noise where it is fitted."""
-    if fitted is None:
-        return False
-    freedom = max(len(fitted.fit.fit.residual) - len(fitted.fit.fit.theta), 1)
-    return fitted.fit.chi2 < data.thresholds.explains * freedom
 
 
 def _declared(data: Data, fitted: FittedModel, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
@@ -179,18 +129,9 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
     return np.asarray(start)
 
 
-def tried(
-    data: Data,
-    fitted: FittedModel,
-    candidate: Candidate,
-    noise: Noise,
-    wanted: float | None = None,
-    *,
-    settled: bool = False,
-    begin: JointFit | None = None,
-) -> FittedModel | None:
+def tried(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise, wanted: float | None = None) -> FittedModel | None:
     """Return a refit, or None where there is none."""
     try:
-        return refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
+        return refit(data, fitted, candidate, noise, wanted=wanted)
     except FemsenseError:
         return None

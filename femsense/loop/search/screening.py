@@ -18,7 +18,7 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import spans_of
 from femsense.loop.fit.fitted_model import FittedModel, problem_of
 from femsense.loop.fit.joint_fit import JointFit, JointProblem
-from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
+from femsense.loop.fit.noise_components import UNTOLD, Noise, estimate_noise, whiten
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import Effect, Entry, Parameter
@@ -245,7 +245,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
                 [groups[i] for i in which],
             )
             most = {"marker": data.placement_std} if fields is None and not clouds else {}
-            noise = noise.joined(estimate_noise(*picked, known, data.thresholds.white_share, most), clouds)
+            noise = noise.joined(estimate_noise(*picked, known, most), clouds)
     return noise, float(sum(g.observations for g in groups))
 
 
@@ -254,8 +254,8 @@ def _explained(data: Data, fitted: FittedModel, fields: Fields | None) -> list[F
     shapes = [jet.residual.shape for jet in fitted.fit.jets]
     if fields is None:
         return [np.zeros((*shape, 0)) for shape in shapes]
-    table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    apart = _apart(table, data.thresholds.apart)
+    table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": UNTOLD}, "")), fields, 100.0)
+    apart = _apart(table, data.thresholds.significant)
     chosen = (*apart, *(c for c in one_each(table) if not c.effect.places_markers))
     return [np.concatenate([np.zeros((*shape, 0)), *(c.raw[i] for c in chosen)], axis=2) for i, shape in enumerate(shapes)]
 

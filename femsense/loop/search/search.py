@@ -8,7 +8,7 @@ from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, mean_square, weighed
+from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import RefitRecord
@@ -18,7 +18,6 @@ from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import hinted, select_next
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
-from femsense.loop.search.subsampling import spares
 from femsense.loop.search.swaps import instead_of_offsets, swapped
 from femsense.model.recording import state_key
 
@@ -106,7 +105,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
         return
     course.earlier = data
     winner = next_one.fitted
-    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(data, fitted, winner)
+    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
     history = [*history, (next_one.candidate.effect.name, winner)]
     history, refits = swapped(data, history, refits, noise, n_effective, say)
     last = history[-1][1]
@@ -122,17 +121,8 @@ def _screened(
     fields = _fields(data, fitted, before, names)
     told, n_effective = noise_of(data, fitted, fields, noise)
     noise = noise if noise is not None and holds_error else told
-    fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets, spare=spared_gain(data, fitted, fields, noise, n_effective))
+    fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets)
     return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
-
-
-def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n_effective: float) -> float:
-    """Return what a fitted model need not gain any more before effects are tried on top of it, since the predicted gain of one of
-    these is so much larger; nothing where all states are little work."""
-    if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
-        return 0.0
-    fit = weighed(data, fitted.fit, noise, fitted.fit.jets)
-    return data.effort.settles * max((c.gain for c in screen_model(data, fit, noise, fields, n_effective)), default=0.0)
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:

@@ -28,25 +28,16 @@ from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, no_equilibrium
 from femsense.model.drive import has_history
 
-MOST_WORK = 30_000
-"""Tetrahedra × states of a recording in which effects are sought …"""
-FEWEST = 16
-"""… but so many states at least."""
 SPARED = 0.5
 """They are no more than this share of all, or effects are sought in all at once."""
 
 
-def some_states(data: Data, *, most_work: int = MOST_WORK) -> Data | None:
-    """Return the data with some states of each recording, fitted and held out, which differ as much as they can; None where that spares little, where a
-    state depends on those before, and where there are clouds, whose rows go by frames already.
-
-    Arguments:
-        data: the data.
-        most_work: so many tetrahedra × states of a recording are looked at, but FEWEST states at least.
-    """
+def some_states(data: Data) -> Data | None:
+    """Return the data with some states of each recording, fitted and held out, which differ as much as they can (`Effort.work`, but FEWEST states at
+    least); None where that spares little, where a state depends on those before, and where there are clouds, whose rows go by frames already."""
     if "clouds" in data.measured or has_history(data.robot):
         return None
-    most = max(FEWEST, most_work // len(data.robot.body.mesh.tets))
+    most = data.effort.work // len(data.robot.body.mesh.tets)
     train, held = ([spread_states(t, most) for t in trials] for trials in (data.train, data.held))
     if float(np.mean([share for _, share in train])) > SPARED:
         return None

@@ -1,10 +1,6 @@
 """What is named is asked again: of each effect, when another one was found, whether it is still needed, and whether another one, or it itself elsewhere,
-is better in its place; of the input offsets, at the end, what explains better what they took.
-
-What is named first is chosen while the others are still missing, and may have won by what it took of theirs: a tilted gravity instead
-of a payload as long as a scale of depth is missing, say, or a soft region in the wrong place as long as friction is. The offsets are fitted along with
-everything, so that an effect competes with them only for what they leave: a camera whose distances are off, a load or a weight can look much like
-a wrong offset. So the model is fitted without, and effects are asked what they explain in that place.
+is better in its place; of the input offsets, at the end, what explains better what they took. What is named first, or fitted along with everything, may have
+won by what it took of what was still missing.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import leaders, shortlist
 from femsense.loop.search.input_offset import OFFSETS, evidence_for_offsets, offsets_are_evident
 from femsense.loop.search.location_search import closer, may_lie_elsewhere
-from femsense.loop.search.refit import FORGONE, beyond, evidence, refit
+from femsense.loop.search.refit import beyond, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit, at_step
 
@@ -74,7 +70,7 @@ def _if_needless(
     price = count * float(np.log(n_effective))
     others = [n for n in fitted.fit.hypothesis.names if n != name]
     try:
-        without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, FORGONE[1] * price + FORGONE[0]))
+        without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, price))
     except FemsenseError:
         return None
     if evidence(without.fit, fitted.fit) > price:

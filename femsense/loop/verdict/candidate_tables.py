@@ -96,7 +96,7 @@ def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> floa
 
 def confounding_map(first: list[Candidate], decides: Thresholds) -> ConfoundingMap:
     """Return how much of each effect's field (row) is collinear with that of another one (column), nuisance projected out."""
-    shown = [c for c in one_each(first) if c.retained >= decides.testable and c.columns.shape[1] <= decides.many_numbers][:MAP]
+    shown = [c for c in one_each(first) if c.retained >= decides.testable][:MAP]
     bases = [np.linalg.qr(c.columns / np.maximum(np.linalg.norm(c.columns, axis=0), 1e-300))[0] for c in shown]
     fields = [c.columns @ c.step if np.linalg.norm(c.columns @ c.step) > 0 else c.columns[:, 0] for c in shown]
     share = tuple(tuple(float(np.linalg.norm(Q.T @ f) / max(float(np.linalg.norm(f)), 1e-300)) for Q in bases) for f in fields)

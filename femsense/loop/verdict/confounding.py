@@ -16,13 +16,13 @@ from femsense.loop.thresholds import Thresholds
 
 
 def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
-    """Return pairs that these data cannot distinguish, those of what is named first."""
+    """Return pairs that these data cannot distinguish: what is named, and what might be in its place."""
     found: dict[frozenset[str], ConfoundedPair] = {}
     asked = _as_evident, _absorbed, _in_common, _alike
     for pair in (pair for ask in asked for pair in ask(search, names, decides)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
-    return sorted(found.values(), key=lambda pair: not set(pair.pair) & set(names))
+    return list(found.values())
 
 
 def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
@@ -115,27 +115,21 @@ def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterat
 
 
 def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose fields agree, once what calibration may move is projected out."""
-    for effect in (c.effect for c in one_each(search.first)):  # play is a negative offset of the displacement
-        for alias in effect.aliases:
-            if effect.mirrors(alias.name) and {alias.name, effect.name} & set(names):
-                yield ConfoundedPair((alias.name, effect.name), cosine=1.0)
-    ones = [c for c in one_each(search.first) if c.retained >= decides.testable and len(c.parameters) <= decides.many_numbers]
-    for i, a in enumerate(ones):
-        for b in ones[i + 1 :]:
+    """Yield the effects whose fields agree with that of a named one, once what calibration may move is projected out: those that explain more than they
+    cost, and that no refits distinguish."""
+    ones = [c for c in one_each(search.first) if c.retained >= decides.testable]
+    for a in (c for c in ones if c.effect.name in names):
+        for b in (c for c in ones if c is not a and c.score > 0.0):
             share = min(confounding(a, b), confounding(b, a))
-            pair = a.effect.name, b.effect.name
-            least, most = sorted((a.gain, b.gain))
-            apart = least < decides.next_to_nothing * most and most > decides.evidence
-            if share > decides.alike and not (apart or any(_is_refuted(search, names, *p, decides) for p in (pair, pair[::-1]))):
-                yield ConfoundedPair(pair, cosine=share)
+            if share > decides.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, decides):
+                yield ConfoundedPair((a.effect.name, b.effect.name), cosine=share)
 
 
-def _is_refuted(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
-    """Return whether refits of another effect in the place of a named one brought much less."""
+def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
+    """Return whether refits of another effect in the place of a named one brought less by `evidence`."""
     for named in (r for r in _named(search, names) if r.name == own and r.is_named):
         there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
         tried = [dbic for dbic in there if np.isfinite(dbic)]  # one that was stopped early has none
-        if tried and max(tried) < decides.refuted * named.evidence:
+        if tried and max(tried) <= named.evidence - decides.evidence:
             return True
     return False

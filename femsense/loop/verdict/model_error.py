@@ -43,7 +43,7 @@ def excess_of(
     data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise, measured: Repeatability
 ) -> Excess:
     """Return what models leave: `before`, with all that was found (`final`), and that is handed back (`back`)."""
-    believed = measured.total if measured.known else min(measured.total, data.thresholds.likely_noise * data.robot.body.reach)
+    believed = measured.total if measured.known else min(measured.total, data.thresholds.resolved * data.robot.body.reach)
     floor = float(np.hypot(believed, placement_rms(data, noise)))
     fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
     held = [beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]

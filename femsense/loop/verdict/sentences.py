@@ -15,30 +15,29 @@ from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
 from femsense.loop.result.records import ModelError, NamedEffect, Value
 from femsense.loop.search.search_state import Search
+from femsense.loop.thresholds import DEFAULTS, Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
 ROUNDED = 1e-6
-"""What is so small beside the largest component of a vector is said as 0."""
-
-
-BEYOND_NOISE = 1.2
-"""Held-out errors that are so many times the noise need another reason."""
-
-
-GROSS = 0.03
-"""Noise of more than this share of the body's reach is said to be suspicious."""
+"""What is so small beside the largest component of a vector, or beside its standard deviation, is said as 0."""
 
 
 def verdict_in_words(
-    verdict: str, effects: Sequence[NamedEffect], found: list[str], before: FittedModel, after: FittedModel, budget: ModelError
+    verdict: str,
+    effects: Sequence[NamedEffect],
+    found: list[str],
+    before: FittedModel,
+    after: FittedModel,
+    budget: ModelError,
+    decides: Thresholds = DEFAULTS,
 ) -> str:
     """Return the sentence on top: the verdict, the held-out error, and how much of that is an error of the model."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= BEYOND_NOISE * np.hypot(known, mesh):
+    if verdict == NONE and before.held_rms <= decides.noisy * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        own = finer if mesh and before.held_rms > BEYOND_NOISE * known else ""
+        own = finer if mesh and before.held_rms > decides.noisy * known else ""
         return f"The model explains the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
     of_it = f"of it {1e3 * budget.held_out_m:.2f} mm is an error of the model, {_noise_in_words(budget)} noise"
     if verdict == NONE:
@@ -112,8 +111,8 @@ def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:
 
 def by_noise(data: Data, measured: Repeatability) -> str:
     """Return in words that what a state repeats to is beyond what cameras have; nothing where it is not."""
-    reach = data.robot.body.reach
-    if measured.total < GROSS * reach:
+    reach, decides = data.robot.body.reach, data.thresholds
+    if measured.total < decides.significant * decides.resolved * reach:
         return ""
     return (
         f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."

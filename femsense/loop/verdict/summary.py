@@ -34,7 +34,7 @@ from femsense.loop.search.screening import Candidate, one_each
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.candidate_tables import KINDS, own_size
-from femsense.loop.verdict.sentences import mesh_error_rms
+from femsense.loop.verdict.sentences import ROUNDED, mesh_error_rms
 from femsense.model.effects.base import absent_elsewhere, placed
 
 DRAWS = 2000
@@ -71,7 +71,8 @@ def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise
 def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> dict[str, Value]:
     """Return the values of one effect; vectors and tables keep their shape. What was not fitted has std None.
 
-    Values are those that are handed back; standard deviations are not smaller than those of the full fit, in which nothing was held still.
+    Values are those that are handed back, none where a fit moved them by next to nothing; standard deviations are not smaller than those of the full
+    fit, in which nothing was held still.
     """
     result = dict[str, Value]()
     for effect, seed in back.fit.hypothesis.settled:
@@ -90,7 +91,8 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
         for p in absent_elsewhere(parameters):
             known = result.get(p.key, Value(None, None, p.unit))
             result[p.key] = Value(placed(known.value, p.part, p.value(p.null)), placed(known.std, p.part, None), known.unit)
-        for p, value, deviation in zip(parameters, values, std):
+        for p, fitted, deviation in zip(parameters, values, std):
+            value = p.null if abs(fitted - p.null) <= ROUNDED * deviation else fitted
             known = result.get(p.key, Value(None, None, p.unit))
             own = placed(known.value, p.part, _finite(p.value(value)))
             result[p.key] = Value(own, placed(known.std, p.part, _finite(p.value_std(value, deviation))), known.unit)

@@ -83,7 +83,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     budget = model_error(data, excess, noise, measured)
     return LoopResult(
         verdict=verdict,
-        sentence=verdict_in_words(verdict, effects, found, before, back, budget)
+        sentence=verdict_in_words(verdict, effects, found, before, back, budget, data.thresholds)
         + in_words(pairs, names)
         + by_noise(data, measured)
         + by_mesh(data, search, back)

@@ -210,10 +210,6 @@ class Effect:
     sought_by_recording: bool = True
     """Whether it is sought so; else it only is if robot.toml declares it."""
 
-    def mirrors(self, name: str) -> bool:
-        """Return whether it is the mirror image of another effect."""
-        return any(alias.name == name and not alias.common for alias in self.aliases)
-
 
 def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLength] | None:
     """Return which coordinates are the components of a vector of known length, shape (p,), and that length;

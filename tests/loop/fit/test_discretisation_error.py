@@ -105,14 +105,14 @@ def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
     "name, size, alike",
     [
         ("cable_friction", 0.01, True),
-        ("cable_friction", 0.3, False),
+        ("cable_friction", 0.3, True),
         ("depth_scale", 1.03, True),
         ("gravity", 1.0, False),
         ("poisson", 0.4, False),
         ("base_compliance", 1e5, False),
     ],
 )
-def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere(name: str, size: float, alike: bool):
+def test_the_mesh_errs_in_another_way_where_the_body_is_another(name: str, size: float, alike: bool):
     robot = arm((4, 1, 1))
     recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=robot)
     noise, data = Noise({"white": 1e-4}, ""), prepare(robot, [recording], [])
@@ -125,7 +125,7 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewher
     after = fit_model(
         data, Hypothesis(data.robot, (*hypothesis.terms, (effect, {}, own))), wider, noise, coordinates, max_iterations=0
     )
-    assert errs_alike(data, before, after) == alike
+    assert errs_alike(before, after) == alike
 
 
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():

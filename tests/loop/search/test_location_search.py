@@ -13,19 +13,16 @@ from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.representative_states import FEWEST, spread_states
 from femsense.loop.data.trial import rms_of
-from femsense.loop.fit.discretisation_error import with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, held_chi2, own_of, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.effect_fields import effect_fields, fields_of, part_that_tells
-from femsense.loop.search.forward_selection import has_settled, select_next
-from femsense.loop.search.location_search import climbed, closer, fitted_at, located, may_lie_elsewhere, same_place, without_term
-from femsense.loop.search.refit import evidence, refit, refit_from
+from femsense.loop.search.forward_selection import select_next
+from femsense.loop.search.location_search import climbed, located, may_lie_elsewhere, same_place, without_term
+from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import Candidate, screen, screen_model
-from femsense.loop.search.search_state import Refit
-from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import apply_effects, find_effect
@@ -59,93 +56,8 @@ def off(candidate: Candidate) -> float:
     return float(np.linalg.norm(np.subtract(candidate.seed["point_m"], HIDDEN[0]["point_m"])))
 
 
-@pytest.fixture
-def toilsome(started: tuple[Data, FittedModel]) -> tuple[Data, FittedModel]:
-    """The same, as if all states were too much work."""
-    data, fitted = started
-    return replace(data, effort=replace(EFFORT, work=FEWEST * len(data.robot.body.mesh.tets))), fitted
-
-
-@pytest.fixture
-def some(toilsome: tuple[Data, FittedModel]) -> RepresentativeCases:
-    """Some of the states, of data with an error of the mesh."""
-    data, fitted = toilsome
-    return representative_cases(with_mesh_errors(data, fitted, []), fitted, NOISE)
-
-
-def test_some_states_of_a_fit_are_what_a_fit_to_these_begins_with(started: tuple[Data, FittedModel], some: RepresentativeCases):
-    fit, fitted = some.fitted.fit, started[1]
-    assert some.spares and some.data.train[0].mesh_error is not None and not some.data.held
-    residual, jacobian = problem_of(some.data, fit, NOISE).evaluate(fitted.fit.fit.theta, True)
-    assert jacobian is not None and len(residual) < 0.6 * len(fitted.fit.fit.residual)
-    np.testing.assert_allclose(fit.fit.residual, residual, atol=1e-4)
-    np.testing.assert_allclose(fit.fit.jacobian, jacobian, atol=1e-3 * np.abs(jacobian).max())
-    assert fit.chi2 == pytest.approx(residual @ residual, rel=1e-4)
-    assert some.of(fitted.fit, NOISE).chi2 == fit.chi2
-
-
-def test_where_all_states_are_little_work_none_is_left_out(started: tuple[Data, FittedModel]):
-    data, fitted = started
-    every = representative_cases(data, fitted, NOISE)
-    assert every.fitted is fitted and all(rows.all() for rows in every.rows) and not every.spares
-
-
-def test_a_candidate_is_the_same_to_some_states(started: tuple[Data, FittedModel], some: RepresentativeCases):
-    data, fitted = started
-    one = payloads(data, fitted)[0]
-    own = some.candidate(one, NOISE)
-    fields = effect_fields(some.fitted.fit, some.data.train, [(one.effect, one.seed, one.parameters)])
-    expected = screen(some.fitted.fit, problem_of(some.data, some.fitted.fit, NOISE), fields, COUNT)[0]
-    assert own is not None and own.cost == one.cost and own.gain == pytest.approx(expected.gain, rel=1e-4) and own.gain < one.gain
-    np.testing.assert_allclose(own.step, expected.step, rtol=1e-3)
-    rubbing = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_friction"]), COUNT)[0]
-    assert some.candidate(replace(rubbing, step=np.array([0.1])), NOISE) is None  # its states need those before
-
-
-IN_SOME = "stopped early: in some of the states"
-
-
-def searched(
-    started: tuple[Data, FittedModel], *names: str, alike: bool = False, each: int = 1
-) -> tuple[list[str], list[RefitRecord]]:
-    """Return what growth says that it refits of a shortlist, whose scores may be alike, and its records; what is left explains the data."""
-    data, fitted = started
-    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, promising=-1e9))
-    table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
-    listed = [c for n in names for c in [c for c in table if c.effect.name == n][: each if n == "payload" else 1]]
-    said = list[str]()
-    winner, records = select_next(data, fitted, [replace(c, score=100.0) if alike else c for c in listed], NOISE, said.append)
-    assert winner is not None and winner.candidate.effect.name == "payload" and "refitting with payload" in said
-    return [text for text in said if text.startswith("refitting")], records
-
-
-def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(toilsome: tuple[Data, FittedModel]):
-    _, records = searched(toilsome, "payload", "cable_gain", "poisson")
-    assert [r.name for r in records] == ["payload", "cable_gain", "poisson"]
-    assert all(r.verdict.startswith(IN_SOME) for r in records[1:])
-
-
-def test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_explains_in_some(
-    toilsome: tuple[Data, FittedModel],
-):
-    said, records = searched(toilsome, "cable_gain", "payload", alike=True)
-    assert said[:3] == [
-        "refitting with cable_gain in some states",
-        "refitting with payload in some states",
-        "refitting with payload",
-    ]
-    assert [r.name for r in records] == ["payload", "cable_gain"] and records[1].verdict.startswith(IN_SOME)
-
-
-def test_rivals_are_fitted_to_all_states_where_these_are_little_work(started: tuple[Data, FittedModel]):
-    said, records = searched(started, "payload", "cable_gain", "poisson")
-    assert said == [f"refitting with {name}" for name in ("payload", "cable_gain", "poisson")]
-    assert not any("some of the states" in r.verdict for r in records)
-
-
 def test_another_form_of_an_effect_is_held_against_other_effects_alone(started: tuple[Data, FittedModel]):
     data, fitted = started
-    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, promising=-1e9))
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["payload", "cable_gain"]), COUNT)
     one, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
     forms = [replace(one, score=100.0), replace(one, effect=replace(one.effect), score=100.0), replace(gain, score=50.0)]
@@ -192,39 +104,10 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(started
     where = best.fit.hypothesis.terms[-1][1]["point_m"]
     assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
     still = replace(data, effort=replace(EFFORT, rounds=0))  # climbs end where they begin
-    for same_field, same_step, count in ((2.0, 0.0, 2), (-1.0, np.inf, 1)):
-        own = replace(still, thresholds=replace(DEFAULTS, same_field=same_field, same_step=same_step))
+    for alike, count in ((2.0, 2), (-1.0, 1)):
+        own = replace(still, thresholds=replace(DEFAULTS, alike=alike))
         climbs = climbed(own, fitted, far, NOISE)
-        assert len(climbs) == count and len(fitted_at(own, fitted, far, begun, climbs, NOISE)) <= count
-
-
-def test_a_refit_begins_where_one_to_some_of_the_states_ended(started: tuple[Data, FittedModel], some: RepresentativeCases):
-    data, fitted = started
-    one = payloads(data, fitted)[0]
-    own = some.candidate(one, NOISE)
-    assert own is not None
-    near, plain = refit(some.data, some.fitted, own, NOISE), refit(data, fitted, one, NOISE)
-    made = refit(data, fitted, one, NOISE, begin=near.fit)
-    hypothesis, prior = near.fit.hypothesis, near.fit.prior
-    there = fit_model(data, hypothesis, prior, NOISE, near.fit.coordinates, own=own_of(near), max_iterations=0)
-    assert made.fit.fit.cost[0] == pytest.approx(there.fit.chi2, rel=0.01)
-    assert made.fit.fit.cost[0] < 0.5 * plain.fit.fit.cost[0]
-    assert made.fit.chi2 == pytest.approx(plain.fit.chi2, abs=1.0)
-
-
-def test_a_fit_to_all_states_starts_from_those_of_the_fit_to_some(started: tuple[Data, FittedModel], some: RepresentativeCases):
-    data, fitted = started
-    one = payloads(data, fitted)[0]
-    own = some.candidate(one, NOISE)
-    assert own is not None
-    near = refit(some.data, some.fitted, own, NOISE).fit
-    refit(data, fitted, one, NOISE)  # what else was tried has left its states since then
-    theta = np.array(near.fit.theta)
-    theta[near.own] = np.log(1e-3)  # a modulus with which nothing stands: it ends where it began
-    fallen = replace(near, fit=replace(near.fit, theta=theta))
-    assert refit_from(data, fitted, fallen, NOISE) is None
-    starts = data.train[0].starts_on(near.hypothesis.robot.body.mesh)
-    assert near.jets[0].states and all(starts[k].positions is s.positions for k, s in near.jets[0].states.items())
+        assert len(climbs) == count
 
 
 def test_places_are_alike_if_they_do_the_same_for_the_same(started: tuple[Data, FittedModel]):
@@ -256,20 +139,15 @@ def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is()
     assert not any("in the place" in text for text in said)
 
 
-def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(started: tuple[Data, FittedModel]):
+def test_a_refit_is_given_up_where_a_rival_explains_more(started: tuple[Data, FittedModel]):
     data, fitted = started
-    table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain", "creep", "payload"]), COUNT)
-    first = {name: next(c for c in table if c.effect.name == name) for name in ("cable_gain", "creep", "payload")}
-    one = first["payload"]
+    one = payloads(data, fitted)[0]
     made = refit(data, fitted, one, NOISE)
     score = evidence(fitted.fit, made.fit) - one.cost
     assert score > 100.0 and made.fit.fit.status != STOPPED_EARLY
-    for settled in (True, False):
-        rival = refit(data, fitted, one, NOISE, wanted=1.1 * score, settled=settled)
-        assert (rival.fit.fit.status == STOPPED_EARLY) == settled
-    ahead = [Refit(one, made, 0.0, RECORD)]
-    assert [has_settled(data, first[name], ahead) for name in first] == [True, False, False]
-    assert not has_settled(data, first["cable_gain"], [])
+    for share, stops in ((1.1, True), (0.9, False)):
+        rival = refit(data, fitted, one, NOISE, wanted=share * score)
+        assert (rival.fit.fit.status == STOPPED_EARLY) == stops
 
 
 @pytest.mark.parametrize("needless", [True, False])
@@ -307,29 +185,6 @@ def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, 
     )
 
 
-def test_where_a_climb_ends_a_fit_to_all_states_is_made_if_some_of_them_are_for_it(toilsome: tuple[Data, FittedModel]):
-    data, fitted = toilsome
-    far = max(payloads(data, fitted)[:6], key=off)
-    begun, climbs = refit(data, fitted, far, NOISE), climbed(data, fitted, far, NOISE)
-    best, _ = located(data, fitted, far, begun, climbs, NOISE)
-    assert np.linalg.norm(np.subtract(best.fit.hypothesis.terms[-1][1]["point_m"], HIDDEN[0]["point_m"])) < 0.004
-    assert len(best.fit.fit.residual) == len(begun.fit.fit.residual)
-    there = fitted_at(data, fitted, far, begun, climbs, NOISE)
-    assert there and all(len(one.fit.fit.residual) == len(begun.fit.fit.residual) for one in there)
-    own = representative_cases(data, fitted, NOISE).candidate(far, NOISE)
-    assert own is not None and not fitted_at(data, fitted, far, best, [own], NOISE)  # what was made explains more by far
-
-
-def test_a_place_moves_on_as_some_of_the_states_have_it(toilsome: tuple[Data, FittedModel]):
-    data, fitted = toilsome
-    made = refit(data, fitted, payloads(data, fitted)[0], NOISE)
-    moved, scatter = closer(data, made, NOISE)
-    begun, end = (np.array(m.fit.hypothesis.terms[-1][1]["point_m"]) for m in (made, moved))
-    assert np.linalg.norm(end - HIDDEN[0]["point_m"]) < 0.6 * np.linalg.norm(begun - HIDDEN[0]["point_m"])
-    assert moved.fit.chi2 < 0.75 * made.fit.chi2 and len(moved.fit.fit.residual) == len(made.fit.fit.residual)
-    assert len(scatter) == 3 and all(0.0 < s < 0.3 for s in scatter)
-
-
 def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedModel]):
     data, fitted = started
     law = next(f for f in data.forms if f.name == "hyperelastic" and f.discrete)
@@ -338,7 +193,7 @@ def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedMo
     less = replace(EFFORT, work=FEWEST * len(data.robot.body.mesh.tets))
     whole, between = (effect_fields(fitted.fit, data.train, todo, effort=e).raw[0][:, :, 0] for e in (EFFORT, less))
     part = part_that_tells(data.train[0], data.robot, less)
-    assert len(part.scene.frames) < 0.6 * len(data.train[0].scene.frames)
+    assert len(part.scene.frames) < 0.7 * len(data.train[0].scene.frames)
     assert 0.0 < rms_of([between - whole]) < 0.25 * rms_of([whole])
     exact = np.isin(data.train[0].scene.frame, spread_states(data.train[0], FEWEST)[0])
     assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
@@ -352,7 +207,8 @@ def test_held_out_data_that_speak_against_an_effect_count(started: tuple[Data, F
     one = payloads(data, fitted)[0]
     made = refit(data, fitted, one, NOISE)
     expensive = replace(one, cost=evidence(fitted.fit, made.fit) - score)
-    better = held_chi2(data, fitted, NOISE) - held_chi2(data, made, NOISE)
-    against = replace(data, thresholds=replace(DEFAULTS, held_counts=-5.0 / better))  # as if χ² rose by 5
-    verdict = acceptance_test(against, fitted, expensive, made, RECORD, NOISE).record.verdict
+    rise = np.sqrt(1.0 + 5.0 / held_chi2(data, fitted, NOISE))  # χ² rises by 5
+    worse = [replace(h, jet=replace(h.jet, residual=rise * h.jet.residual)) for h in fitted.held]
+    lenient = replace(data, thresholds=replace(DEFAULTS, held_gain=-1e9))
+    verdict = acceptance_test(lenient, fitted, expensive, replace(made, held=worse), RECORD, NOISE).record.verdict
     assert verdict == "passes" if passes else "held-out data speak against it" in verdict

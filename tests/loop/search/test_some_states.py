@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,10 +11,11 @@ from arm import arm, record, sweeps
 
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data, prepare
+from femsense.loop.data.representative_states import FEWEST
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.search import search_begun, search_effects
 from femsense.loop.search.search_state import Search, SearchProgress
-from femsense.loop.search.some_states import FEWEST, in_all_states, some_states
+from femsense.loop.search.some_states import in_all_states, some_states
 
 GAIN = ({"name": "cable_gain", "scale": {"up": 0.8}},)
 
@@ -31,7 +33,8 @@ def measured(hidden: bool) -> Data:
 @cache
 def sought() -> tuple[Data, SearchProgress, Search]:
     """Return some states of a recording with a gain, and the search in them at its end."""
-    some = some_states(measured(True), most_work=0)
+    every = measured(True)
+    some = some_states(replace(every, effort=replace(every.effort, work=0)))
     assert some is not None
     data, before, start = calibrated(some, lambda text: None)
     data = with_discretisation_error(data, start[-1][1], ["cable_gain"], lambda text: None)

@@ -14,13 +14,12 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, w
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, surely_predicts
-from femsense.loop.search.calibration import fitted_again
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
 from femsense.loop.search.location_search import closer, without_last
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
-from femsense.loop.search.search import scored, spared_gain
+from femsense.loop.search.search import scored
 from femsense.loop.search.search_state import Refit
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
@@ -29,9 +28,7 @@ from femsense.model.effects import find_effect
 RECORD = RefitRecord("", {})
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
-LENIENT = replace(
-    DEFAULTS, sweeps_for=-np.inf, held_gain=-1e9, held_counts=0.0, above_mesh=0.0, above_mesh_if_sure=0.0, plainly_worse=np.inf
-)
+LENIENT = replace(DEFAULTS, sweeps_for=-np.inf, held_gain=-1e9, above_mesh=0.0, plainly_worse=np.inf)
 """Evidence alone."""
 HIDDEN = [
     {"name": "payload", "point_m": [0.05, 0.0, 0.01], "force_n": [0.06, 0.15, 0.12]},
@@ -137,7 +134,7 @@ def test_fields_are_computed_anew_where_those_of_the_model_before_promise_someth
     fitted, _ = added(data, base, "cable_gain" if promises else "payload", 1)
     hints = fields_of(data, base, ["payload", "poisson"]).beside(fitted.fit)
     assert hints is not None
-    own = data if promises else replace(data, thresholds=replace(DEFAULTS, promising=1e3))
+    own = data if promises else replace(data, thresholds=replace(DEFAULTS, evidence=1e3))
     fields, table = scored(own, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
     assert (fields is hints) != promises
     assert {c.effect.name for c in table} <= {"payload", "poisson"}
@@ -150,7 +147,7 @@ def test_fields_of_the_model_before_that_nearly_suffice_are_computed_anew():
     assert hints is not None
     best = screen_model(data, fitted.fit, NOISE, hints, COUNT)[0]
     for share, anew in ((1.5, True), (2.5, False)):
-        own = replace(data, thresholds=replace(DEFAULTS, promising=share * best.gain - best.cost))
+        own = replace(data, thresholds=replace(DEFAULTS, evidence=share * best.gain - best.cost))
         assert not shortlist([best], own.thresholds, EFFORT, first=False)
         fields, _ = scored(own, fitted, hints, NOISE, ["payload"], COUNT)
         assert (fields is not hints) == anew
@@ -218,22 +215,3 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
     off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])
     assert np.all(off[3:] < 0.001) and np.all(off < 4.0 * std)
-
-
-def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end():
-    data, fitted = started()
-    rough = fit_model(
-        data, fitted.fit.hypothesis, fitted.fit.prior, NOISE, np.zeros(len(fitted.fit.coordinates)), max_iterations=1
-    )
-    fields = fields_of(data, rough, ["payload", "cable_gain"])
-    best = max(c.gain for c in screen_model(data, rough.fit, NOISE, fields, COUNT))
-    assert spared_gain(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
-    data = replace(data, effort=replace(EFFORT, some_states=2.0))  # as if they were not
-    spare = spared_gain(data, rough, fields, NOISE, COUNT)
-    assert spare == pytest.approx(EFFORT.settles * best)
-    finer = replace(NOISE, std={"white": 1e-5})
-    assert spared_gain(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
-    known = rough.fit.jets
-    whole, part = (fitted_again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
-    assert len(part.fit.fit.cost) < len(whole.fit.fit.cost) and part.fit.chi2 < whole.fit.chi2 + 100.0 * spare
-    assert part.fit.fit.status == "converged"

@@ -151,3 +151,14 @@ def test_the_robot_that_is_handed_back_predicts_what_the_fitted_model_does() -> 
     assert returned_model.prediction_gap(data, whole, back, search.noise) < 1e-6
     named = apply_effects(data.declared, [e for e in entries if e["name"] == "cable_gain"])
     assert returned_model.prediction_gap(data, named, back, search.noise) > 5e-4
+
+
+def test_what_a_fit_moved_by_next_to_nothing_is_said_as_none() -> None:
+    _, search = with_gain(300e3)
+    fit = search.final.fit
+    theta = np.array(fit.fit.theta)
+    theta[fit.own :] = -4e-20
+    moved = replace(search.final, fit=replace(fit, fit=replace(fit.fit, theta=theta)))
+    offsets = summary.values_of({}, moved, "cable_offset")["tension_n"].value
+    assert set(offsets.values()) == {0.0} and summary.values_of({}, moved, "stiffness")["scale"].value == 1.0
+    assert 0.0 not in summary.values_of({}, search.final, "cable_offset")["tension_n"].value.values()
