@@ -32,7 +32,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = ("docs", "femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml")
+PARTS = ("docs", "femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml", "hatch_build.py")
 MOST_S = 600.0
 """Tests that take longer than this [s] have noticed: what is broken does not end."""
 
@@ -116,7 +116,7 @@ def red(copy: Path, tests: Sequence[str], *, most_s: float = MOST_S) -> tuple[bo
     """Run tests in the copy; return whether any fails, and the last line of the report."""
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
     environment = {**os.environ, **one_thread, "PYTHONPATH": str(copy), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    options = ["-x", "--no-header", "--tb=no", "--disable-warnings", "-p", "no:cacheprovider"]
+    options = ["-x", "--no-header", "--tb=no", "--disable-warnings"]
     command = [sys.executable, "-m", "pytest", *options, *(f"tests/{test}" for test in tests)]
     try:
         done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=most_s, check=False)
