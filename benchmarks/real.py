@@ -219,7 +219,7 @@ def improved(asked: Asked, minutes: float) -> dict[str, Any] | str:
     if not (folder / "loop.json").is_file():
         command = [sys.executable, "-m", "femsense", "improve", str(asked.robot), *map(str, asked.train), "-o", str(folder)]
         command += ["--correct", *(["--validation", *map(str, asked.held)] if asked.held else [])]
-        began = time.perf_counter()
+        began, spent = time.perf_counter(), children_s()
         try:
             done = subprocess.run(
                 [*command, *asked.options, "--json"], capture_output=True, text=True, timeout=60 * minutes, check=False
@@ -228,13 +228,18 @@ def improved(asked: Asked, minutes: float) -> dict[str, Any] | str:
             return f"not ended after {minutes:g} min"
         if not (folder / "loop.json").is_file():
             return " ".join(done.stderr.split())[:200]
-        import resource
-
-        spent = resource.getrusage(resource.RUSAGE_CHILDREN)
-        taken = {"cpu_s": spent.ru_utime + spent.ru_stime, "wall_s": time.perf_counter() - began}
+        taken = {"cpu_s": children_s() - spent, "wall_s": time.perf_counter() - began}
         (asked.robot.parent / "time.json").write_text(json.dumps(taken))
     document: dict[str, Any] = json.loads((folder / "loop.json").read_text(encoding="utf-8"))
     return document
+
+
+def children_s() -> float:
+    """Return the processor time of all commands that have ended [s]."""
+    import resource
+
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def named(document: Mapping[str, Any]) -> str:

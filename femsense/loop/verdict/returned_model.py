@@ -12,6 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
+from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import (
     FittedModel,
@@ -77,6 +78,27 @@ def worth_handing_back(data: Data, search: Search, promoted: list[str], names: l
             return names, back
         names = [n for n in names if n not in idle] if idle else names[:-1]
     return [], search.before
+
+
+def surely_handed_back(
+    data: Data, search: Search, promoted: list[str], sure: list[str], seed_std: dict[str, FloatArray]
+) -> tuple[list[str], FittedModel, list[str]]:
+    """Return the names that are handed back with their model, and the names that are sure beside what is not handed back, but not without it.
+
+    Where something that was found is gone, the others are fitted again, and asked again whether they are sure.
+    """
+    unsure = list[str]()
+    while True:
+        names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
+        if not names or back is search.final:
+            return names, back, unsure
+        std = parameter_std(data, back, search.noise, seed_std)
+        kept = [n for n in names if n in promoted and is_sure(back, n, std[n], data.thresholds)]
+        kept += sure_effects(data, back, [n for n in names if n not in promoted], std)
+        if len(kept) == len(names):
+            return names, back, unsure
+        unsure += [n for n in names if n not in kept]
+        promoted, sure = [n for n in promoted if n in kept], [n for n in sure if n in kept]
 
 
 def _inside(data: Data, search: Search, names: Sequence[str]) -> FittedModel | None:

@@ -31,7 +31,7 @@ from femsense.loop.verdict.returned_model import (
     prediction_gap,
     promoted_nuisances,
     sure_effects,
-    worth_handing_back,
+    surely_handed_back,
 )
 from femsense.loop.verdict.sentences import by_mesh, by_noise, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
@@ -59,7 +59,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n], data.thresholds)]
     added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
     sure = sure_effects(data, final, added, std)
-    names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
+    names, back, unsure = surely_handed_back(data, search, promoted, sure, _seed_std(search))
     drifted = MODULUS in promoted and MODULUS not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
     entries = entries_of(back, names) if names else []
@@ -88,7 +88,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)
-        + evidence_for(data, found, [n for n in added if n not in sure])
+        + evidence_for(data, found, [n for n in added if n not in sure or n in unsure])
         + surprise
         + _by_prediction(data, robot, back, noise),
         noise_m=measured.total,

@@ -125,6 +125,18 @@ def test_an_effect_is_named_only_where_its_own_value_is_away_from_none_by_three_
     assert names == (["cable_gain"] if sure else [])
 
 
+@pytest.mark.parametrize("scatter, sure", [(0.0, True), (0.05, False)])
+def test_what_is_named_is_sure_without_what_is_not_handed_back_too(scatter: float, sure: bool) -> None:
+    data, search = with_gain(300e3)
+    worse = replace(
+        search, final=replace(search.final, held_rms=2.0 * search.before.held_rms)
+    )  # so that the gain is fitted alone
+    seed_std = {"cable_gain": np.array([scatter])}
+    names, back, unsure = returned_model.surely_handed_back(data, worse, [], ["cable_gain"], seed_std)
+    assert (names, unsure) == ((["cable_gain"], []) if sure else ([], ["cable_gain"]))
+    assert back.fit.hypothesis.names == (("cable_gain",) if sure else search.before.fit.hypothesis.names)
+
+
 def test_where_a_load_hangs_is_not_what_makes_it_sure() -> None:
     data, fitted = fitted_arm(arm((4, 2, 2)), 1.0)
     payload = find_effect("payload")
