@@ -16,7 +16,7 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.first_poses import first_poses
-from femsense.calib.from_clouds import pose_pivot, refine_poses
+from femsense.calib.from_clouds import free_clouds, pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.input_checks import check_inputs
 from femsense.calib.inputs import first_inputs, initial_state, input_bounds, input_tables, largest_input, weak_inputs
@@ -271,11 +271,16 @@ def _result(
         frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
         noise_m=float(np.sqrt(3.0)) * marker_repeatability(recording),
         joint_covariance=joint,
+        marker_covariance=fit.covariance,
     )
 
 
 def _with_clouds(robot: Robot, recording: Recording, by_markers: Calibration) -> Calibration:
-    """Return the calibration with poses to which the clouds of free frames have their say."""
+    """Return the calibration with poses and unknown initial inputs to which the clouds of free frames have their say."""
+    known = by_markers.marker_covariance
+    inputs_open = recording.actuation_zero == "unknown" and bool(robot.body.cables)
+    if inputs_open and free_clouds(recording) and np.isfinite(known).all() and known.any():
+        return _with_std(robot, with_initial_inputs(robot, recording, by_markers, known))
     fitted = refine_poses(robot, recording, by_markers)
     return by_markers if fitted is by_markers else _with_std(robot, fitted)
 

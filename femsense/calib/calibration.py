@@ -47,6 +47,9 @@ class Calibration:
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given:
     that of the first camera alone is known."""
+    marker_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """What markers alone say of undeclared poses (as joint_covariance) and of initial inputs ([N] or [m]) together; empty where
+    nothing was fitted to them. It is not kept in a file."""
     is_corrected: bool = False
     """Whether the robot's empirical correction was used."""
 

@@ -113,7 +113,7 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
         normal, right, scores, rms = sums.normal, sums.right, sums.cells, sums.rms
         if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
             return calibration
-        worth = _worth(normal, scores, prior, gone - np.linalg.solve(normal, right))
+        worth = worth_of_clouds(normal, scores, prior, gone - np.linalg.solve(normal, right))
         if worth >= 0.9 * share:
             break
         share = worth
@@ -130,7 +130,7 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     )
 
 
-def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
+def worth_of_clouds(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
     """Return by which share the clouds count beside the markers [1].
 
     Points of one cell err together; the scatter of the cells' scores tells how far the pose of the clouds is known.

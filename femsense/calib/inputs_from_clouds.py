@@ -1,4 +1,4 @@
-"""Initial inputs of cables, and the poses of cameras with them, from the clouds of free frames where no marker tells them.
+"""Initial inputs of cables, and the poses of cameras with them, from the clouds of free frames; what markers say of them enters as a Gaussian.
 
 Gauss–Newton over poses and inputs: the residual of each point is that along its ray onto the body under the inputs.
 A cable moves the whole body, so that a change of input looks like no change of pose in more than one frame.
@@ -6,14 +6,14 @@ A cable moves the whole body, so that a change of input looks like no change of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums
+from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, worth_of_clouds
 from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray, freeze
@@ -31,48 +31,87 @@ FRAMES = 6
 """Free frames that are used at most, spread over the recording."""
 STEPS = 8
 DERIVATIVES = 3
-"""In so many first steps the derivative by the inputs is new."""
+"""In so many first steps the derivative by the inputs is new; in the first one where markers tell them nearly."""
 START_STD = (0.1, 0.03)
 """What the poses are off by before: [rad], and as a share of the body's diagonal; as in `clouds_alone`."""
 STEP = {"tension": 1e-2, "displacement": 1e-4}
 """Difference for the derivative by an input [N] or [m]."""
 
 
-def with_initial_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> Calibration:
+def with_initial_inputs(
+    robot: Robot, recording: Recording, calibration: Calibration, known: FloatArray | None = None
+) -> Calibration:
     """Return the calibration with undeclared poses and the initial inputs moved to where the clouds of free frames see the body.
 
     Arguments:
         robot, recording: as loaded; the recording's zero is unknown.
         calibration: with poses near the true ones.
+        known: covariance of what markers say of undeclared poses (rotation [rad] and shift [m] each) and of the initial inputs
+            ([N] or [m]) of the calibration, shape (p + a, p + a); by default hardly anything is known.
 
     Raises:
         DataError: no free frame has a cloud, or the body is found in none.
     """
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving]) if moving else np.zeros(0, dtype=np.int64)
-    poses, pivot, p = list(calibration.poses), pose_pivot(robot), len(which)
-    initial = first_inputs(robot, recording)
-    assert initial is not None
-    noises = measured_noises(robot, recording, calibration)
-    low, high = input_bounds(robot, recording)
-    prior = _prior(robot, recording, p)
-    gone, start = np.zeros(p), initial.copy()
-    scans: dict[int, Scan] = {}
-    moves: dict[int, FloatArray] = {}
-    for step in range(STEPS):
-        states = _states(robot, recording, initial)
-        if step < 2:
-            scans = _scans(robot, recording, poses, states)
-        if step < DERIVATIVES:
-            moves = _moves(robot, recording, initial, states)
-        sums = _sums(robot, scans, states, moves, poses, noises, which)
-        change = _bounded(sums, prior, np.append(gone, initial - start), low - initial, high - initial)
-        full = np.zeros(6 * len(poses))
-        full[which] = change[:p]
-        poses, gone, initial = moved_poses(poses, full, pivot), gone + change[:p], initial + change[p:]
-        if np.abs(change[p:]).max() < 1e-3 * STEP[recording.actuation] and np.abs(change[:p]).max(initial=0.0) < 1e-6:
-            break
-    return _answer(robot, recording, calibration, poses, initial, sums, prior, which)
+    p = len(which)
+    if known is None:
+        start, prior = first_inputs(robot, recording), np.diag(_prior(robot, recording, p))
+    else:
+        start, prior = _inputs_of(robot, recording, calibration), np.linalg.inv(known)
+    assert start is not None
+    fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
+    derivatives = DERIVATIVES if known is None else 1
+    poses, initial, gone, sums = fit.joint(calibration.poses, 1.0, derivatives)
+    share = 1.0 if known is None else worth_of_clouds(sums.normal, sums.cells, prior, gone - np.linalg.solve(sums.normal, sums.right))
+    if share < 0.9:  # clouds and markers are farther apart than both say
+        poses, initial, _, sums = fit.joint(calibration.poses, share, derivatives)
+    return _answer(robot, recording, calibration, poses, initial, (sums, share, prior), which, by_markers=known is not None)
+
+
+def _inputs_of(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:
+    table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+    return np.array([table[name] for name in robot.body.cable_names])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fit:
+    """What a joint fit starts from."""
+
+    robot: Robot
+    recording: Recording
+    noises: tuple[CameraNoise, ...]
+    which: IntArray
+    """Coordinates of poses that move, shape (p,)."""
+    start: FloatArray
+    """Initial inputs, shape (a,)."""
+    prior: FloatArray
+    """Precision of poses and inputs about where they start, shape (p + a, p + a)."""
+
+    def joint(
+        self, first: Sequence[FloatArray], share: float, derivatives: int
+    ) -> tuple[list[FloatArray], FloatArray, FloatArray, RaySums]:
+        """Return poses, initial inputs, how far both went, shape (p + a,), and the last equations; points count by a share."""
+        robot, recording, p = self.robot, self.recording, len(self.which)
+        poses, pivot, initial = list(first), pose_pivot(robot), self.start.copy()
+        low, high = input_bounds(robot, recording)
+        gone = np.zeros(p + len(initial))
+        scans: dict[int, Scan] = {}
+        moves: dict[int, FloatArray] = {}
+        for step in range(STEPS):
+            states = _states(robot, recording, initial)
+            if step < 2:
+                scans = _scans(robot, recording, poses, states)
+            if step < derivatives:
+                moves = _moves(robot, recording, initial, states)
+            sums = _sums(robot, scans, states, moves, poses, self.noises, self.which)
+            change = _bounded(sums, share, self.prior, gone, low - initial, high - initial)
+            full = np.zeros(6 * len(poses))
+            full[self.which] = change[:p]
+            poses, gone, initial = moved_poses(poses, full, pivot), gone + change, initial + change[p:]
+            if np.abs(change[p:]).max() < 1e-3 * STEP[recording.actuation] and np.abs(change[:p]).max(initial=0.0) < 1e-6:
+                break
+        return poses, initial, gone, sums
 
 
 def _prior(robot: Robot, recording: Recording, poses: int) -> FloatArray:
@@ -147,11 +186,12 @@ def _sums(
     return ray_sums(seen_rows(), len(which) + len(robot.body.cables), size)
 
 
-def _bounded(sums: RaySums, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+def _bounded(
+    sums: RaySums, share: float, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
     """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
-    P = sums.normal + np.diag(prior)
-    root = np.linalg.cholesky(P).T
-    wanted = -np.linalg.solve(root.T, sums.right + prior * gone)
+    root = np.linalg.cholesky(share * sums.normal + prior).T
+    wanted = -np.linalg.solve(root.T, share * sums.right + prior @ gone)
     free = np.full(len(gone) - len(low), np.inf)
     box = (np.append(-free, low - 1e-12), np.append(free, high + 1e-12))
     return np.asarray(lsq_linear(root, wanted, bounds=box).x)
@@ -163,21 +203,23 @@ def _answer(
     calibration: Calibration,
     poses: list[FloatArray],
     initial: FloatArray,
-    sums: RaySums,
-    prior: FloatArray,
+    weighed: tuple[RaySums, float, FloatArray],
     which: IntArray,
+    *,
+    by_markers: bool,
 ) -> Calibration:
-    p = len(which)
-    inverse = np.linalg.inv(sums.normal + np.diag(prior))
-    covariance = inverse @ (sums.cells.T @ sums.cells + np.diag(prior)) @ inverse
+    """Return the calibration with what was found; `weighed` are the equations, the share by which they count, and the prior's precision."""
+    (sums, share, prior), p = weighed, len(which)
+    inverse = np.linalg.inv(share * sums.normal + prior)
+    covariance = inverse @ (share**2 * sums.cells.T @ sums.cells + prior) @ inverse
     joint = np.zeros((6 * len(poses),) * 2)
     joint[np.ix_(which, which)] = covariance[:p, :p]
     tables = input_tables(robot, recording, initial, covariance[p:, p:])
     weak = weak_inputs(recording, tables.tension_std if recording.actuation == "tension" else tables.displacement_std)
-    found = "converged (initial inputs by clouds alone)"
+    found, what = ("converged", "these data") if by_markers else ("converged (initial inputs by clouds alone)", "the clouds")
     return replace(
         calibration,
-        status=f"{found}, but the clouds hardly determine the initial input of {weak}" if weak else found,
+        status=f"{found}, but {what} hardly determine the initial input of {weak}" if weak else found,
         T_robot_camera=freeze(poses[0]),
         poses=tuple(freeze(T) for T in poses),
         pose_covariance=freeze(joint[:6, :6]),
@@ -187,5 +229,5 @@ def _answer(
         cable_displacement_m=tables.displacement,
         tension_std_n=tables.tension_std,
         displacement_std_m=tables.displacement_std,
-        frames=tuple(int(recording.frame_numbers[k]) for k in _frames(recording)),
+        frames=calibration.frames if by_markers else tuple(int(recording.frame_numbers[k]) for k in _frames(recording)),
     )

@@ -9,7 +9,6 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.fitted_model import (
     FittedModel,
     fit_model,
@@ -29,12 +28,9 @@ from femsense.loop.thresholds import Effort, Thresholds
 
 
 def select_next(
-    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress, *, holds_error: bool = False
+    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
 ) -> tuple[Refit | None, list[RefitRecord]]:
-    """Return the effect that comes next, or None where nothing passes; and what became of each candidate that was refitted.
-
-    Where the noise holds an error of the model, `holds_error`, the simplest is chosen that predicts as well as the best.
-    """
+    """Return the effect that comes next, or None where nothing passes; and what became of each candidate that was refitted."""
     listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
         return None, []
@@ -44,12 +40,9 @@ def select_next(
     leading = leaders(data, fitted, refits, noise, say)
     if not leading:
         return None, _updated(records, refits)
-    if holds_error:
-        leading = _simplest(data, leading | {i: r for i, r in refits.items() if r.record.passes and i not in leading})
     # where evidence is close, what surely predicts better
     first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]))
-    chosen = leading[first] if leading[first].record.seed_std is not None else polished(data, fitted, leading[first], noise, say)
-    winner = _enriched(data, fitted, chosen, table, noise, say).saying(NAMED)
+    winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
@@ -59,22 +52,6 @@ def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise:
     best = max((r.score for r in passing.values()), default=np.inf)
     near = {i: r for i, r in passing.items() if r.score > best - data.thresholds.evidence}
     return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say) for i, r in near.items()}
-
-
-def _simplest(data: Data, passing: Mapping[int, Refit]) -> dict[int, Refit]:
-    """Return, of those that predict left-out sweeps as well as the best but for a standard error, those with the fewest numbers.
-
-    Evidence counts what is left as noise. Where much of it is an error of the model, an effect with many numbers bends to that.
-    Source: the rule of one standard error, Breiman, Friedman, Olshen and Stone, "Classification and Regression Trees" (1984).
-    """
-    best = max(passing.values(), key=lambda r: r.record.cv_gain or 0.0)
-    as_good = dict[int, Refit]()
-    for i, r in passing.items():
-        gain, std = sweeps_predicted(data.train, best.fitted.fit, r.fitted.fit)
-        if r is best or gain > -std:
-            as_good[i] = r
-    fewest = min(len(r.fitted.fit.coordinates) for r in as_good.values())
-    return {i: r for i, r in as_good.items() if len(r.fitted.fit.coordinates) == fewest}
 
 
 def _refitted(

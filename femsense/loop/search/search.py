@@ -97,7 +97,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
     if found >= _most_effects(data):
         course.over = True
         return
-    next_one, tried = select_next(data, fitted, table, noise, say, holds_error=course.holds_error)
+    next_one, tried = select_next(data, fitted, table, noise, say)
     refits = [*refits, *at_step(tried, len(history))]
     course.refits = refits
     if next_one is None:
