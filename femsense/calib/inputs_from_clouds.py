@@ -62,16 +62,33 @@ def with_initial_inputs(
     assert start is not None
     fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
     derivatives = DERIVATIVES if known is None else 1
-    poses, initial, gone, sums = fit.joint(calibration.poses, 1.0, derivatives)
-    share = 1.0 if known is None else worth_of_clouds(sums.normal, sums.cells, prior, gone - np.linalg.solve(sums.normal, sums.right))
-    if share < 0.9:  # clouds and markers are farther apart than both say
-        poses, initial, _, sums = fit.joint(calibration.poses, share, derivatives)
-    return _answer(robot, recording, calibration, poses, initial, (sums, share, prior), which, by_markers=known is not None)
+    end = fit.joint(calibration.poses, 1.0, derivatives)
+    if known is not None:  # clouds count less where they and markers are farther apart than both say
+        apart = end.gone - np.linalg.solve(end.sums.normal, end.sums.right)
+        share = worth_of_clouds(end.sums.normal, end.sums.cells, prior, apart)
+        end = fit.joint(calibration.poses, share, derivatives) if share < 0.9 else end
+    return _answer(fit, calibration, end, by_markers=known is not None)
 
 
 def _inputs_of(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:
     table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
     return np.array([table[name] for name in robot.body.cable_names])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _End:
+    """Where a joint fit ends."""
+
+    poses: list[FloatArray]
+    initial: FloatArray
+    """Initial inputs, shape (a,)."""
+    gone: FloatArray
+    """How far poses and inputs went, shape (p + a,)."""
+    sums: RaySums
+    share: float
+    """How much points count."""
+    scans: dict[int, Scan]
+    moves: dict[int, FloatArray]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,10 +105,8 @@ class _Fit:
     prior: FloatArray
     """Precision of poses and inputs about where they start, shape (p + a, p + a)."""
 
-    def joint(
-        self, first: Sequence[FloatArray], share: float, derivatives: int
-    ) -> tuple[list[FloatArray], FloatArray, FloatArray, RaySums]:
-        """Return poses, initial inputs, how far both went, shape (p + a,), and the last equations; points count by a share."""
+    def joint(self, first: Sequence[FloatArray], share: float, derivatives: int) -> _End:
+        """Return where Gauss–Newton leads with points that count by a share; in so many first steps the derivative is new."""
         robot, recording, p = self.robot, self.recording, len(self.which)
         poses, pivot, initial = list(first), pose_pivot(robot), self.start.copy()
         low, high = input_bounds(robot, recording)
@@ -111,7 +126,27 @@ class _Fit:
             poses, gone, initial = moved_poses(poses, full, pivot), gone + change, initial + change[p:]
             if np.abs(change[p:]).max() < 1e-3 * STEP[recording.actuation] and np.abs(change[:p]).max(initial=0.0) < 1e-6:
                 break
-        return poses, initial, gone, sums
+        return _End(poses, initial, gone, sums, share, scans, moves)
+
+    def covariance(self, end: _End) -> FloatArray:
+        """Return the covariance of poses and inputs, shape (p + a, p + a): of points, of what was known before, and of the law."""
+        inverse = np.linalg.inv(end.share * end.sums.normal + self.prior)
+        cells = end.share * end.sums.cells
+        by_law = inverse @ (end.share * self._turned_by_law(end))
+        return np.asarray(inverse @ (cells.T @ cells + self.prior) @ inverse + np.outer(by_law, by_law))
+
+    def _turned_by_law(self, end: _End) -> FloatArray:
+        """Return by how much the right side of the equations differs under the neo-Hookean law, shape (p + a,). What all cables have in common
+        compresses the body, and laws that agree for small strains differ there. 0 where the robot declares a law by an effect."""
+        body = self.robot.body
+        if body.material.law != "corotational":
+            return np.zeros(len(self.prior))
+        rights = []
+        for material in (body.material, replace(body.material, law="neo_hookean")):
+            robot = replace(self.robot, body=replace(body, material=material))
+            states = _states(robot, self.recording, end.initial)
+            rights.append(_sums(robot, end.scans, states, end.moves, end.poses, self.noises, self.which).right)
+        return np.asarray(rights[1] - rights[0])
 
 
 def _prior(robot: Robot, recording: Recording, poses: int) -> FloatArray:
@@ -186,9 +221,7 @@ def _sums(
     return ray_sums(seen_rows(), len(which) + len(robot.body.cables), size)
 
 
-def _bounded(
-    sums: RaySums, share: float, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray
-) -> FloatArray:
+def _bounded(sums: RaySums, share: float, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
     root = np.linalg.cholesky(share * sums.normal + prior).T
     wanted = -np.linalg.solve(root.T, share * sums.right + prior @ gone)
@@ -197,24 +230,13 @@ def _bounded(
     return np.asarray(lsq_linear(root, wanted, bounds=box).x)
 
 
-def _answer(
-    robot: Robot,
-    recording: Recording,
-    calibration: Calibration,
-    poses: list[FloatArray],
-    initial: FloatArray,
-    weighed: tuple[RaySums, float, FloatArray],
-    which: IntArray,
-    *,
-    by_markers: bool,
-) -> Calibration:
-    """Return the calibration with what was found; `weighed` are the equations, the share by which they count, and the prior's precision."""
-    (sums, share, prior), p = weighed, len(which)
-    inverse = np.linalg.inv(share * sums.normal + prior)
-    covariance = inverse @ (share**2 * sums.cells.T @ sums.cells + prior) @ inverse
+def _answer(fit: _Fit, calibration: Calibration, end: _End, *, by_markers: bool) -> Calibration:
+    """Return the calibration with what was found."""
+    robot, recording, p, poses = fit.robot, fit.recording, len(fit.which), end.poses
+    covariance = fit.covariance(end)
     joint = np.zeros((6 * len(poses),) * 2)
-    joint[np.ix_(which, which)] = covariance[:p, :p]
-    tables = input_tables(robot, recording, initial, covariance[p:, p:])
+    joint[np.ix_(fit.which, fit.which)] = covariance[:p, :p]
+    tables = input_tables(robot, recording, end.initial, covariance[p:, p:])
     weak = weak_inputs(recording, tables.tension_std if recording.actuation == "tension" else tables.displacement_std)
     found, what = ("converged", "these data") if by_markers else ("converged (initial inputs by clouds alone)", "the clouds")
     return replace(
@@ -224,7 +246,7 @@ def _answer(
         poses=tuple(freeze(T) for T in poses),
         pose_covariance=freeze(joint[:6, :6]),
         joint_covariance=freeze(joint),
-        normal_rms_m=sums.rms,
+        normal_rms_m=end.sums.rms,
         cable_tension_n=tables.tension,
         cable_displacement_m=tables.displacement,
         tension_std_n=tables.tension_std,
