@@ -56,9 +56,9 @@ def with_initial_inputs(
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving]) if moving else np.zeros(0, dtype=np.int64)
     p = len(which)
     if known is None:
-        start, prior = first_inputs(robot, recording), np.diag(_prior(robot, recording, p))
+        start, prior = first_inputs(robot, recording), np.asarray(np.diag(_prior(robot, recording, p)))
     else:
-        start, prior = _inputs_of(robot, recording, calibration), np.linalg.inv(known)
+        start, prior = _inputs_of(robot, recording, calibration), np.asarray(np.linalg.inv(known))
     assert start is not None
     fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
     derivatives = DERIVATIVES if known is None else 1
