@@ -166,7 +166,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
     This closes the loop of a drag (see `let_drag`, which comes before).
 
     Raises:
-        InputError: no model, no such source, or a model that knows no marker of the robot or not its frame.
+        InputError: no model, no such source, or a model of markers that the robot does not have, or not in its frame.
     """
     from femsense.xr.proprioception.labelled import ROBOT, WORDS
     from femsense.xr.proprioception.model_file import load_model
@@ -175,12 +175,13 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
 
     model, twin = load_model(model_file), live.publishers[0].twin
     known = [handle.name for handle in twin.handles]
-    if not set(known) & set(model.marker_names):
+    unknown = [name for name in model.marker_names if name not in known]
+    if unknown:
         raise InputError(
-            "the model knows no marker of the robot",
+            "the model has markers that the robot does not have: is it another robot's?",
             where=str(model_file),
-            found=", ".join(model.marker_names),
-            expected=f"one of the markers of {twin.name}: {', '.join(known)}",
+            found=", ".join(unknown),
+            expected=f"markers of {twin.name}: {', '.join(known)}",
             hint="learn from columns that are named as the markers in robot.toml",
         )
     if model.frame != ROBOT:

@@ -193,10 +193,11 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
     network = linear_network(np.zeros(1), np.ones(1), np.array([[0.0], [0.0], [1e-3]]), rest)  # a millimetre up for each unit
     domain = learn_domain(np.random.default_rng(0).uniform(-2.0, 2.0, (300, 1)))
     chain = ProprioceptiveModel(("bend",), (marker,), network, (), domain, None, frame="robot")
+    two = linear_network(np.zeros(1), np.ones(1), np.zeros((6, 1)), np.tile(rest, 2))
     turned = save_model(replace(chain, frame="markers"), tmp_path / "t.onnx")
     model, strange = (
         save_model(chain, tmp_path / "m.onnx"),
-        save_model(replace(chain, marker_names=("other",)), tmp_path / "o.onnx"),
+        save_model(replace(chain, marker_names=(marker, "other"), network=two), tmp_path / "o.onnx"),
     )
     readings = tmp_path / "sensors.csv"
     readings.write_text("time_s,bend\n0,1\n", encoding="utf-8")
@@ -204,7 +205,7 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
     wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": False}).encode()
     with stream_runs([run], StreamOptions(page=page)) as live:
         let_drag(live, run, DragOptions())
-        with pytest.raises(InputError, match="no marker of the robot"):
+        with pytest.raises(InputError, match="markers that the robot does not have"):
             measure_by_sensors(live, str(readings), strange)
         with pytest.raises(InputError, match="not in the robot's frame"):
             measure_by_sensors(live, str(readings), turned)

@@ -233,6 +233,16 @@ def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) 
     return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
 
+def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
+    """Return the whitened sum of squares of the difference between two models on held-out data."""
+    return float(
+        sum(
+            (whiten(noise.whitener(t.groups, t.mesh_error), b - a) ** 2).sum()
+            for t, b, a in zip(data.held, before.held_residuals, after.held_residuals)
+        )
+    )
+
+
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     return JointProblem(
         fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.placement_std

@@ -12,7 +12,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, span_of
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import PASSES, RefitRecord
@@ -38,11 +38,15 @@ def acceptance_test(
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
+    acts = held_shift(
+        data, fitted, made, noise
+    )  # what `held` is on average for the true effect, with a variance of four times that
+    wanted = min(decides.held_gain * gain * held_share(data), acts - 2.0 * decides.significant * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
     fit_objection = _objection(made, candidate, score, decides)
     if fit_objection is None and np.isfinite(std_error) and better <= decides.sweeps_for * std_error:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
-    if fit_objection is None and held < decides.held_gain * gain * held_share(data):
+    if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
     if fit_objection is None and score + held <= decides.evidence:  # what was not fitted speaks against it
         fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"

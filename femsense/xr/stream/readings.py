@@ -125,15 +125,19 @@ def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
 def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
     if not isinstance(told, dict) or not any(name in told for name in channels):
         return None
-    when = _number(told.get("time_s"))
-    return when if np.isfinite(when) else time.monotonic(), np.array([_number(told.get(name)) for name in channels])
+    when, values = _number(told.get("time_s")), np.array([_number(told.get(name)) for name in channels])
+    if not np.isfinite(values).any():
+        return None
+    return when if np.isfinite(when) else time.monotonic(), values
 
 
 def _number(value: Any) -> float:
+    """Return a finite number, or nan."""
     try:
-        return float(value)
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
         return float("nan")
+    return number if np.isfinite(number) else float("nan")
 
 
 # Sources
