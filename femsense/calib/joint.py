@@ -6,7 +6,7 @@ import numpy as np
 
 from femsense.calib.inputs import input_bounds
 from femsense.core.arrays import FloatArray
-from femsense.core.least_squares import FitResult, covariance_of, gauss_newton
+from femsense.core.least_squares import FitResult, gauss_newton
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
@@ -47,7 +47,7 @@ def fit_joint(
             break
         problem.weigh(jet, huber, len(theta))
     moved, inputs = problem.place(theta)
-    return _with_bound_inputs(fit, theta, (low, high)), moved, inputs, jet
+    return fit, moved, inputs, jet  # an input at its bound is no better known than others: what they have in common moves all
 
 
 class _Problem:
@@ -125,18 +125,6 @@ class _Problem:
         self.std = _noise_std(winsorised, float(3 * (self.repeats**2).sum()), parameters)
         if len(jet.rest):
             self.placement_std = max(PLACEMENT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean())))
-
-
-def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FitResult:
-    """A parameter at its bound stays there: it takes no part in the covariance of the others."""
-    at = (theta <= bounds[0]) | (theta >= bounds[1])
-    if not at.any():
-        return fit
-    covariance = np.zeros_like(fit.covariance)
-    covariance[np.ix_(~at, ~at)] = covariance_of(fit.jacobian[:, ~at])
-    own = np.linalg.norm(fit.jacobian[:, at], axis=0)
-    covariance[at, at] = np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0) ** 2, np.inf)
-    return FitResult(fit.theta, covariance, fit.residual, fit.jacobian, fit.cost, fit.status)
 
 
 def _repeats(scene: Scene) -> FloatArray:

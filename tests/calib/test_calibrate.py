@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import bar_body, random_rotation
+from arm import arm, record
 from helpers import DATA, block_mesh
 
 from femsense.calib.calibrate import calibrate, calibrated_start, usable_frames
@@ -482,3 +483,12 @@ def test_a_start_for_further_fits_is_where_calibration_ends(initial: np.ndarray 
     else:
         np.testing.assert_allclose(inputs, list(whole.cable_tension_n.values()), atol=1e-12)
     assert sorted(states) == [0, 1, 2, 3] and all(s.converged for s in states.values())
+
+
+def test_an_input_at_its_bound_is_no_better_known_than_others() -> None:
+    """What all cables have in common hardly moves a marker: one that ends at nothing may be as far off as the others."""
+    inputs = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 0.6, 0]])
+    found = calibrate(arm(), record(inputs, zero="unknown", initial=np.array([0.0, 0.3, 0.0, 0.3]), noise=5e-4)[0])
+    assert min(found.cable_tension_n.values()) < 1e-6
+    std = np.array([found.tension_std_n[name] for name in found.cable_tension_n], dtype=float)
+    assert std.min() > 0.5 * std.max()
