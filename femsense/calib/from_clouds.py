@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.calib.calibration import Calibration
+from femsense.calib.inputs import calibrated_inputs
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import BoolArray, FloatArray, freeze
 from femsense.core.errors import FemsenseError
@@ -256,10 +257,7 @@ def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:
 def _free_frames(robot: Robot, recording: Recording, poses: tuple[FloatArray, ...], calibration: Calibration) -> list[_Seen]:
     """Return what is seen in the free frames that have clouds."""
     free = free_clouds(recording)
-    initial = None
-    if recording.actuation_zero == "unknown":
-        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
-        initial = np.array([table[name] for name in robot.body.cable_names])
+    initial = calibrated_inputs(robot, recording, calibration) if recording.actuation_zero == "unknown" else None
     driven, triangles = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), body_surface(robot.body.mesh).triangles
     result = []
     for k, state in free_path(driven, free):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.drive import DrivenRobot, drive_of
@@ -57,6 +58,12 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
         return None
     lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
     return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
+
+
+def calibrated_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:
+    """Return the initial inputs of a calibration in the recording's unit [N] or [m], shape (a,)."""
+    table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+    return np.array([table[name] for name in robot.body.cable_names])
 
 
 def largest_input(robot: Robot, actuation: str) -> float:

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, worth_of_clouds
-from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, FemsenseError
@@ -58,7 +58,7 @@ def with_initial_inputs(
     if known is None:
         start, prior = first_inputs(robot, recording), np.asarray(np.diag(_prior(robot, recording, p)))
     else:
-        start, prior = _inputs_of(robot, recording, calibration), np.asarray(np.linalg.inv(known))
+        start, prior = calibrated_inputs(robot, recording, calibration), np.asarray(np.linalg.inv(known))
     assert start is not None
     fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
     derivatives = DERIVATIVES if known is None else 1
@@ -68,11 +68,6 @@ def with_initial_inputs(
         share = worth_of_clouds(end.sums.normal, end.sums.cells, prior, apart)
         end = fit.joint(calibration.poses, share, derivatives) if share < 0.9 else end
     return _answer(fit, calibration, end, by_markers=known is not None)
-
-
-def _inputs_of(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:
-    table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
-    return np.array([table[name] for name in robot.body.cable_names])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
