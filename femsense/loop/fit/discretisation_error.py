@@ -310,3 +310,9 @@ def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_
 def beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
     """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
     return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])
+
+
+def mesh_error_rms(data: Data) -> float | None:
+    """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
+    errors = mesh_errors(data)
+    return rms_of(errors) if errors else None

@@ -8,9 +8,11 @@ from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, mean_square
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.model_error import excess_of
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.calibration import Ready, calibrated_pose, fitted_again, matched
@@ -62,12 +64,12 @@ def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None
 
 
 def _nothing_explains(course: SearchProgress) -> bool:
-    """Return whether markers are much farther from the last model than the noise of the richest linear model allows. That noise then weighs only how
-    states differ, and lets a pose and input offsets go wherever these agree."""
-    if course.holds_error or course.noise is None or "clouds" in course.data.measured:
+    """Return whether the last model has a large error of its own: the noise of the richest linear model then weighs only how states differ, and lets a
+    pose and input offsets go wherever these agree."""
+    data, fitted, noise = course.data, course.fitted, course.noise
+    if course.holds_error or noise is None or "clouds" in data.measured:
         return False
-    residuals = [jet.residual for jet in course.fitted.fit.jets]
-    return mean_square(course.data.train, residuals, course.noise) > course.data.thresholds.lacks
+    return excess_of(data, course.base, fitted, fitted, noise, repeatability(data, fitted, noise)).is_large
 
 
 def _most_effects(data: Data) -> int:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from femsense.loop.data.dataset import MESH, Data
-from femsense.loop.data.trial import rms_of
-from femsense.loop.fit.discretisation_error import mesh_errors
+from femsense.loop.fit.discretisation_error import mesh_error_rms, mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
@@ -131,9 +130,3 @@ def values_in_words(parameters: Mapping[str, Value]) -> str:
 
     said = {k: p for k, p in parameters.items() if k != "file"}
     return ", ".join(f"{k} {show(p.value)}" + ("" if p.unit == "1" else f" {p.unit}") for k, p in said.items())
-
-
-def mesh_error_rms(data: Data) -> float | None:
-    """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
-    errors = mesh_errors(data)
-    return rms_of(errors) if errors else None

@@ -12,7 +12,7 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS
-from femsense.loop.fit.discretisation_error import representative_frames
+from femsense.loop.fit.discretisation_error import mesh_error_rms, representative_frames
 from femsense.loop.fit.fitted_model import FittedModel, held_out, roughly_keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import (
@@ -34,7 +34,7 @@ from femsense.loop.search.screening import Candidate, one_each
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.candidate_tables import KINDS, own_size
-from femsense.loop.verdict.sentences import ROUNDED, mesh_error_rms
+from femsense.loop.verdict.sentences import ROUNDED
 from femsense.model.effects.base import absent_elsewhere, placed
 
 DRAWS = 2000

@@ -14,6 +14,7 @@ from femsense.loop.data.trial import Trial
 from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.discretisation_error import without_mesh_error
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
+from femsense.loop.fit.model_error import Excess, excess_of, model_error
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
@@ -21,7 +22,6 @@ from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
 from femsense.loop.verdict.empirical import judged_correction
-from femsense.loop.verdict.model_error import Excess, excess_of, model_error
 from femsense.loop.verdict.report_data import gather
 from femsense.loop.verdict.residual_diagnostics import describe_left, structure_tests
 from femsense.loop.verdict.returned_model import (

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from femsense.loop.data.trial import Groups
+from femsense.loop.fit.model_error import excess_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.thresholds import DEFAULTS
-from femsense.loop.verdict.model_error import excess_of
 from femsense.loop.verdict.verdict import lacks_much
 
 RNG = np.random.default_rng(11)

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import beyond_mesh
+from femsense.loop.fit.discretisation_error import beyond_mesh, mesh_error_rms
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.records import ModelError
-from femsense.loop.verdict.sentences import mesh_error_rms
 
 
 @dataclass(frozen=True, slots=True)
