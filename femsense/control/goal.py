@@ -13,6 +13,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.fem.mesh import Embedding, embed_points
+from femsense.model.on_body import check_on_body
 from femsense.model.robot import Robot
 
 Forces = Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]
@@ -90,7 +91,9 @@ def _numbers(value: npt.ArrayLike, where: str) -> FloatArray:
 def _place(robot: Robot, key: str | tuple[float, float, float]) -> FloatArray:
     """Return where a marker sits at rest, or the point itself [m], shape (3,). Raises InputError."""
     if not isinstance(key, str):
-        return _numbers(key, "target")
+        place = _numbers(key, "target")
+        check_on_body(robot.body.mesh, place[None], where="target")
+        return place
     if key not in robot.glued_names:
         raise InputError(
             "unknown marker",
@@ -136,4 +139,6 @@ def _nodal(robot: Robot, forces: Forces, contacts: Sequence[WallContact]) -> Flo
     if not pairs:
         return np.zeros_like(mesh.nodes)
     places, values = (np.array(column) for column in zip(*pairs))
+    check_on_body(mesh, places[: len(forces)], where="forces")
+    check_on_body(mesh, places[len(forces) :], where="contacts")
     return embed_points(mesh, places).spread(values, len(mesh.nodes))

@@ -238,7 +238,10 @@ def _best_step(
     u, miss = efforts_of(state), goal.miss(state.positions)
     J, W = slopes.points, slopes.wound
     moved = slopes.body if by_body else np.linalg.norm(J, axis=0)
-    unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
+    farthest = float(moved.max(initial=0.0))
+    if not farthest > 0.0:  # held points
+        return Step(np.zeros(len(u)), 0.0, 0.0)
+    unit = body.reach / np.maximum(moved, WEAKEST * farthest)
     scaled = J * unit
     top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
     low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)

@@ -171,9 +171,12 @@ def _scaling(problem: Problem) -> _Scaling:
     D = 1.0 / np.where(weak, largest if largest > 0.0 else 1.0, curvature)
     rows_G, rows_A = _inverse_lengths(G * D), _inverse_lengths(A * D)
     sizes = np.concatenate([np.abs(D * q), np.abs(rows_A * b), np.abs(rows_G * h)])
-    limits = np.concatenate([lb / D, ub / D])
-    size = float(sizes.max(initial=0.0)) or float(np.abs(limits[np.isfinite(limits)]).max(initial=0.0)) or 1.0
-    return _Scaling(size * D, rows_G / size, rows_A / size, size**2)
+    limits = np.abs(np.concatenate([lb / D, ub / D]))
+    widest = float(limits[np.isfinite(limits)].max(initial=0.0))
+    size = float(sizes.max(initial=0.0)) or widest or 1.0
+    if widest > 0.0 and np.isfinite(limits).all():  # no answer is larger, however flat the objective
+        size = min(size, widest)
+    return _Scaling(size * D, rows_G / size, rows_A / size, size * max(size, float(np.abs(D * q).max(initial=0.0))))
 
 
 def _inverse_lengths(rows: FloatArray) -> FloatArray:

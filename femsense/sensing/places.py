@@ -10,11 +10,8 @@ import numpy.typing as npt
 
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.contact_patch import BodySurface, closest_surface_point
 from femsense.model.recording_parts import Tool
-from femsense.model.robot import Robot
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
 from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape
 from femsense.pointcloud.rays import Surface
@@ -168,21 +165,6 @@ def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:
     """Return whether a place touches the clamp: a force there does not move the body, and a holder always touches it."""
     clamped = sensor.robot.body.mesh.nodes[sensor.robot.body.clamped]
     return bool(len(clamped)) and bool(np.linalg.norm(clamped - place, axis=1).min() < sensor.surface.edge)
-
-
-def check_places(places: FloatArray, surface: BodySurface, robot: Robot, size: float) -> None:
-    """Raise InputError where a given place lies far from the surface."""
-    nodes = robot.body.mesh.nodes
-    for i, place in enumerate(places):
-        distance = float(np.linalg.norm(closest_surface_point(surface, nodes, place) - place))
-        if distance > 0.1 * size:
-            raise InputError(
-                "far from the surface of the body",
-                where=f"at[{i}]",
-                found=f"{place.tolist()} m, {1e3 * distance:.1f} mm away",
-                expected=f"a point of the surface at rest, within {1e3 * nodes.min(axis=0)} … {1e3 * nodes.max(axis=0)} mm",
-                hint="coordinates are metres in the robot frame",
-            )
 
 
 def near_places(points: FloatArray, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:

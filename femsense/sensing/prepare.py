@@ -22,6 +22,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.marker_correction import corrected
+from femsense.model.on_body import check_on_body
 from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
@@ -29,7 +30,7 @@ from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
-from femsense.sensing.places import check_places, near_places, object_touches, objects_near
+from femsense.sensing.places import near_places, object_touches, objects_near
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
 MODULUS_STD = 0.01
@@ -101,7 +102,7 @@ def prepare(
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     surface = body_surface(robot.body.mesh)
-    check_places(places, surface, robot, size)
+    check_on_body(robot.body.mesh, places, where="at")
     if not recording.has_clouds and not len(places):
         raise InputError(
             "no clouds, and no place of contact is given",

@@ -270,6 +270,10 @@ def test_the_finger_of_the_peers_reaches_its_heights_and_keeps_its_limits() -> N
         ({"tap": [0.0, 0.0, 0.0]}, {}, "did you mean 'tip'"),
         ({}, {}, "nothing is wanted"),
         ({"tip": [0.0, 0.0]}, {}, "not a place"),
+        ({(0.05, 0.5, 0.0): [0.0, 0.0, 0.0]}, {}, r"target: far from the surface of the body\n.* 470.0 mm from the body"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([0.05, 0.5, 0.0], [0.0, 0.0, 0.1])]}, "forces: far from the surface"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([50.0, 0.0, 15.0], [0.0, 0.0, 0.1])]}, "divide by 1000"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"contacts": [fs.WallContact((0.05, 0.5, 0.0), (0.0, 0.0, 1.0), 0.0, 0.1)]}, "contacts: far"),
         ({"tip": [0.0, 0.0, 0.0]}, {"control": "torque"}, "unknown control"),
         ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "no cable or chamber"),
         ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "wrong way round"),
@@ -295,3 +299,22 @@ def test_the_command_says_inputs_limits_and_exit_status(tmp_path: Path, capsys: 
     capsys.readouterr()
     assert run(["reach", "four-leg", "--target", f"{name}={1e3 * x + 3},,"]) == 2
     assert "this looks like millimetres" in capsys.readouterr().err
+
+
+def test_a_held_point_is_moved_by_no_input() -> None:
+    motion = fs.reach(bar(), {(0.0, 0.015, 0.0): [0.02, 0.0, 0.0]})
+    assert motion.status == "nearest" and "no input moves the points" in motion.text
+
+
+@pytest.mark.skipif(not (DATA / "finger").is_dir(), reason="shared data")
+def test_the_nearest_is_found_where_the_error_bends_downwards_on_the_way() -> None:
+    """The least height of this node is at 1.4 N, the slope turns at 2 N."""
+    robot = load_robot(str(DATA / "finger"))
+    nodes = robot.body.mesh.nodes
+    point = nodes[np.linalg.norm(nodes - [-0.0896, 0.0085, 0.015], axis=1).argmin()]
+    tie = embed_points(robot.body.mesh, point[None])
+    lowest = tie.positions(fs.solve_equilibrium(robot.body, tension={"cable": 1.4}).positions)[0, 2]
+    for height in (-0.09, -0.005):
+        motion = fs.reach(robot, {tuple(point.tolist()): [np.nan, np.nan, height]})
+        assert motion.status == "nearest" and motion.error_m <= lowest - height + 2e-6
+        assert not any("push" in limit for limit in motion.limits)

@@ -41,6 +41,10 @@ KNOWN = {
     # min ½|x|² − 2x₁ − 3x₂ with x₁ + x₂ = 3, x₂ ≤ 1, x₁ ≤ 5: x = (2, 1), y = 0, z_box₂ = 2
     "both": Known(Problem(np.eye(2), [-2.0, -3.0], A=[[1, 1]], b=[3], ub=[5, 1]), [2, 1], [], [0], [0, 2]),
     "one direction is flat": Known(Problem(np.diag([1.0, 0.0]), [-1.0, 1.0], lb=[-np.inf, -2]), [1, -2], [], [], [0, -1]),
+    "nearly flat within narrow bounds": Known(
+        Problem(2.0**-33 * np.eye(2), [0.25, -0.125], lb=[-(2.0**-10), -(2.0**-9)], ub=[2.0**-8, 2.0**-10]),
+        *([-(2.0**-10), 2.0**-10], [], [], [2.0**-43 - 0.25, 0.125 - 2.0**-43]),
+    ),
     "a linear programme": Known(Problem(np.zeros((2, 2)), [1.0, 2.0], lb=[0, 0], A=[[1, 1]], b=[1]), [1, 0], [], [-1], [0, -1]),
 }
 
