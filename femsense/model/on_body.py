@@ -24,7 +24,7 @@ def check_on_body(mesh: TetMesh, places: FloatArray, *, where: str) -> None:
         where: what gives them, for the message.
 
     Raises:
-        InputError: a place is farther from the surface than a tenth of the body's diagonal..
+        InputError: a place is farther from the surface than a tenth of the body's diagonal.
     """
     nodes, surface = mesh.nodes, body_surface(mesh)
     size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
