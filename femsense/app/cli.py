@@ -26,8 +26,11 @@ from femsense.app.compiling import announced_compiling
 from femsense.core.errors import FemsenseError
 
 STOPPED = 130
-STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
 """Exit status after Ctrl-C, as shells have it."""
+STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
+STOPPED_EARLY = "stopped before anything was served"
+SERVING = ("stream", "view")
+"""Commands that end with Ctrl-C; before they serve, they were stopped."""
 
 
 app = typer.Typer(
@@ -90,18 +93,20 @@ def run(arguments: Sequence[str], *, program: typer.Typer = app) -> int:
     notes: list[str] = []
     as_json = "--json" in arguments
     words = repeat_options(list(arguments)) or ["--help"]
+    stopped = STOPPED_EARLY if words[0] in SERVING else STOPPED_TEXT
     with _calm_warnings(notes, as_json):
         try:
-            with _clean_stdout(as_json), announced_compiling(words, say):
-                answer = program(args=words, prog_name="femsense", standalone_mode=False)
-            if isinstance(answer, Answer):
-                return _print(answer, as_json, notes)
-            return _fail(STOPPED_TEXT, STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)
+            with announced_compiling(words, say):
+                with _clean_stdout(as_json):
+                    answer = program(args=words, prog_name="femsense", standalone_mode=False)
+                if isinstance(answer, Answer):
+                    return _print(answer, as_json, notes)
+            return _fail(stopped, STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             return 1
         except (KeyboardInterrupt, typer.Abort):
-            return _fail(STOPPED_TEXT, STOPPED, as_json, notes)
+            return _fail(stopped, STOPPED, as_json, notes)
         except Exception as error:
             if os.environ.get("FEMSENSE_DEBUG") == "1":
                 raise

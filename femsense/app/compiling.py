@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 
-COMPILING = frozenset({"demo", "mesh", "simulate", "calibrate", "estimate", "improve", "export"})
+COMPILING = frozenset({"demo", "mesh", "simulate", "calibrate", "estimate", "improve", "export", "reach"})
 """Commands that use compiled kernels."""
+DRAGGING = frozenset({"--drag", "--commands"})
+"""With these `stream` uses them too, when somebody drags for the first time."""
 COMPILING_TEXT = "compiling kernels, once after an installation: up to a minute"
 
 
@@ -18,7 +20,8 @@ def announced_compiling(words: Sequence[str], say: Callable[[str], None]) -> Ite
         words: the command and its arguments; others than those that use kernels are left alone, so that they need not load numba.
         say: takes the line.
     """
-    if words[0] not in COMPILING or {"-h", "--help"} & set(words):
+    uses = words[0] in COMPILING or (words[0] == "stream" and bool(DRAGGING & set(words)))
+    if not uses or {"-h", "--help"} & set(words):
         yield
         return
     from numba.core import event

@@ -11,13 +11,14 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
+from femsense.app.stream_log import Streamed, StreamLog, Watched, connection, readings_from
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
 from femsense.xr.stream.payloads import MEASURED, Twin, TwinFrame, measured_bytes, topic
-from femsense.xr.stream.publisher import Publisher, PublishOptions, play
+from femsense.xr.stream.publisher import FIRST_POSE, Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 from femsense.xr.view import PAGE, live_page_files
 
@@ -62,10 +63,11 @@ class LiveStream:
     threads: list[Thread] = field(default_factory=list)
     stop: Event = field(default_factory=Event)
     closers: list[Callable[[], None]] = field(default_factory=list)
-    links: dict[str, Callable[[], str]] = field(default_factory=dict)
-    """Connections to elsewhere: what says why there is none."""
-    sources: dict[str, Callable[[], str]] = field(default_factory=dict)
-    """Where readings come from: what says why there are none."""
+    watched: list[Watched] = field(default_factory=list)
+    """Connections to elsewhere, and where readings come from."""
+    brokers: tuple[str, ...] = ()
+    """Elsewhere, that it is sent to."""
+    begun: float = field(default_factory=time.monotonic)
 
     @property
     def url(self) -> str:
@@ -75,19 +77,23 @@ class LiveStream:
     @property
     def trouble(self) -> str:
         """Which connections and readings there are none of, and why; empty where all is well."""
-        links = [f"no connection to {where} ({why()}), trying again" for where, why in self.links.items() if why()]
-        return "; ".join(links + [f"no readings of {where} ({why()}), waiting" for where, why in self.sources.items() if why()])
+        return "; ".join(one.trouble for one in self.watched if one.trouble)
+
+    @property
+    def streamed(self) -> Streamed:
+        """What was streamed so far, and who got it."""
+        poses = {publisher.twin.name: publisher.sent for publisher in self.publishers}
+        clients = None if self.broker is None else self.broker.clients
+        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, self.brokers)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
-        known, patient = "", time.monotonic() + PATIENCE_S
+        log, patient = StreamLog(self.watched), time.monotonic() + PATIENCE_S
         while any(thread.is_alive() for thread in self.threads) or not (self.threads or self.stop.is_set()):
             living = [thread for thread in self.threads if thread.is_alive()]
             living[0].join(0.5) if living else self.stop.wait(0.5)
-            trouble = self.trouble
-            if say is not None and trouble != known and time.monotonic() > patient:
-                say(trouble or ("readings come" if "no readings" in known else "connected again"))
-                known = trouble
+            for text in log.news() if time.monotonic() > patient else ():
+                (say or quiet)(text)
 
     def close(self) -> None:
         """End the sources, say so, and free the ports."""
@@ -107,20 +113,31 @@ class LiveStream:
         self.close()
 
 
-def stream_runs(runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, clouds: bool = True) -> LiveStream:
-    """Play runs at their own times to whoever watches; return at once.
+def quiet(_text: str) -> None:
+    """Say nothing."""
+
+
+def stream_runs(
+    runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, clouds: bool = True, say: Callable[[str], None] = quiet
+) -> LiveStream:
+    """Play runs at their own times to whoever watches; return at once. `say` is told what takes long.
 
     Raises:
         InputError: a folder without states, or an address that cannot be used.
         MissingDependency: the extra `xr` is not installed, or the page was not built.
     """
+    from femsense.xr.run_contents import has_current_glb
     from femsense.xr.stream.run_source import frames_of, open_run
 
+    for run in runs:
+        if (run / "states.npz").is_file() and not has_current_glb(run):
+            say(f"making the mesh of {run}")
     opened = [open_run(run, clouds=clouds) for run in runs]
     names = _distinct([one.twin.name for one in opened])
     live = _serve(options, names[0])
     for one, name in zip(opened, names):
         _play(live, replace(one.twin, name=name), frames_of(one, rate_hz=options.rate_hz, loop=loop), options)
+        live.closers.append(one.clouds.close)
     return live
 
 
@@ -140,8 +157,9 @@ def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, nam
     stop = Event()
     readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
     live = _serve(options, twin.name, stop)
-    live.sources[without_password(source)] = lambda: readings.trouble
-    _play(live, twin, frames_of_sensors(readings, model), options, at_once=True)
+    shown = without_password(source)
+    live.watched.append(readings_from(shown, lambda: readings.trouble))
+    _play(live, twin, frames_of_sensors(readings, model), options, readings=f"readings of {shown}")
     return live
 
 
@@ -193,7 +211,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
             hint="learn with -c CALIBRATION, or with --robot-frame where they are in it",
         )
     readings = readings_of(source, model.channels, live.stop)
-    live.sources[without_password(source)] = lambda: readings.trouble
+    live.watched.append(readings_from(without_password(source), lambda: readings.trouble))
 
     def run() -> None:
         for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
@@ -218,7 +236,7 @@ def show_stream(
     except BaseException:
         bridge.close()
         raise
-    return LiveStream(hub, server, closers=[bridge.close], links={without_password(url): lambda: bridge.trouble})
+    return LiveStream(hub, server, closers=[bridge.close], watched=[connection(without_password(url), lambda: bridge.trouble)])
 
 
 def stream_document(live: LiveStream) -> dict[str, Any]:
@@ -268,14 +286,16 @@ def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> Liv
         if options.mqtt is not None:
             address = broker_address(options.mqtt, password=password, authority=options.authority)
             sink = MqttSink(hub, address, first)
-            live.links[f"{address.host}:{address.port}"] = lambda: sink.trouble
+            live.brokers = (f"{address.host}:{address.port}",)
+            live.watched.append(connection(live.brokers[0], lambda: sink.trouble))
         undo.pop_all()
     return live
 
 
-def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, at_once: bool = False) -> None:
-    """Send frames from a thread of their own."""
-    publisher = Publisher(live.hub, twin, PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror))
+def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, readings: str = "") -> None:
+    """Send frames from a thread of their own; those of `readings` at once as they come, others at their own times."""
+    publishing = PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror, waits_for=readings or FIRST_POSE)
+    publisher = Publisher(live.hub, twin, publishing)
     live.publishers.append(publisher)
 
     def watch() -> None:
@@ -283,7 +303,7 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
             publisher.watch()
 
     def run() -> None:
-        if at_once:
+        if readings:
             for frame in frames:
                 publisher.publish(frame)
         else:
@@ -293,7 +313,7 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
     live.threads.append(thread)
     thread.start()
-    if at_once:
+    if readings:
         Thread(target=watch, daemon=True, name=f"femsense-watch-{twin.name}").start()
 
 

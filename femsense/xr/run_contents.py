@@ -128,10 +128,16 @@ def _stiffness(run: Path) -> float | None:
         return None
 
 
+def has_current_glb(run: Path) -> bool:
+    """Return whether the mesh of a run is there, and no older than its states."""
+    glb, states = run / "robot.glb", run / "states.npz"
+    return glb.is_file() and states.is_file() and glb.stat().st_mtime >= states.stat().st_mtime
+
+
 def current_glb(run: Path, scratch: Path) -> Path:
     """Return the mesh of the run, made anew where it is missing or older than the states."""
-    glb, states = run / "robot.glb", run / "states.npz"
-    if glb.is_file() and glb.stat().st_mtime >= states.stat().st_mtime:
+    glb = run / "robot.glb"
+    if has_current_glb(run):
         return glb
     target = glb if os.access(run, os.W_OK) else scratch / "robot.glb"
     export_run(run, target)

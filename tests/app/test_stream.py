@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
 import socket
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import numpy as np
 import pytest
 from glb import ROOT
 from helpers import write_block_robot, write_small_recording
-from small_run import make_run
+from small_run import make_run, write_run_with_a_cloud
 from streams import within
 from xr_bar import write_run_with_mesh
 
@@ -32,9 +34,13 @@ from femsense.app.stream_command import (
     stream_sensors,
     stream_text,
 )
+from femsense.calib.calibration import Calibration
+from femsense.calib.files import write_calibration
 from femsense.core.errors import InputError
+from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
+from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.run_files import run_inputs, write_run
 from femsense.xr.armature import make_armature
 from femsense.xr.proprioception.domain import learn_domain
@@ -73,6 +79,23 @@ def test_two_runs_reach_a_viewer_of_a_viewer(tmp_path: Path, page: Path) -> None
             assert within(10.0, lambda name=robot: f"femsense/{name}/pose_json" in shown.hub.newest())
             assert shown.hub.newest()[f"femsense/{robot}/glb"].payload[:4] == b"glTF"
     assert json.loads(live.hub.newest()["femsense/bar/status"].payload)["state"] == "ended"
+
+
+def test_a_run_without_its_mesh_says_that_it_is_made_and_streams_what_was_measured(tmp_path: Path, page: Path) -> None:
+    run, made, _ = write_run_with_a_cloud(tmp_path)
+    surface = PointCloud(made.states.nodes_m[1].astype(float), None)
+    write_cloud(tmp_path / "recording" / "clouds" / "000001.ply", surface)
+    unknown, here = np.zeros((6, 6)), np.eye(4)
+    write_calibration(
+        Calibration(here, (here,), ("",), {}, {}, 0.0, {}, (), here, unknown, {}, {}, "given"), run / "calibration.json"
+    )
+    said: list[str] = []
+    with stream_runs([run], StreamOptions(page=page), say=said.append) as live:
+        assert said == [f"making the mesh of {run}"]
+        newest, topic = live.hub.newest, f"femsense/{made.robot.name}/cloud"
+        assert within(30.0, lambda: topic in newest() and len(newest()[topic].payload) > 100)
+        points = np.frombuffer(newest()[topic].payload[20:], dtype="<f4").reshape(-1, 4)
+    assert len(points) > 30 and np.abs(points[:, 3]).max() < 0.02  # points of the body, by their distance from its surface
 
 
 def test_a_run_that_is_played_once_ends_and_says_so(tmp_path: Path, page: Path) -> None:
@@ -127,8 +150,9 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
         live.wait(said.append)
     why = ("nothing has come yet", "they stopped")
     silences = [f"no readings of udp://127.0.0.1:{port} ({text}), waiting" for text in why]
-    assert said == [silences[0], "readings come", silences[1], "readings come"]
-    assert states == ["stale", "live"] * 2
+    come = f"readings of udp://127.0.0.1:{port} come"
+    assert said == [silences[0], come, silences[1], come]
+    assert states == ["waiting", "live", "stale", "live"]
 
 
 def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,6 +162,23 @@ def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, 
     (tmp_path / "empty").write_text("\n", encoding="utf-8")
     with pytest.raises(InputError, match="password is empty"):
         show_stream("http://127.0.0.1:1", page=page, password_file=tmp_path / "empty")
+
+
+@pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="the page was not built into this installation")
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_line_says_at_once_what_it_does_and_at_the_end_what_was_streamed(tmp_path: Path, end: signal.Signals) -> None:
+    run = write_run_with_mesh(tmp_path / "bar")
+    call = [sys.executable, "-m", "femsense", "stream", str(run), "--port", "0"]
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as program:
+        assert program.stdout is not None and program.stderr is not None
+        assert program.stderr.readline() == f"reading {run}\n"
+        url = program.stdout.readline().strip()
+        with connect(f"{url.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
+            assert viewer.recv(5)
+        program.send_signal(end)
+        assert program.wait(20) == 0
+        said = program.stderr.read()
+    assert re.fullmatch(r"streamed [1-9]\d* poses? of bar in \d+\.\d s, to 1 viewer\n", said), said
 
 
 @pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="the page was not built into this installation")

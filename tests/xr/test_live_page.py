@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,12 @@ from live_bars import Source
 from streams import read_frame, within
 from xr_bar import write_run_with_mesh
 
-from femsense.xr.stream.hub import Message
+from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import TwinFrame, pose_bytes, status_bytes
+from femsense.xr.stream.publisher import Publisher, PublishOptions
 from femsense.xr.stream.run_source import RunStream, frames_of, open_run
+from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
+from femsense.xr.view import live_page_files
 
 pytest.importorskip("websockets")
 
@@ -88,8 +92,8 @@ await page.evaluate(() => new Promise((done) => {
 await page.evaluate(() => {
   const proto = femsense.shown.robots.get('bar').constructor.prototype, step = proto.step;
   globalThis.pictures = [];
-  proto.step = function (now, at, stage) {
-    step.call(this, now, at, stage);
+  proto.step = function (now, ...more) {
+    step.call(this, now, ...more);
     if (this.id === 'bar') pictures.push([(now - this.arrived) / 1000, this.body.isStale]);
   };
 });
@@ -252,6 +256,91 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
     assert all(told["spoken"]) and not any(told["unspoken"])  # nobody speaks of forces of the third robot
     side = 1.0 - 2 * 10 / 700  # a label stays in the picture, ten pixels from its edges
     assert told["edges"][1] == pytest.approx(side, abs=0.01) and told["edges"][2] == pytest.approx(-side, abs=0.01)
+
+
+WAITS = """
+const page = await opened.newPage({ viewport: { width: 700, height: 500 } });
+const say = (what) => console.log(JSON.stringify(what));
+const told = () => new Promise((done) => process.stdin.once('data', done));
+const badge = (state) => page.waitForFunction((s) => document.querySelector('#badge').dataset.state === s, state, { timeout: 60000 });
+const seen = () => page.evaluate(() => ({ badge: document.querySelector('#badge').textContent, panel: document.querySelector('#panel').checkVisibility(),
+  live: document.querySelector('#live').getAttribute('aria-pressed'), grey: femsense.shown.robots.get('arm').body.isStale }));
+await page.goto(given[0]);
+await badge('waiting');
+await page.waitForFunction(() => femsense.shown.robots.get('arm')?.body?.isStale, null, { timeout: 60000 });
+say(await seen());
+await badge('live');
+await page.waitForTimeout(300);
+say(await seen());
+await page.keyboard.press(' ');
+await badge('paused');
+say(await seen());
+await page.evaluate(() => {
+  const robot = femsense.shown.robots.get('arm'), proto = robot.constructor.prototype, step = proto.step;
+  globalThis.pictures = [];
+  proto.step = function (now, ...more) {
+    step.call(this, now, ...more);
+    pictures.push([(now - this.arrived) / 1000, this.body.isStale]);
+  };
+});
+await told();
+await badge('stale');
+await page.waitForTimeout(300);
+say({ ...await seen(), pictures: await page.evaluate(() => globalThis.pictures) });
+await told();
+await badge('lost');
+say(await seen());
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_page_says_what_it_waits_for_and_greys_what_stops_while_it_is_paused(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    run, hub = open_run(write_run_with_mesh(tmp_path / "bar")), Hub()
+    publisher = Publisher(hub, replace(run.twin, name="arm"), PublishOptions(waits_for="readings of a.csv"))
+    server = WebSocketServer(hub, live_page_files(built_page), options=ServerOptions(port=0))
+    browser = start_browser(request.config, WAITS, server.url)
+    assert browser.stdin is not None and browser.stdout is not None
+    flowing, frames = Event(), frames_of(run, rate_hz=30.0)
+
+    def flow() -> None:
+        while not flowing.wait(1 / 30):
+            publisher.publish(next(frames))
+
+    def said() -> dict[str, Any]:
+        line = browser.stdout.readline()
+        assert line, browser.stderr.read() if browser.stderr else ""
+        return dict(json.loads(line))
+
+    def go() -> None:
+        browser.stdin.write("go\n")
+        browser.stdin.flush()
+
+    try:
+        waiting = {"badge": "waiting for readings of a.csv", "panel": False, "live": "false", "grey": True}
+        assert said() == waiting
+        sender = Thread(target=flow, daemon=True)
+        sender.start()
+        live = said()
+        assert live["badge"].startswith("live") and live["panel"] and live["live"] == "true" and not live["grey"]
+        paused = said()
+        assert paused["badge"].startswith("paused · live") and paused["live"] == "false" and not paused["grey"]
+        go()
+        time.sleep(0.3)
+        flowing.set()  # nothing comes any more, the connection stands
+        stale = said()
+        assert stale["badge"].startswith("paused · stale") and stale["grey"]
+        assert all(grey == (age > 0.4) for age, grey in stale["pictures"]) and any(not grey for _, grey in stale["pictures"])
+        sender.join()
+        go()
+        hub.close()
+        assert said() == {"badge": "paused · no connection", "panel": True, "live": "false", "grey": True}
+    finally:
+        flowing.set()
+        hub.close()
+        browser.kill()
 
 
 def check_scene(scene: dict[str, Any], run: RunStream, frame: TwinFrame) -> None:

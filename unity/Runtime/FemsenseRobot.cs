@@ -14,7 +14,7 @@ namespace Femsense
         [Tooltip("The node robot_frame of the loaded mesh, or any transform turned by -90 degrees about x")] public Transform robotFrame;
         [Tooltip("Length of an arrow of one newton [m]")] public float metresPerNewton = 0.05f;
         [Tooltip("A pose that is older is stale [s]")] public float staleAfter = 0.4f;
-        /// <summary>What the sender says of itself: live, stale, ended or lost.</summary>
+        /// <summary>What the sender says of itself: waiting (for its first pose), live, stale, ended or lost.</summary>
         public Status Status { get; private set; }
         /// <summary>What is said of the newest frame; anything but "ok" is doubtful.</summary>
         public string FrameStatus { get; private set; }

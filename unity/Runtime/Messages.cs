@@ -55,7 +55,7 @@ namespace Femsense
         }
     }
 
-    /// <summary>Whether a robot streams: live, stale (its sensors say nothing), ended, or lost (its program died).</summary>
+    /// <summary>Whether a robot streams: waiting (for what Detail says), live, stale (its sensors say nothing), ended, or lost (its program died).</summary>
     public sealed class Status
     {
         public string State = "";

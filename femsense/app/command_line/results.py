@@ -105,10 +105,14 @@ def view(
 
         need_one([] if run is None else [run], stream)
         return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
-    from femsense.xr.view import serve, write_static_page
-
     if run is None:
         raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
+    say(f"reading {run}")
+    from femsense.xr.run_contents import has_current_glb
+    from femsense.xr.view import serve, write_static_page
+
+    if (run / "states.npz").is_file() and not has_current_glb(run):
+        say(f"making the mesh of {run}")
     if output is not None:
         page = write_static_page(run, output)
         return Answer({"page": str(page)}, f"written: {page}")
@@ -117,6 +121,7 @@ def view(
     def wait() -> None:
         with contextlib.suppress(KeyboardInterrupt), server:
             server.wait()
+        say("the page is closed")
 
     return Answer({"url": server.url}, f"{server.url}\nCtrl-C ends it", then=wait)
 
@@ -159,6 +164,8 @@ def stream(
     json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
+    for what in [str(run) for run in runs or []] + ([] if model is None else [str(model)]):
+        say(f"reading {what}")
     from femsense.app.stream_command import (
         StreamOptions,
         let_drag,
@@ -185,11 +192,12 @@ def stream(
     )
     if sensors is not None and model is not None and not runs:
         return _live(stream_sensors(sensors, model, options), browser)
-    live = stream_runs(runs or [], options, loop=not once)
+    live = stream_runs(runs or [], options, loop=not once, say=say)
     if drag or commands:
         from femsense.xr.stream.command_gate import GateOptions
         from femsense.xr.stream.drag_server import DragOptions
 
+        say("making ready for drags")
         let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=commands)))
         if sensors is not None and model is not None:
             measure_by_sensors(live, sensors, model)
@@ -208,6 +216,7 @@ def _live(live: LiveStream, browser: bool) -> Answer:
     def wait() -> None:
         with contextlib.suppress(KeyboardInterrupt), live:
             live.wait(say)
+        say(live.streamed.text if live.publishers else "the page is closed")
 
     return Answer(stream_document(live), stream_text(live), then=wait)
 

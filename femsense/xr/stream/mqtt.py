@@ -202,6 +202,7 @@ class EmbeddedBroker:
         self._loop = asyncio.new_event_loop()
         self._broker: Any = None
         self._waiting: dict[str, Message] = {}
+        self._arrived: set[str] = set()
         self._failed: BaseException | None = None
         self._finish = asyncio.Event()
         ready = Event()
@@ -219,6 +220,11 @@ class EmbeddedBroker:
         with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
             self._loop.call_soon_threadsafe(self._take, messages)
 
+    @property
+    def clients(self) -> int:
+        """How many different clients were let in so far."""
+        return len(self._arrived)
+
     def close(self) -> None:
         """Let clients go and free the port."""
         with contextlib.suppress(RuntimeError):
@@ -235,18 +241,18 @@ class EmbeddedBroker:
             self._loop.close()
 
     async def _serve(self, ready: Event) -> None:
-        from amqtt.broker import Broker
+        from femsense.xr.stream.broker_guests import EachOnce
 
         for name in ("amqtt", "transitions"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        guests = {"receive": self._hear, "password": self._access.password or ""}
+        guests = {"receive": self._hear, "arrived": self._arrived.add, "password": self._access.password or ""}
         listener: dict[str, Any] = {"type": "tcp", "bind": f"{self._access.host}:{self.port}", "max_connections": 64}
         if self._access.certificate is not None:
             key = self._access.key or self._access.certificate
             listener |= {"ssl": True, "certfile": str(self._access.certificate), "keyfile": str(key)}
         settings = {"listeners": {"default": listener}, "plugins": {"femsense.xr.stream.broker_guests.Guests": guests}}
         try:
-            self._broker = Broker(settings)
+            self._broker = EachOnce(settings)
             await self._broker.start()
         except Exception as error:  # amqtt wraps what the system says in errors of its own
             self._failed = error.__cause__ or error

@@ -31,6 +31,7 @@ from femsense.xr.stream.payloads import (
     topic,
 )
 
+FIRST_POSE = "the first pose"
 STALE_S = 0.4
 """What has sent no pose for so long is stale."""
 EARLY = 0.2
@@ -49,6 +50,8 @@ class PublishOptions:
     """Also `pose_json`, for clients that read only text."""
     glb_url: str = ""
     """Where the mesh can be loaded; by default beside the page."""
+    waits_for: str = FIRST_POSE
+    """What is waited for until the first pose goes out, in words."""
 
 
 class RateLimit:
@@ -70,29 +73,26 @@ class Publisher:
     """Sends one twin's frames into a hub."""
 
     def __init__(self, hub: Hub, twin: Twin, options: PublishOptions | None = None) -> None:
-        """Announce the twin: its mesh, its description, and that it is live."""
+        """Announce the twin: its mesh, its description, and what it waits for."""
         self.hub, self.twin = hub, twin
         self.options = options or PublishOptions()
         self.sent = 0
         self._has_cloud = False
         self._lock = Lock()
-        self._came, self._sent_at, self._state = time.monotonic(), float("nan"), ""
+        self._came, self._sent_at, self._state = time.monotonic(), float("nan"), "waiting"
         self._pose_limit = RateLimit(self.options.rate_hz)
         self._cloud_limit, self._field_limit = RateLimit(self.options.cloud_rate_hz), RateLimit(self.options.cloud_rate_hz)
         self.announce(twin)
 
     def announce(self, twin: Twin) -> None:
         """Say what streams; also later, where something about it has changed."""
-        self.twin, self._state = twin, "live"
+        self.twin = twin
         glb = topic(twin.name, GLB)
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
-        self.hub.publish(
-            [
-                Message(glb, twin.glb),
-                Message(topic(twin.name, MODEL), model_bytes(twin, url)),
-                Message(topic(twin.name, STATUS), status_bytes("live")),
-            ]
-        )
+        model = Message(topic(twin.name, MODEL), model_bytes(twin, url))
+        with self._lock:
+            waits = self.options.waits_for if self._state == "waiting" else ""
+            self.hub.publish([Message(glb, twin.glb), model, self._status(self._state, waits)])
 
     def publish(self, frame: TwinFrame, *, now: float | None = None) -> bool:
         """Send a frame unless the rate forbids it; return whether it was sent."""
@@ -102,7 +102,7 @@ class Publisher:
             if not self._pose_limit.allows(moment):
                 return False
             self._sent_at = time.time()
-            again = [self._status("live")] if self._state == "stale" else []
+            again = [self._status("live")] if self._state in ("waiting", "stale") else []
             self.hub.publish([*again, *self._messages(frame, moment)])
             self.sent += 1
         return True

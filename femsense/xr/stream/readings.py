@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from serial import Serial
 
 LONGEST_LINE = 65_536
+SHOWN = 60
+"""Characters of a line that is no reading."""
 POLL_S = 0.002
 """How often a file is asked whether it has grown."""
 WAIT_S = 0.1
@@ -44,7 +46,7 @@ class Readings(Iterator[Reading]):
         """Read items; `away` says why the source is not there, or nothing."""
         self._items, self._read, self._away = items, read, away
         self._came = float("nan")
-        self._passed = 0
+        self._passed: Any = None
 
     def __next__(self) -> Reading:
         for item in self._items:
@@ -52,7 +54,7 @@ class Readings(Iterator[Reading]):
             if found is not None:
                 self._came = time.monotonic()
                 return found
-            self._passed += 1
+            self._passed = item if self._passed is None else self._passed
         raise StopIteration
 
     @property
@@ -62,7 +64,9 @@ class Readings(Iterator[Reading]):
             return self._away()
         if np.isfinite(self._came):
             return "they stopped" if time.monotonic() - self._came > QUIET_S else ""
-        return f"lines that came: {self._passed}, none a reading of its channels" if self._passed else "nothing has come yet"
+        if self._passed is None:
+            return "nothing has come yet"
+        return f"what comes is no reading of its channels, first {_shown(self._passed)}"
 
     def close(self) -> None:
         """Let go of the source."""
@@ -129,6 +133,12 @@ def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
     if not np.isfinite(values).any():
         return None
     return when if np.isfinite(when) else time.monotonic(), values
+
+
+def _shown(item: Any) -> str:
+    """Return the beginning of what came, for people."""
+    text = item.decode("utf-8", "replace") if isinstance(item, bytes) else str(item)
+    return repr(text if len(text) <= SHOWN else text[:SHOWN] + "…")
 
 
 def _number(value: Any) -> float:

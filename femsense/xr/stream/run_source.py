@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,10 @@ from femsense.xr.landmarks import landmarks_of_run
 from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
 from femsense.xr.stream.payloads import Contact, FieldKind, Input, Twin, TwinFrame
 
+if TYPE_CHECKING:
+    from femsense.model.recording import Recording
+
+Cloud = npt.NDArray[np.float32]
 CLOUD_POINTS = 3000
 """Of a measured cloud that are shown."""
 CLOUD_REACH = 0.1
@@ -35,8 +40,8 @@ class RunStream:
     skin: AnimatedSkin
     frames: tuple[Mapping[str, Any], ...]
     """As `contacts_of_run` has them, one for each pose."""
-    clouds: tuple[npt.NDArray[np.float32] | None, ...]
-    """Measured points and residuals [m], shape (n, 4), of each pose."""
+    clouds: MeasuredClouds
+    """Measured points and residuals of each pose, where the recording is still there."""
     field: npt.NDArray[np.uint8]
     """Share of the largest stress at each vertex of each pose, 0 … 255, shape (F, v)."""
 
@@ -75,8 +80,8 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
         field=FieldKind(**told["field"], largest=stress.largest),
     )
     frames = tuple(told["frames"])
-    measured = _clouds(run, frames) if clouds else None
-    return RunStream(twin, skin, frames, measured or (None,) * len(frames), stress.shares)
+    measured = MeasuredClouds(len(frames), _cloud_reader(run, frames) if clouds else None)
+    return RunStream(twin, skin, frames, measured, stress.shares)
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:
@@ -125,7 +130,7 @@ def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFra
         status=told["status"] or "",
         frame=-1 if told["frame"] is None else told["frame"],
         run_s=t,
-        cloud=stream.clouds[nearest],
+        cloud=stream.clouds.at(nearest),
         field=stream.field[nearest],
     )
 
@@ -152,31 +157,87 @@ def _or_nan(value: float | None) -> float:
 # Clouds of the recording
 
 
-def _clouds(run: Path, frames: tuple[Mapping[str, Any], ...]) -> tuple[npt.NDArray[np.float32] | None, ...] | None:
-    """Return the clouds of all frames; None where the recording or the calibration is no longer there."""
-    from femsense.calib.files import read_calibration
+class MeasuredClouds:
+    """Measured points of each pose with their residuals, read in the background in the order of the poses: what streams need not
+    wait for them (the library for distances alone takes seconds to load)."""
+
+    def __init__(self, count: int, read: Callable[[], Callable[[int], Cloud | None] | None] | None) -> None:
+        """Begin to read.
+
+        Arguments:
+            count: of poses.
+            read: returns what reads the cloud of a pose, or None where there are none; called in the background. None: no clouds.
+        """
+        self._found: dict[int, Cloud | None] = {}
+        self._stop = Event()
+        self._thread: Thread | None = None
+        if read is not None:
+            self._thread = Thread(target=self._read_all, args=(count, read), daemon=True, name="femsense-clouds")
+            self._thread.start()
+
+    def at(self, k: int) -> Cloud | None:
+        """Return points and residuals [m] of a pose, shape (n, 4); None where there are none, or not yet."""
+        return self._found.get(k)
+
+    def wait(self) -> None:
+        """Return when all are read."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def close(self) -> None:
+        """Read no more."""
+        self._stop.set()
+        self.wait()
+
+    def _read_all(self, count: int, read: Callable[[], Callable[[int], Cloud | None] | None]) -> None:
+        cloud_of = read()
+        if cloud_of is None:
+            return
+        for k in range(count):
+            if self._stop.is_set():
+                return
+            self._found[k] = cloud_of(k)
+
+
+def _cloud_reader(run: Path, frames: tuple[Mapping[str, Any], ...]) -> Callable[[], Callable[[int], Cloud | None] | None]:
+    """Return what opens the recording of a run, and then reads a pose's cloud; opens nothing where it is no longer there."""
+
+    def opened() -> Callable[[int], Cloud | None] | None:
+        from femsense.calib.files import read_calibration
+        from femsense.io.recording_folder import load_recording
+        from femsense.sensing.run_files import read_states
+
+        try:
+            document = json.loads((run / "run.json").read_text(encoding="utf-8"))
+            recording = load_recording(document["inputs"]["recording"]["path"])
+            poses = read_calibration(run / "calibration.json").poses
+            states = read_states(run / "states.npz")
+        except (OSError, ValueError, KeyError, TypeError, FemsenseError):
+            return None
+        numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
+        if not recording.has_clouds:
+            return None
+
+        def cloud(k: int) -> Cloud | None:
+            number = numbers.get(frames[k]["frame"], -1)
+            points = _points(recording, number, poses) if number >= 0 and k < len(states.nodes_m) else None
+            return None if points is None else with_residuals(points, states.nodes_m[k], states.tets)
+
+        return cloud
+
+    return opened
+
+
+def _points(recording: Recording, number: int, poses: Sequence[FloatArray]) -> FloatArray | None:
+    """Return what all cameras measured in one frame, robot frame [m], shape (n, 3), or None."""
     from femsense.io.clouds.frame_clouds import read_frame_cloud
-    from femsense.io.recording_folder import load_recording
-    from femsense.sensing.run_files import read_states
 
     try:
-        document = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        recording = load_recording(document["inputs"]["recording"]["path"])
-        poses = read_calibration(run / "calibration.json").poses
-        states = read_states(run / "states.npz")
-    except (OSError, ValueError, KeyError, TypeError, FemsenseError):
+        clouds = [read_frame_cloud(recording, number, view=v) for v in range(len(poses))]
+    except FemsenseError:
         return None
-    numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
-    found: list[npt.NDArray[np.float32] | None] = []
-    for told, nodes in zip(frames, states.nodes_m):
-        k = numbers.get(told["frame"], -1)
-        try:
-            clouds = [read_frame_cloud(recording, k, view=v) for v in range(len(poses))] if k >= 0 else []
-        except FemsenseError:
-            clouds = []
-        points = [cloud.points @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses) if cloud is not None]
-        found.append(with_residuals(np.vstack(points), nodes, states.tets) if points else None)
-    return tuple(found)
+    points = [cloud.points @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses) if cloud is not None]
+    return np.vstack(points) if points else None
 
 
 def with_residuals(points: FloatArray, nodes: npt.ArrayLike, tets: npt.ArrayLike) -> npt.NDArray[np.float32]:

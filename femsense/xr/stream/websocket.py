@@ -122,6 +122,8 @@ class WebSocketServer:
         self.hub, self.page = hub, page
         self.access, self.options = access or Access(), options or ServerOptions()
         self.port = 0
+        self.visits = 0
+        """How many viewers came so far."""
         self._viewers: set[_Viewer] = set()
         self._fresh: dict[str, Message] = {}
         self._lock = Lock()
@@ -229,6 +231,7 @@ class WebSocketServer:
         viewer = _Viewer()
         viewer.offer({name: message for name, message in self.hub.newest().items() if not name.endswith(f"/{GLB}")})
         self._viewers.add(viewer)
+        self.visits += 1
         listening = asyncio.create_task(self._listen(connection))
         listening.add_done_callback(lambda _: viewer.leave())
         try:

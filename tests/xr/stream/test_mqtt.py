@@ -34,12 +34,15 @@ needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto on 
 class Heard:
     """What an MQTT client hears."""
 
-    def __init__(self, port: int, address: BrokerAddress | None = None) -> None:
+    def __init__(self, port: int, address: BrokerAddress | None = None, topics: tuple[str, ...] = ("femsense/#",)) -> None:
         self.messages: dict[str, bytes] = {}
-        self.source = MqttSource(address or BrokerAddress("127.0.0.1", port), self.take)
+        self.kinds: list[str] = []
+        """Of all messages, in the order in which they came."""
+        self.source = MqttSource(address or BrokerAddress("127.0.0.1", port), self.take, topics=topics)
 
     def take(self, message: Message) -> None:
-        self.messages[message.topic.rpartition("/")[2]] = message.payload
+        self.kinds.append(message.topic.rpartition("/")[2])
+        self.messages[self.kinds[-1]] = message.payload
 
     def state(self) -> str:
         return str(json.loads(self.messages.get("status", b"{}")).get("state"))
@@ -79,12 +82,30 @@ def test_the_embedded_broker_has_the_model_for_who_comes_late_and_the_pose_for_a
     heard = Heard(broker.port)
     with closing(heard, hub):
         assert within(5.0, lambda: {"glb", "model", "status"} <= heard.messages.keys())
-        assert heard.messages["glb"] == GLB and heard.state() == "live"
+        assert heard.messages["glb"] == GLB and heard.state() == "waiting"
         publisher.publish(moment(0.0, x=0.5))
         assert within(5.0, lambda: {"pose", "force", "inputs", "pose_json"} <= heard.messages.keys())
         assert x_of(heard.messages["pose"]) == 0.5
         publisher.end()
         assert within(5.0, lambda: heard.state() == "ended")
+
+
+def test_the_embedded_broker_gives_what_is_kept_once_to_each_of_several_and_only_what_it_asked_for() -> None:
+    hub = Hub()
+    publisher = Publisher(hub, twin())
+    broker = EmbeddedBroker(hub, port=0)
+    first = Heard(broker.port)
+    with closing(first, hub):
+        assert within(5.0, lambda: "status" in first.kinds)
+        second, states = Heard(broker.port), Heard(broker.port, topics=("femsense/+/status",))
+        with closing(second, states):
+            assert within(5.0, lambda: "status" in second.kinds and "status" in states.kinds)
+            publisher.end()  # what comes after all that is kept
+            assert within(5.0, lambda: all(one.state() == "ended" for one in (first, second, states)))
+            for one in (first, second):
+                assert sorted(one.kinds) == ["glb", "model", "status", "status"]
+            assert states.kinds == ["status", "status"]
+        assert broker.clients == 3
 
 
 def test_a_taken_port_is_said() -> None:
@@ -126,7 +147,7 @@ def test_a_program_that_is_killed_is_announced_as_lost(tmp_path: Path) -> None:
         heard = Heard(port)
         paths = f"import sys; sys.path[:0] = {sys.path!r}\n"
         with subprocess.Popen([sys.executable, "-c", paths + code]) as program, closing(heard):
-            assert within(20.0, lambda: heard.state() == "live")
+            assert within(20.0, lambda: heard.state() == "waiting")
             program.send_signal(signal.SIGKILL)
             assert within(10.0, lambda: heard.state() == "lost")
 
@@ -206,7 +227,7 @@ def test_a_bridge_brings_another_page_s_stream_comes_back_and_takes_wishes_along
         assert within(5.0, lambda: b"lost" in here.newest()["femsense/arm/status"].payload)
         again = WebSocketServer(there, PAGE, options=ServerOptions(port=server.port))
         with closing(again):
-            assert within(5.0, lambda: b"live" in here.newest()["femsense/arm/status"].payload)
+            assert within(5.0, lambda: b"waiting" in here.newest()["femsense/arm/status"].payload)
             publisher.publish(moment(1.0, x=0.5))
             assert within(5.0, lambda: "femsense/arm/pose" in here.newest())
             assert x_of(here.newest()["femsense/arm/pose"].payload) == 0.5

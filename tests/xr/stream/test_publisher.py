@@ -55,9 +55,27 @@ def test_messages_of_a_moment_go_together_and_too_many_do_not_go() -> None:
     hub.attach(sink)
     sink.batches.clear()
     assert publisher.publish(moment(0.0), now=0.0) and not publisher.publish(moment(0.001), now=0.001)
-    assert sink.topics() == ["pose", "force", "inputs"] and len(sink.batches) == 1
+    assert sink.topics() == ["status", "pose", "force", "inputs"] and len(sink.batches) == 1
     publisher.end()
     assert b"ended" in hub.newest()["femsense/arm/status"].payload
+
+
+def test_until_the_first_pose_it_is_said_what_is_waited_for() -> None:
+    hub = Hub()
+    publisher = Publisher(hub, twin(), PublishOptions(waits_for="readings of a.csv"))
+
+    def status() -> dict[str, object]:
+        return json.loads(hub.newest()["femsense/arm/status"].payload)
+
+    waiting = {"state": "waiting", "detail": "readings of a.csv"}
+    assert status() == waiting
+    publisher.watch(now=time.monotonic() + 10.0)
+    publisher.announce(twin(name="arm", frame="markers"))  # something else about it has changed
+    assert status() == waiting  # what never was live is not stale
+    publisher.publish(moment(0.0))
+    assert status() == {"state": "live", "detail": ""}
+    publisher.announce(twin())
+    assert status() == {"state": "live", "detail": ""}
 
 
 def test_a_source_that_stops_is_stale_until_it_goes_on() -> None:
@@ -84,12 +102,6 @@ def test_a_source_that_stops_is_stale_until_it_goes_on() -> None:
     publisher.watch(now=20.0)
     publisher.publish(moment(2.0), now=21.0)
     assert status()["state"] == "ended"
-
-
-def test_a_source_that_never_began_is_stale_without_a_time() -> None:
-    hub = Hub()
-    Publisher(hub, twin()).watch(now=time.monotonic() + 1.0)
-    assert json.loads(hub.newest()["femsense/arm/status"].payload) == {"state": "stale", "detail": ""}
 
 
 def test_a_field_goes_out_ten_times_a_second_at_most() -> None:

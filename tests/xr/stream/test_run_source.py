@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import time
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from xr_bar import bar_mesh, bar_states, write_run_with_mesh
 from femsense.core.errors import InputError
 from femsense.xr.glb_reader import read_glb
 from femsense.xr.skinning import skin_vertices
-from femsense.xr.stream.run_source import RunStream, between, frames_of, open_run, with_residuals
+from femsense.xr.stream.run_source import MeasuredClouds, RunStream, between, frames_of, open_run, with_residuals
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +84,24 @@ def test_residuals_of_a_cloud_are_distances_from_the_surface() -> None:
     cloud = with_residuals(points, mesh.nodes, mesh.tets)
     np.testing.assert_allclose(cloud[:, 3], [0.003, -0.002], atol=1e-6)
     np.testing.assert_allclose(cloud[:, :3], points[:2], atol=1e-6)
+
+
+def test_clouds_are_read_beside_the_stream_until_it_is_closed() -> None:
+    begun, go = Event(), Event()
+
+    def read(k: int) -> np.ndarray | None:
+        begun.set()
+        assert go.wait(10.0)
+        return None if k == 1 else np.full((1, 4), k, dtype=np.float32)
+
+    clouds = MeasuredClouds(3, lambda: read)
+    assert begun.wait(10.0) and clouds.at(0) is None  # not yet, and nobody waits for it
+    go.set()
+    clouds.wait()
+    assert clouds.at(1) is None and [clouds.at(k)[0, 0] for k in (0, 2)] == [0.0, 2.0]
+    closed = MeasuredClouds(10_000, lambda: lambda k: time.sleep(0.01))
+    closed.close()  # does not wait for all of them
+    assert MeasuredClouds(3, lambda: None).at(0) is None and MeasuredClouds(3, None).at(0) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"glTF", b"x" * 40, b"glTF\x02\0\0\0\x1c\0\0\0\x08\0\0\0JSON{}      "])

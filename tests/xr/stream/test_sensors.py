@@ -247,7 +247,7 @@ def test_a_source_without_readings_says_why() -> None:
     assert list(nowhere) == []
 
 
-def test_lines_that_are_no_readings_are_counted_until_one_is() -> None:
+def test_a_line_that_is_no_reading_is_shown_until_one_is() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -255,7 +255,10 @@ def test_lines_that_are_no_readings_are_counted_until_one_is() -> None:
     assert readings.trouble == "nothing has come yet"
     Thread(target=lambda: found.append(next(readings)), daemon=True).start()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for line, said in ((b"1,2,3,4,5,6,7,8,9", "lines that came: 1, none a reading of its channels"), (b"1,2", "")):
+        for line, said in (
+            (b"1,2,3,4,5,6,7,8,9", "what comes is no reading of its channels, first '1,2,3,4,5,6,7,8,9'"),
+            (b"1,2", ""),
+        ):
             sender.sendto(line, ("127.0.0.1", port))
             assert within(3.0, lambda said=said: readings.trouble == said)
     assert within(3.0, lambda: bool(found)) and found[0][1].tolist() == [1.0, 2.0]

@@ -45,7 +45,7 @@ class Streams {
   constructor(private readonly stage: Stage) {
     this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
     this.dragging = new Dragging(stage, (robot, wish) => this.connection.send(pack(robot, "drag", wish)));
-    element("panel").hidden = element("dock").hidden = false;
+    element("dock").hidden = false;
     element("about").textContent = "waiting for a robot …";
     element("cloud").hidden = element("drag").hidden = true;
     stage.headset.grab = (hand) => this.dragging.take(hand);
@@ -133,7 +133,7 @@ class Streams {
 
   private step(): void {
     const now = performance.now();
-    for (const robot of this.robots.values()) robot.step(now, this.paused ? this.at : null, this.stage);
+    for (const robot of this.robots.values()) robot.step(now, this.paused ? this.at : null, this.open, this.stage);
     this.dragging.step();
     if (now - this.drawn < 100) return;
     this.drawn = now;
@@ -153,10 +153,13 @@ class Streams {
   private read(now: number): void {
     const robot = this.chosen;
     const badge = element("badge");
-    const [state, said] = robot ? robot.state(now, this.open) : [this.open ? "waiting" : "lost", this.open ? "no robot yet" : "no connection"];
+    const [state, words] = robot ? robot.state(now, this.open) : [this.open ? "waiting" : "lost", this.open ? "no robot yet" : "no connection"];
     document.documentElement.dataset.stream = state;
+    const said = this.paused ? `paused · ${words}` : words;
     badge.dataset.state = this.paused && state === "live" ? "paused" : state;
     if (badge.textContent !== said) badge.textContent = said;
+    element("live").setAttribute("aria-pressed", String(!this.paused && state === "live"));
+    element("panel").hidden = !robot?.shown;
     if (!robot) return;
     element("about").textContent = robot.about();
     element<HTMLOptionElement>("paint-stress").hidden = !robot.model.field;
@@ -167,7 +170,7 @@ class Streams {
     const shown = robot.shown;
     if (!shown) return;
     showFrame(shown, robot.model.inputs, Math.max(robot.body?.arrows.largest ?? 0, 1e-9));
-    element("panel").dataset.stale = String(state !== "live" && !this.paused);
+    element("panel").dataset.stale = String(state !== "live");
     const newest = robot.newest?.time_s ?? 0;
     const end = this.paused ? Math.max(this.at, newest - KEPT_S + PLOTTED_S) : newest;
     this.plot.draw(robot.history, end - PLOTTED_S, end, shown.time_s);
@@ -186,7 +189,6 @@ class Streams {
     const every = Math.max(1, Math.floor(robot.history.length / 300));
     drawCurve(robot.history.filter((_, i) => i % every === 0), oldest, newest);
     element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : clockText(robot, shown);
-    element("live").setAttribute("aria-pressed", String(!this.paused));
   }
 
   private legend(kind: Paint): void {
@@ -307,8 +309,8 @@ class Robot {
     this.join();
   }
 
-  /** Shows the newest moment, or that of a time while paused. */
-  step(now: number, at: number | null, stage: Stage): void {
+  /** Shows the newest moment, or that of a time while paused; grey as soon as the stream is not live, paused or not. */
+  step(now: number, at: number | null, open: boolean, stage: Stage): void {
     const body = this.body;
     if (!body) return;
     const wanted = at === null ? this.newest : (this.history[frameAt(this.history, at)] ?? null);
@@ -316,7 +318,7 @@ class Robot {
       this.put(wanted);
       stage.touch();
     }
-    const stale = at === null && this.state(now, true)[0] !== "live";
+    const stale = this.state(now, open)[0] !== "live";
     if (stale !== body.isStale) {
       body.setStale(stale);
       stage.touch();
@@ -333,7 +335,7 @@ class Robot {
     if (!open) return ["lost", "no connection"];
     if (state === "ended") return ["ended", "ended"];
     if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
-    if (!Number.isFinite(age)) return ["waiting", "no pose yet"];
+    if (state === "waiting" || !Number.isFinite(age)) return ["waiting", `waiting for ${(state === "waiting" && detail) || "the first pose"}`];
     if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
     return ["live", this.rate()];
   }

@@ -1,0 +1,84 @@
+"""What a stream says while it runs and when it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Watched:
+    """A connection or a source of readings, which may be missing."""
+
+    missing: str
+    back: str
+    until: str
+    why: Callable[[], str]
+    """Why it is missing; empty where it is there."""
+
+    @property
+    def trouble(self) -> str:
+        """That it is missing and why; empty where it is there."""
+        why = self.why()
+        return f"{self.missing} ({why}), {self.until}" if why else ""
+
+
+def connection(where: str, why: Callable[[], str]) -> Watched:
+    """Return what watches a connection to elsewhere."""
+    return Watched(f"no connection to {where}", f"connected to {where}", "trying again", why)
+
+
+def readings_from(source: str, why: Callable[[], str]) -> Watched:
+    """Return what watches a source of readings."""
+    return Watched(f"no readings of {source}", f"readings of {source} come", "waiting", why)
+
+
+class StreamLog:
+    """Says of each connection and source for itself when it goes and when it comes back."""
+
+    def __init__(self, watched: Sequence[Watched]) -> None:
+        """Watch; as long as nothing was missing, nothing is said."""
+        self._watched = watched
+        self._known: dict[Watched, str] = {}
+
+    def news(self) -> list[str]:
+        """Return what has changed since the last call."""
+        told = []
+        for one in self._watched:
+            trouble = one.trouble
+            if trouble != self._known.get(one, ""):
+                told.append(trouble or one.back)
+            self._known[one] = trouble
+        return told
+
+
+@dataclass(frozen=True, slots=True)
+class Streamed:
+    """What was streamed, and who got it."""
+
+    poses: dict[str, int]
+    """Of each robot."""
+    seconds: float
+    viewers: int
+    """Of the page and its WebSocket."""
+    clients: int | None = None
+    """Of the embedded broker; None: there was none."""
+    brokers: Sequence[str] = ()
+    """Elsewhere, that it was sent to."""
+
+    @property
+    def text(self) -> str:
+        """One sentence for people."""
+        robots = [f"{_count(count, 'pose')} of {name}" for name, count in self.poses.items()]
+        places = [_count(self.viewers, "viewer")]
+        places += [] if self.clients is None else [_count(self.clients, "client of the broker", "clients of the broker")]
+        places += [f"the broker {where}" for where in self.brokers]
+        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}"
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    return f"{number or 'no'} {one if number == 1 else many or one + 's'}"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
