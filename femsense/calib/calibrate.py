@@ -15,6 +15,7 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
+from femsense.calib.declared_poses import Fitted, check_declared_poses
 from femsense.calib.first_poses import first_poses
 from femsense.calib.from_clouds import free_clouds, pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
@@ -155,6 +156,7 @@ def _fitted(
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
         pairs = pairs_of(robot, scene, poses, jet.residual)
     if strict:
+        check_declared_poses(scene.recording, poses, pairs, lambda other: _left_with(robot, other, scene.frames))
         check_inputs(scene.recording, pairs)
         said = check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
         if initial is None and not said:
@@ -167,6 +169,12 @@ def _fitted(
 def _residual_of(robot: Robot, recording: Recording, frames: IntArray) -> FloatArray:
     """Return what a fit to some frames leaves [m], shape (k, 3)."""
     return _fitted_as_named(robot, recording, frames, [])[-1].residual
+
+
+def _left_with(robot: Robot, recording: Recording, frames: IntArray) -> Fitted:
+    """Return what a fit to some frames leaves [m], and its poses."""
+    _, _, poses, _, jet = _fitted_as_named(robot, recording, frames, [])
+    return root_mean_square(jet.residual), poses
 
 
 def _fitted_as_named(

@@ -1,0 +1,43 @@
+"""A declared pose that is not that of the camera is named, by how much; one that is right is not."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import T_ROBOT_CAMERA, arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.errors import DataError
+from femsense.core.pose import move_pose
+from femsense.model.recording import Recording
+
+LEVELS = np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0)])
+INITIAL = np.array([0.6, 0.3, 0.2, 0.4])
+
+
+def declared(recording: Recording, step: list[float]) -> Recording:
+    return replace(recording, T_robot_camera=(move_pose(T_ROBOT_CAMERA, step, pivot_a=[0.05, 0, 0]),))
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+def test_a_pose_that_is_off_is_named_with_its_shift_and_turn(zero: str) -> None:
+    recording = record(LEVELS, noise=2e-4, **({"zero": zero, "initial": INITIAL} if zero == "unknown" else {}))[0]
+    with pytest.raises(
+        DataError,
+        match=r"declared pose of camera .* shifted by (9\.\d+|10) mm \((9\.\d+|10), .*at the body. Leave T_robot_camera",
+    ):
+        calibrate(arm(), declared(recording, [0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    with pytest.raises(DataError, match=r"declared pose of camera .* turned by (4\.\d+|5|5\.\d+)° "):
+        calibrate(arm(), declared(recording, [0.0, np.radians(5.0), 0.0, 0.0, 0.0, 0.0]))
+
+
+def test_a_pose_that_is_right_is_not_accused_though_the_body_is_too_soft() -> None:
+    recording = record(LEVELS, noise=2e-4)[0]
+    for robot in (arm(), arm(modulus=500e3)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = calibrate(robot, declared(recording, [0.0] * 6))
+        np.testing.assert_array_equal(found.poses[0], T_ROBOT_CAMERA)
