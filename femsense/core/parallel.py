@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from functools import cache
 from typing import TypeVar
 
@@ -64,7 +65,7 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
     with one_blas_thread(), ThreadPoolExecutor(count) as pool:
         try:
             for item in items:
-                waiting.append(pool.submit(function, item))
+                waiting.append(pool.submit(copy_context().run, function, item))  # work is counted there, too
                 if len(waiting) >= 2 * count:
                     yield waiting.popleft().result()
             while waiting:

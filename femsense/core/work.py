@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from threading import Lock
 
 
 @dataclass(slots=True)
@@ -20,6 +21,7 @@ class Work:
     """States that were continued on a finer mesh."""
 
 
+_adding = Lock()
 _counting: ContextVar[tuple[tuple[Work, Callable[[], None] | None], ...]] = ContextVar("counting", default=())
 
 
@@ -41,8 +43,9 @@ def counting(tell: Callable[[], None] | None = None) -> Iterator[Work]:
 def count(*, equilibria: int = 0, responses: int = 0, refined: int = 0) -> None:
     """Count work that was done, wherever somebody does (`counting`)."""
     for work, tell in _counting.get():
-        work.equilibria += equilibria
-        work.responses += responses
-        work.refined += refined
+        with _adding:
+            work.equilibria += equilibria
+            work.responses += responses
+            work.refined += refined
         if tell is not None:
             tell()

@@ -15,6 +15,8 @@ from helpers import block_mesh
 from femsense.core import parallel
 from femsense.core.errors import DataError, InputError
 from femsense.core.parallel import beside, each, set_workers, workers
+from femsense.core.work import Work, counting
+from femsense.core.work import count as counted
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import make_body
 from femsense.fem.linalg.factorization import factorize
@@ -26,6 +28,14 @@ from femsense.model.quasi_static_path import solve_path
 def _as_before():
     yield
     set_workers(None)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_work_is_counted_whoever_does_it(threads: int):
+    set_workers(threads)
+    with counting() as work:
+        list(each(lambda i: counted(equilibria=i), range(5)))
+    assert work == Work(equilibria=10)
 
 
 def test_results_come_in_order_and_little_is_worked_on_ahead():

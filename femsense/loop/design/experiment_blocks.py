@@ -13,7 +13,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.least_squares import FitResult
 from femsense.core.pose import rotation_from_vector
-from femsense.loop.data.trial import Trial
+from femsense.loop.data.trial import States, Trial
 from femsense.loop.design.candidate_experiments import MOST_EACH
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.search.effect_fields import effect_fields
@@ -152,45 +152,45 @@ def make_block(
     Raises:
         DataError: a frame has no equilibrium.
     """
-    trial = trial if measured else _as_expected(trial, robot)
-    jet = _jet(trial, robot)
+    trial, states = (trial, None) if measured else _as_expected(trial, robot)
+    jet = _jet(trial, robot, states)
     rows = _seen(trial, robot, jet) if see else np.ones(len(jet.residual), dtype=bool)
     columns, rest_columns = _columns(trial, robot, jet, forms, turns, width=max((f.columns.stop for f in forms), default=0))
-    states = len(np.unique(trial.groups.state[rows]))
+    distinct = len(np.unique(trial.groups.state[rows]))
     gram, placements = _gram(_own(jet)[rows], columns[rows], noise), _placements(jet, rest_columns, noise)
     if not with_rest:
-        return Block(recording, gram, None, placements, states, int(rows.sum()))
+        return Block(recording, gram, None, placements, distinct, int(rows.sum()))
     placed = _with_rest(trial, robot)
-    jet = _jet(placed, robot)
+    jet = _jet(placed, robot, jet.states)
     moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured placements where they are
     fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
     rested = _gram(_own(jet)[rows], columns[rows], noise)
-    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), states, int(rows.sum()))
+    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), distinct, int(rows.sum()))
 
 
 def _own(jet: SceneJet) -> FloatArray:
     return np.concatenate([jet.by_pose, jet.by_initial], axis=2)
 
 
-def _jet(trial: Trial, robot: Robot) -> SceneJet:
+def _jet(trial: Trial, robot: Robot, known: States | None) -> SceneJet:
     probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
-    return probe.jet(trial, _start(trial), np.zeros(0), True)
+    return probe.jet(trial, _start(trial), np.zeros(0), True, known=known)
 
 
 def _start(trial: Trial) -> FloatArray:
     return np.concatenate([np.zeros(6 * len(trial.poses)), np.zeros(0) if trial.initial is None else trial.initial])
 
 
-def _as_expected(trial: Trial, robot: Robot) -> Trial:
-    """Return the trial with its markers where the declared robot would have the camera measure them."""
+def _as_expected(trial: Trial, robot: Robot) -> tuple[Trial, States]:
+    """Return the trial with its markers where the declared robot would have the camera measure them, and the states of that robot."""
     probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
     states = probe.jet(trial, _start(trial), np.zeros(0), False).states
     places = {k: robot.markers.positions(state.positions) for k, state in states.items()}
     scene = trial.scene
     true = np.array([places[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
-    return replace(trial, scene=replace(scene, points=measured_points(trial.poses[0], true, robot.observation)))
+    return replace(trial, scene=replace(scene, points=measured_points(trial.poses[0], true, robot.observation))), states
 
 
 def _with_rest(trial: Trial, robot: Robot) -> Trial:

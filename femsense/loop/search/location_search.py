@@ -16,7 +16,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without,
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
-from femsense.loop.search.refit import tried
+from femsense.loop.search.refit import evidence, tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
 from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
@@ -34,10 +34,10 @@ def located(
     begun = [made, *(one for one in tries if one is not None and one.fit.fit.status != STOPPED_EARLY)]
     moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
-        if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * evident:
+        if not moved or evidence(one.fit, moved[0][0].fit) < 2.0 * evident:
             moved.append(closer(data, one, noise))
     best, scatter = min(moved, key=lambda end: end[0].fit.chi2)
-    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + evident]
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if evidence(s.fit, best.fit) < evident]
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 

@@ -212,3 +212,34 @@ def test_held_out_data_that_speak_against_an_effect_count(started: tuple[Data, F
     lenient = replace(data, thresholds=replace(DEFAULTS, held_gain=-1e9))
     verdict = acceptance_test(lenient, fitted, expensive, replace(made, held=worse), RECORD, NOISE).record.verdict
     assert verdict == "passes" if passes else "held-out data speak against it" in verdict
+
+
+@pytest.mark.parametrize(("acts", "passes"), [(4.0, True), (16.0, False)])
+def test_what_hardly_acts_on_held_out_data_need_not_show_there(started: tuple[Data, FittedModel], acts: float, passes: bool):
+    """What shifts them by χ² of A brings A ± 2 √A if it is true: −A is within three deviations of that where A is less than 9."""
+    data, fitted = started
+    one = payloads(data, fitted)[0]
+    made, before = refit(data, fitted, one, NOISE), [h.jet.residual for h in fitted.held]
+    shifts = [np.random.default_rng(0).normal(size=r.shape) for r in before]
+    along = sum(float(np.vdot(s, r)) for s, r in zip(shifts, before)) / sum(float(np.vdot(r, r)) for r in before)
+    across = [s - along * r for s, r in zip(shifts, before)]  # so that χ² of held-out data rises by A
+    size = 1e-4 * np.sqrt(acts / sum(float(np.vdot(a, a)) for a in across))
+    held = [replace(h, jet=replace(h.jet, residual=h.jet.residual + size * a)) for h, a in zip(fitted.held, across)]
+    record = acceptance_test(data, fitted, one, replace(made, held=held), RECORD, NOISE).record
+    assert record.held_dchi2 == pytest.approx(-acts, rel=1e-6) and record.dbic > 100.0
+    assert record.passes if passes else "does not predict the held-out data" in record.verdict
+
+
+def test_places_explain_as_much_where_the_misfit_hides_the_difference(started: tuple[Data, FittedModel]):
+    data, fitted = started
+    near, *others = payloads(data, fitted)
+    other = next(c for c in others if np.linalg.norm(np.subtract(c.seed["point_m"], near.seed["point_m"])) > 0.01)
+    one, two = (refit(data, fitted, c, NOISE) for c in (near, other))
+    best, worse = sorted((one.fit, two.fit), key=lambda fit: fit.chi2)
+    less, half = evidence(worse, best), 0.5 * np.abs(one.fit.coordinates[-3:] - two.fit.coordinates[-3:])
+    assert worse.chi2 - best.chi2 > 2.0 * less  # so many times the noise is left
+    still = replace(DEFAULTS, swap=np.inf)  # no place is moved
+    for evident, as_good in ((0.9 * less, False), (1.1 * less, True)):
+        own = replace(data, thresholds=replace(still, evidence=evident))
+        scatter = np.array(located(own, fitted, near, one, [other], NOISE)[1])
+        assert bool((scatter >= 0.99 * half).all()) is as_good
