@@ -39,7 +39,7 @@ from femsense.model.camera_frame import in_robot_frame
 from femsense.model.marker_correction import corrected
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene, rest_residual
 from femsense.model.recording import Recording
-from femsense.model.recording_checks import check_against
+from femsense.model.recording_checks import check_against, how_to_free
 from femsense.model.repeats import marker_repeatability
 from femsense.model.robot import Robot
 
@@ -87,8 +87,7 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
         return _from_rest(robot, recording)
     if not len(chosen):
         raise DataError(
-            "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or "
-            "declare loads.csv"
+            f"no frame is free of undeclared contact: mark free frames {how_to_free(recording)}, or declare the loads (loads.csv)"
         )
     allowed = None
     if has_image_markers(robot, recording):
@@ -321,7 +320,7 @@ def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) 
 def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     """Return the calibration of a recording none of whose frames can be used: poses from the markers at rest alone."""
     if recording.actuation_zero == "unknown" and (robot.body.cables or robot.body.chambers):
-        raise DataError("initial inputs need a frame that is free of undeclared contact (column free of frames.csv)")
+        raise DataError(f"initial inputs need a frame that is free of undeclared contact: mark it {how_to_free(recording)}")
     number = {name: i for i, name in enumerate(robot.marker_names)}
     rest = recording.rest
     assert rest is not None

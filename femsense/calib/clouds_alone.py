@@ -19,6 +19,7 @@ from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import how_to_free
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.segmentation import color_mask
@@ -81,7 +82,7 @@ def _states(robot: Robot, recording: Recording, calibration: Calibration, views:
     if not frames:
         raise DataError(
             "the pose of a camera without markers needs a cloud of a free frame: mark frames in which nothing touches "
-            "the robot with 1 in the column free of frames.csv"
+            f"the robot {how_to_free(recording)}"
         )
     initial = None
     if recording.actuation_zero == "unknown":

@@ -24,6 +24,7 @@ from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import how_to_free
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 
@@ -157,7 +158,7 @@ def _frames(recording: Recording) -> list[int]:
     if not frames:
         raise DataError(
             "initial inputs without markers need clouds of free frames: mark frames in which nothing touches the robot "
-            "with 1 in the column free of frames.csv"
+            f"{how_to_free(recording)}"
         )
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, FRAMES).round().astype(int))]
 

@@ -22,6 +22,7 @@ from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
 from femsense.model.observation import Scene
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import in_frames
 from femsense.model.robot import Robot
 
 TOLD = 1.5
@@ -159,7 +160,7 @@ def _by_zero(
     zero = (np.linalg.lstsq(J / size, (measured - modelled).ravel(), rcond=1e-3)[0] / size)[:a]
     unit, scale = ("N", 1.0) if recording.actuation == "tension" else ("mm", 1e3)
     values = ", ".join(f"{name} {scale * z:+.2g} {unit}" for name, z in zip(robot.body.cable_names, zero))
-    text = f'the inputs in frames.csv seem to count from another zero ({values}). actuation_zero = "unknown" finds it'
+    text = f'the inputs{in_frames(recording)} seem to count from another zero ({values}). actuation_zero = "unknown" finds it'
     shifted = replace(recording, inputs=freeze(recording.inputs + zero))
     change = np.zeros_like(response.drivers)
     change[:, :a] = zero
@@ -201,7 +202,7 @@ def _signs(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Rea
         turned = table.copy()
         turned[:, columns] *= -1.0
         if columns and turned[:, columns].any():
-            text = f"the inputs of {', '.join(names[j] for j in columns)} in frames.csv seem to have the wrong sign (> 0 pulls)"
+            text = f"the inputs of {', '.join(names[j] for j in columns)}{in_frames(recording)} seem to have the wrong sign (> 0 pulls)"
             yield Reading(text, robot, _with_inputs(recording, turned), frames)
 
 
@@ -213,7 +214,7 @@ def _orders(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Re
             columns = np.arange(len(names))
             columns[first : first + count] = first + np.array(order)
             moved = [f"{names[i]} moves the robot as {names[j]} should" for i, j in enumerate(np.argsort(columns)) if i != j]
-            text = f"the columns of inputs in frames.csv seem exchanged: {', '.join(moved)}. Exchange them, or the cables in robot.toml"
+            text = f"the columns of inputs{in_frames(recording)} seem exchanged: {', '.join(moved)}. Exchange them, or the cables in robot.toml"
             yield Reading(text, robot, _with_inputs(recording, table[:, columns]), frames)
 
 
@@ -245,7 +246,7 @@ def _delays(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Re
 def _gravities(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
     own, size = robot.body.gravity, float(np.linalg.norm(robot.body.gravity))
     if recording.gravity is not None:
-        text = "gravity in frames.csv seems to have the wrong sign (an accelerometer at rest shows it upwards)"
+        text = f"gravity{in_frames(recording)} seems to have the wrong sign (an accelerometer at rest shows it upwards)"
         yield Reading(text, robot, replace(recording, gravity=freeze(-recording.gravity)), frames)
         return
     for j, sign in itertools.product(range(3) if size else (), (1.0, -1.0)):

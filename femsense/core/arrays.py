@@ -30,6 +30,14 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return view
 
 
+def as_numbers(values: npt.ArrayLike, name: str, *, expected: object = "numbers", hint: str | None = None) -> FloatArray:
+    """Coerce to numbers of any shape. Raises InputError, which says what was expected and what to try."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError("not numbers", where=name, found=repr(values)[:80], expected=expected, hint=hint) from None
+
+
 def as_points(values: npt.ArrayLike | Iterable[Iterable[float]], name: str = "points") -> FloatArray:
     """Coerce to finite points, shape (n, 3); a single point becomes (1, 3). Raises InputError."""
     try:

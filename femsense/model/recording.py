@@ -358,8 +358,11 @@ def _check_parts(recording: Recording) -> None:
         raise InputError("unknown actuation", where="actuation", found=r.actuation, expected="tension | displacement")
     if r.actuation_zero not in ("absolute", "unknown"):
         raise InputError("unknown zero", where="actuation_zero", found=r.actuation_zero, expected="absolute | unknown")
-    if not np.isfinite(r.time_s).all() or (np.diff(r.time_s) <= 0).any():
-        raise InputError("time does not increase", where="time_s", expected="finite, in order of time")
+    wrong = np.flatnonzero(~np.isfinite(r.time_s[1:]) | ~(np.diff(r.time_s) > 0))
+    if len(wrong) or not np.isfinite(r.time_s).all():
+        k = int(wrong[0]) if len(wrong) else 0
+        times = f"{r.time_s[k : k + 2].tolist()} s from position {k} on"
+        raise InputError("time does not increase", where="time_s", found=times, expected="finite, in order of time")
     if len(np.unique(r.frame_numbers)) != F:
         raise InputError("a frame stands twice", where="frame_numbers", expected="each frame once")
     lengths = {

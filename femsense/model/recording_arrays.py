@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import as_numbers
 from femsense.core.errors import InputError
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import Drives, MarkerRows, Timeline, Views
@@ -36,15 +37,19 @@ def recording_from_arrays(
     Raises:
         InputError: shapes that do not fit, times that do not increase.
     """
-    frames = np.asarray(time_s, dtype=np.float64).size
-    places = {name: np.asarray(x, dtype=np.float64) for name, x in (markers or {}).items()}
+    times = as_numbers(time_s, "time_s", expected="the time of each frame [s]").reshape(-1)
+    frames = times.size
+    places = {
+        name: as_numbers(x, f"markers[{name!r}]", expected=f"places [m], shape {(frames, 3)}")
+        for name, x in (markers or {}).items()
+    }
     for name, x in places.items():
         if x.shape != (frames, 3):
             raise InputError("places of another shape", where=f"markers[{name!r}]", found=x.shape, expected=(frames, 3))
     grid = np.stack(list(places.values()), axis=1) if places else np.zeros((frames, 0, 3))
     frame, index = np.nonzero(np.isfinite(grid).all(axis=2))
     return make_recording(
-        Timeline(time_s, free=free),
+        Timeline(times, free=free),
         drives=Drives(
             actuation=actuation,
             cable_names=tuple(inputs or ()),
@@ -58,8 +63,12 @@ def recording_from_arrays(
 
 
 def _columns(series: Mapping[str, npt.ArrayLike] | None, frames: int, what: str) -> npt.NDArray[np.float64]:
-    columns = {name: np.asarray(values, dtype=np.float64) for name, values in (series or {}).items()}
+    wanted = f"a number for each of {frames} frames"
+    columns = {name: as_numbers(values, f"{what}[{name!r}]", expected=wanted) for name, values in (series or {}).items()}
     for name, values in columns.items():
         if values.shape != (frames,):
             raise InputError("a series of another length", where=f"{what}[{name!r}]", found=values.shape, expected=(frames,))
+        if not np.isfinite(values).all():
+            k = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise InputError("not finite", where=f"{what}[{name!r}]", found=f"{values[k]} in frame {k}", expected=wanted)
     return np.stack(list(columns.values()), axis=1) if columns else np.zeros((frames, 0))

@@ -48,11 +48,12 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
 
 def warn_of_values(recording: Recording) -> None:
     """Warn of times, displacements and signs that can be computed with but are hardly meant."""
-    r, where = recording, _place(recording, "frames.csv")
+    r, where = recording, place_of(recording, "frames.csv", "inputs")
     steps = np.diff(r.time_s)
     if len(steps) and np.median(steps) > SLOW:
-        text = f"one frame every {np.median(steps):.4g} s by the column time_s; is it in milliseconds?"
-        warnings.warn(f"{where}: {text}", stacklevel=3)
+        column = "the column time_s" if r.folder else "time_s"
+        text = f"one frame every {np.median(steps):.4g} s by {column}; is it in milliseconds?"
+        warnings.warn(f"{place_of(r, 'frames.csv', 'time_s')}: {text}", stacklevel=3)
     if r.actuation != "displacement":
         return
     for name, pulled in zip(r.cable_names, r.inputs.T):
@@ -68,8 +69,21 @@ def warn_of_values(recording: Recording) -> None:
             warnings.warn(f"{where}: {text}; is the sign right? > 0 shortens", stacklevel=3)
 
 
-def _place(recording: Recording, file: str) -> str:
-    return str(recording.folder / file) if recording.folder else file
+def place_of(recording: Recording, file: str, argument: str) -> str:
+    """Return where a part of a recording stands: in a file of its folder, or, made of arrays, in an argument of `from_arrays`."""
+    return str(recording.folder / file) if recording.folder else f"Recording.from_arrays, {argument}"
+
+
+def in_frames(recording: Recording) -> str:
+    """Return " in frames.csv" where a recording has one."""
+    return " in frames.csv" if recording.folder else ""
+
+
+def how_to_free(recording: Recording) -> str:
+    """Return how frames are said to be free of undeclared contact."""
+    if recording.folder is None:
+        return "with True in free of Recording.from_arrays"
+    return f"with 1 in the column free of {recording.folder.name}/frames.csv"
 
 
 def _with_cable_order(robot: Robot, recording: Recording) -> Recording:
@@ -92,14 +106,14 @@ def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[st
         parts = [f"lacks {', '.join(lacking)}"] if lacking else []
         parts += [f"has {', '.join(extra)} that the robot has not"] if extra else []
         idle = "a cable that was slack" if kind == "cable" else "a chamber without pressure"
+        column = f"{kind}_" if recording.folder else ""
+        logged = "; inputs that another program logged: femsense import --actuation LOG.csv" if recording.folder else ""
         raise InputError(
             f"other {kind}s than those of the robot {robot.name!r}: the recording {' and '.join(parts)}",
-            where=_place(recording, "frames.csv"),
-            found=", ".join(f"{kind}_{name}" for name in given) or f"no {kind} columns",
-            expected=", ".join(f"{kind}_{name}" for name in wanted) or f"no {kind} columns",
-            hint=did_you_mean(extra[0], wanted)
-            if extra
-            else f"{idle} has a column of zeros; inputs that another program logged: femsense import --actuation LOG.csv",
+            where=place_of(recording, "frames.csv", "inputs" if kind == "cable" else "pressures"),
+            found=", ".join(column + name for name in given) or f"no {kind}s",
+            expected=", ".join(column + name for name in wanted) or f"no {kind}s",
+            hint=did_you_mean(extra[0], wanted) if extra else f"{idle} has zeros in all frames{logged}",
         )
     return [given.index(name) for name in wanted]
 
@@ -111,7 +125,7 @@ def _without_strangers(robot: Robot, recording: Recording) -> Recording:
     if recording.has_markers and len(strangers) == len(recording.marker_names):
         raise InputError(
             f"no marker that the robot {robot.name!r} has",
-            where=_place(recording, "markers.csv"),
+            where=place_of(recording, "markers.csv", "markers"),
             found=", ".join(recording.marker_names),
             expected=", ".join(robot.marker_names) or "the robot declares no [[markers]]",
             hint=did_you_mean(strangers[0], robot.marker_names),
@@ -120,7 +134,7 @@ def _without_strangers(robot: Robot, recording: Recording) -> Recording:
     if not strangers:
         return result
     warnings.warn(
-        f"{_place(recording, 'markers.csv')}: markers that the robot {robot.name!r} lacks are left out: {', '.join(strangers)}",
+        f"{place_of(recording, 'markers.csv', 'markers')}: markers that the robot {robot.name!r} lacks are left out: {', '.join(strangers)}",
         stacklevel=3,
     )
     names = [name for name in recording.marker_names if name in known]
@@ -137,7 +151,10 @@ def _without_rest_strangers(known: set[str], recording: Recording) -> Recording:
     if rest is None or known.issuperset(rest.names):
         return recording
     lost = sorted(set(rest.names) - known)
-    warnings.warn(f"{_place(recording, 'rest.csv')}: markers that the robot lacks are left out: {', '.join(lost)}", stacklevel=4)
+    warnings.warn(
+        f"{place_of(recording, 'rest.csv', 'markers at rest')}: markers that the robot lacks are left out: {', '.join(lost)}",
+        stacklevel=4,
+    )
     kept = np.array([name in known for name in rest.names], dtype=bool)
     names = tuple(name for name in rest.names if name in known)
     left = RestMarkers(names, freeze(rest.positions[kept]), freeze(rest.std[kept]), freeze(rest.view[kept], np.int64))
@@ -157,7 +174,7 @@ def _check_loads(robot: Robot, recording: Recording) -> None:
         looks = np.abs(places[worst]).max() > 20 * np.abs(robot.body.mesh.nodes).max()
         raise InputError(
             "a known load is far from the body",
-            where=f"{_place(recording, 'loads.csv')}, frame {recording.frame_numbers[k]}",
+            where=f"{place_of(recording, 'loads.csv', 'loads')}, frame {recording.frame_numbers[k]}",
             found=f"{places[worst].tolist()} m, {1e3 * outside[worst]:.4g} mm outside",
             expected=f"a place on the body at rest, robot frame, at most {250 * diagonal:.4g} mm outside",
             hint="this looks like millimetres: places are in metres"
@@ -177,7 +194,7 @@ def _check_displacements(robot: Robot, recording: Recording) -> None:
         if span > max(length, 1e-3):
             raise InputError(
                 f"cable {cable.name!r} is shortened by more than its length",
-                where=_place(recording, "frames.csv"),
+                where=place_of(recording, "frames.csv", "inputs"),
                 found=f"{span:.4g} m",
                 expected=f"less than {length:.4g} m from its far end to its pull point",
                 hint="this looks like millimetres: displacements are in metres" if span > 5 * length else None,
@@ -191,7 +208,7 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
         if highest > chamber.max_pressure * (1 + 1e-9):
             warnings.warn(
                 (
-                    f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its "
+                    f"{place_of(recording, 'frames.csv', 'pressures')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its "
                     f"max_pressure_pa of {chamber.max_pressure:.4g} Pa"
                 ),
                 stacklevel=3,
@@ -205,7 +222,7 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
             if span > (cable.max_tension - cable.min_tension) * (1 + 1e-9):
                 warnings.warn(
                     (
-                        f"{_place(recording, 'frames.csv')}: the tensions of cable {cable.name!r} span {span:.4g} N, more "
+                        f"{place_of(recording, 'frames.csv', 'inputs')}: the tensions of cable {cable.name!r} span {span:.4g} N, more "
                         f"than from its min_tension_n to its max_tension_n"
                     ),
                     stacklevel=3,
@@ -214,7 +231,7 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
         if tension.max(initial=-np.inf) > cable.max_tension * (1 + 1e-9):
             warnings.warn(
                 (
-                    f"{_place(recording, 'frames.csv')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its "
+                    f"{place_of(recording, 'frames.csv', 'inputs')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its "
                     f"max_tension_n of {cable.max_tension:.4g} N"
                 ),
                 stacklevel=3,
@@ -222,7 +239,7 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
         if tension.min(initial=np.inf) < 0:
             warnings.warn(
                 (
-                    f"{_place(recording, 'frames.csv')}: cable {cable.name!r} goes down to {tension.min():.4g} N; a cable "
+                    f"{place_of(recording, 'frames.csv', 'inputs')}: cable {cable.name!r} goes down to {tension.min():.4g} N; a cable "
                     f"cannot push"
                 ),
                 stacklevel=3,

@@ -9,7 +9,7 @@ import pytest
 from helpers import write_block_robot
 
 import femsense as fs
-from femsense.core.errors import InputError
+from femsense.core.errors import DataError, InputError
 from femsense.model.recording import marker_grid
 
 TIME = np.array([0.0, 0.5, 1.0])
@@ -35,6 +35,35 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         fs.Recording.from_arrays(TIME, inputs={"top": [1.0, 2.0]})
     with pytest.raises(InputError, match="places of another shape"):
         fs.Recording.from_arrays(TIME, markers={"tip": np.zeros((3, 2))})
+    with pytest.raises(
+        InputError, match=r"inputs\['top'\]: not numbers\n  found:    \['x', 1, 2\]\n  expected: a number for each"
+    ):
+        fs.Recording.from_arrays(TIME, inputs={"top": ["x", 1, 2]})
+    with pytest.raises(InputError, match=r"pressures\['air'\]: not finite\n  found:    nan in frame 1"):
+        fs.Recording.from_arrays(TIME, pressures={"air": [0.0, np.nan, 1.0]})
+    with pytest.raises(InputError, match=r"time_s: time does not increase\n  found:    \[2.0, 1.0\] s from position 1 on"):
+        fs.Recording.from_arrays([0.0, 2.0, 1.0])
+
+
+def test_what_does_not_fit_the_robot_is_said_of_arguments_where_there_are_no_files(tmp_path: Path) -> None:
+    robot = fs.load_robot(write_block_robot(tmp_path))
+    names = robot.body.cable_names
+    assert len(names) > 1
+    lacking = fs.Recording.from_arrays(TIME, inputs={names[0]: [0.0, 1.0, 2.0]}, markers=PLACES)
+    with pytest.raises(InputError) as said:
+        fs.calibrate(robot, lacking)
+    text = str(said.value)
+    assert text.startswith("Recording.from_arrays, inputs: other cables than those of the robot")
+    assert f"found:    {names[0]}\n" in text and f"expected: {', '.join(names)}\n" in text
+    assert ".csv" not in text and "column" not in text and "femsense import" not in text
+    inputs = {name: [0.0, 0.1, 0.2] for name in names}
+    strange = fs.Recording.from_arrays(TIME, inputs=inputs, markers={"nose": PLACES["tip"]})
+    with pytest.raises(InputError, match=r"^Recording\.from_arrays, markers: no marker that the robot"):
+        fs.calibrate(robot, strange)
+    seen = {name: np.tile(robot.marker_points[i], (3, 1)) for i, name in enumerate(robot.marker_names)}
+    touched = fs.Recording.from_arrays(TIME, inputs=inputs, markers=seen, free=[False] * 3)
+    with pytest.raises(DataError, match=r"mark free frames with True in free of Recording\.from_arrays"):
+        fs.calibrate(robot, touched)
 
 
 def test_a_robot_and_a_state_say_what_they_are_in_one_line(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, as_numbers
 from femsense.core.errors import InputError
 from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
 from femsense.xr.proprioception.domain import Domain, Outside
@@ -54,7 +54,7 @@ class ProprioceptiveModel:
             time_s: when several rows were read [s], shape (n,); needed where the model has a memory.
 
         Raises:
-            InputError: another number of channels, or no times for a model with memory.
+            InputError: no numbers, another number of channels, or no times for a model with memory.
         """
         x, single = self._rows(rows)
         y = self.network(self._inputs(x, single, time_s)).reshape(len(x), -1, 3)
@@ -101,10 +101,11 @@ class ProprioceptiveModel:
         return self.chain
 
     def _rows(self, rows: npt.ArrayLike) -> tuple[FloatArray, bool]:
-        x = np.asarray(rows, dtype=np.float64)
-        if x.ndim not in (1, 2) or x.shape[-1] != len(self.channels):
-            expected = f"{len(self.channels)} channels: {', '.join(self.channels)}"
-            raise InputError("another number of channels", where="rows", found=x.shape, expected=expected)
+        count = len(self.channels)
+        expected = f"a row of readings, one number for each of {count} channels: {', '.join(self.channels)}"
+        x = as_numbers(rows, "rows", expected=expected, hint="numbers in the order of the channels")
+        if x.ndim not in (1, 2) or x.shape[-1] != count:
+            raise InputError("another number of channels", where="rows", found=f"shape {x.shape}", expected=expected)
         return np.atleast_2d(x), x.ndim == 1
 
     def _inputs(self, x: FloatArray, steady: bool, time_s: npt.ArrayLike | None) -> FloatArray:

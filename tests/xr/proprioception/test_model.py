@@ -134,5 +134,9 @@ def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
     model = some_model("sigmoid", memory=(1.0,))
     with pytest.raises(InputError, match="another number of channels"):
         model.markers([1.0, 2.0])
+    for wrong in (["a"], "abc", {"light": 0.0}):
+        with pytest.raises(InputError, match="rows: not numbers") as said:
+            model.markers(wrong)
+        assert repr(wrong) in str(said.value) and "one number for each of 3 channels" in str(said.value)
     with pytest.raises(InputError, match="has a memory"):
         model.markers(np.zeros((4, 3)))
