@@ -38,7 +38,7 @@ def delayed(frames: int) -> Callable[[np.ndarray], np.ndarray]:
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
-        (lambda u: -u, "inputs of up, down, left, right in frames.csv seem to have the wrong sign"),
+        (lambda u: -u, "inputs of up, down, left, right seem to have the wrong sign"),
         (lambda u: u[:, [2, 1, 0, 3]], "exchanged: up moves the robot as left should, left moves the robot as up should"),
         (lambda u: np.roll(u, 1, axis=0), "1 frames early"),
         (lambda u: np.roll(u, -1, axis=0), "1 frames late"),
@@ -60,7 +60,7 @@ def test_a_sign_shows_where_the_zero_is_unknown_too() -> None:
     plain = recording("displacement")
     assert calibrate(arm(), plain).rms_m < 6e-4
     turned = plain.inputs * np.array([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(DataError, match=r"inputs of left in frames.csv seem to have the wrong sign"):
+    with pytest.raises(DataError, match=r"inputs of left seem to have the wrong sign"):
         calibrate(arm(), with_inputs(turned, plain))
 
 
@@ -73,7 +73,7 @@ def test_gravity_the_other_way_is_refused_and_another_modulus_is_no_gravity(recw
 
 def test_an_accelerometer_of_another_sign_is_named() -> None:
     measured = replace(recording(), gravity=freeze(np.tile([0.0, 0.0, 9.81], (len(LEVELS), 1))))
-    with pytest.raises(DataError, match=r"gravity in frames.csv seems to have the wrong sign"):
+    with pytest.raises(DataError, match=r"gravity seems to have the wrong sign"):
         calibrate(arm(), measured)
 
 

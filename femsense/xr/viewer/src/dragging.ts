@@ -26,7 +26,9 @@ import { element } from "./readout";
 import { tie } from "./ties";
 import type { Stage } from "./stage";
 
-const EVERY_MS = 33; // wishes are sent so often while held: the robot stops when they stop
+const EVERY_MS = 33; // wishes are sent so often while held, however slowly pictures come: the robot stops when they stop
+const BLIND_MS = 1000; // who has seen no new picture for so long leads nobody
+const HINT = "Drag a green point, or hold Shift and use the arrow keys.";
 const STEP = 0.01; // of the body's size, for a key
 const TOUCH = 0.03; // a hand that is nearer to a handle touches it [m]
 const NEAR = 0.04; // of the body's size: a ray that passes a handle so closely points at it
@@ -49,6 +51,9 @@ export class Dragging {
   private enabled = false;
   private armed = false;
   private sent = 0;
+  private seen = 0; // when the last picture was prepared
+  private heard: Reach | null = null; // the newest answer, and that which is shown
+  private shown: Reach | null = null;
   private seq = 0;
   private readonly plane = new Plane();
   private readonly ray = new Raycaster();
@@ -70,6 +75,7 @@ export class Dragging {
     window.addEventListener("keydown", (e) => this.key(e));
     window.addEventListener("keyup", (e) => e.key.startsWith("Arrow") && this.release());
     element("arm").addEventListener("click", () => this.arm(!this.armed));
+    window.setInterval(() => this.repeat(), EVERY_MS);
   }
 
   /** Takes another robot as the one that is dragged. */
@@ -107,20 +113,35 @@ export class Dragging {
     this.release();
     if (!on) this.arm(false);
     for (const ball of this.balls) ball.visible = on;
-    if (this.twin) this.twin.root.visible = on;
+    if (this.twin) this.twin.root.visible = false;
     this.line.visible = this.target.visible = false;
     element("dragging").hidden = !on;
-    this.stage.touch();
+    this.shown = this.heard; // what was answered before was answered to somebody else
+    if (on) this.tell(HINT, "", "");
+    this.stage.panelsChanged();
   }
 
-  /** Places the handles on the body, and repeats the wish while it is held. */
+  /** Repeats the wish while it is held and seen. */
+  private repeat(): void {
+    const now = performance.now();
+    if (this.held !== null && now - this.sent >= EVERY_MS - 5 && now - this.seen < BLIND_MS) this.say();
+  }
+
+  private tell(text: string, status: string, inputs: string): void {
+    const said = element("reach");
+    said.textContent = text;
+    said.dataset.status = status;
+    element("reach-inputs").textContent = inputs;
+  }
+
+  /** Places the handles on the body. */
   step(): void {
+    this.seen = performance.now();
     if (!this.enabled || !this.subject) return;
     this.balls.forEach((ball, i) => {
       ball.position.copy(this.places[i]!());
       ball.scale.setScalar(i === (this.held ?? this.chosen) ? 1.25 : 1);
     });
-    if (this.held !== null && performance.now() - this.sent >= EVERY_MS) this.say();
   }
 
   /** Sends where the held point is wanted. */
@@ -167,12 +188,15 @@ export class Dragging {
 
   /** Shows what the server found, and where the robot would be. */
   answered(reach: Reach, ghost: Float32Array | null = null): void {
-    const said = element("reach");
-    said.textContent = reach.text;
-    said.dataset.status = reach.status;
-    element("reach-inputs").textContent = reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`).join(" · ");
+    this.heard = reach;
+    if (!this.enabled || reach === this.shown) return;
+    this.shown = reach;
+    this.tell(reach.text, reach.status, reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`).join(" · "));
     element("arm").dataset.moving = String(reach.armed);
-    if (ghost && this.enabled && this.subject) poseBones(this.reachable().bones, ghost);
+    if (ghost && this.subject) {
+      poseBones(this.reachable().bones, ghost);
+      this.reachable().root.visible = true;
+    }
     this.stage.touch();
   }
 
@@ -280,6 +304,7 @@ export class Dragging {
         return choice;
       }),
     );
+    list.children[this.chosen]?.scrollIntoView({ block: "nearest", inline: "nearest" });
   }
 }
 

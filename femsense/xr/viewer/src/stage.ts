@@ -32,7 +32,11 @@ const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stan
 /** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
 function free(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
   const tabs = document.querySelector("#robots:not([hidden])") ? 42 : 0;
-  if (width <= 820 && height > 480) return { left: 10, right: 10, top: 80 + tabs + 0.3 * height, bottom: 180 };
+  const dragging = document.querySelector<HTMLElement>("#dragging:not([hidden])");
+  if (width <= 820 && height > 480) {
+    const [panel, below] = dragging ? [60, dragging.clientHeight + 12] : [0.3 * height, 0];
+    return { left: 10, right: 10, top: 80 + tabs + panel, bottom: 180 + below };
+  }
   return { left: 20, right: height > 480 ? 310 : 290, top: 70, bottom: 100 };
 }
 
@@ -176,6 +180,11 @@ export class Stage {
     if (this.renderer.xr.isPresenting || !width || !height) return null;
     const { left, right, top, bottom } = free(width, height);
     return new Box2(new Vector2((2 * left) / width - 1, (2 * bottom) / height - 1), new Vector2(1 - (2 * right) / width, 1 - (2 * top) / height));
+  }
+
+  /** Makes room for panels that come or go. */
+  panelsChanged(): void {
+    this.resize();
   }
 
   /** Brings back the view of the screen after a headset had its own. */

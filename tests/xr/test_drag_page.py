@@ -1,0 +1,106 @@
+"""A point of the twin is dragged in a browser: what the page shows, what it sends, and when it stops sending."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import CHROMIUM, start_browser
+from live_bars import Source
+from xr_bar import write_run_with_mesh
+
+from femsense.xr.stream.hub import Message
+from femsense.xr.stream.run_source import open_run
+
+pytest.importorskip("websockets")
+
+DRAG = """
+const page = await opened.newPage({ viewport: { width: 390, height: 844 } });
+const say = (what) => console.log(JSON.stringify(what));
+const told = () => new Promise((done) => process.stdin.once('data', done));
+const boxes = () => page.evaluate(() => {
+  const { stage, robots } = femsense.shown, { body } = robots.get('bar'), canvas = document.querySelector('#view').getBoundingClientRect();
+  const ball = [];
+  body.group.traverse((one) => one.name === 'top' && one.isMesh && ball.push(one));
+  const at = ball[0].getWorldPosition(ball[0].position.clone()).project(stage.camera);
+  const sides = (id) => { const box = document.querySelector(id).getBoundingClientRect(); return [box.top, box.bottom]; };
+  return { ball: [canvas.left + (at.x + 1) / 2 * canvas.width, canvas.top + (1 - at.y) / 2 * canvas.height],
+    panel: sides('#panel'), dragging: sides('#dragging'), dock: sides('#dock'), reach: document.querySelector('#reach').textContent };
+});
+const on = (id) => page.evaluate((id) => document.querySelector(id).getAttribute('aria-pressed'), id);
+await page.goto(given[0]);
+await page.waitForFunction(() => femsense.shown.robots.get('bar')?.shown && femsense.shown.robots.get('bar').reach, null, { timeout: 60000 });
+await page.click('#drag');
+await page.waitForTimeout(500);
+const begun = await boxes();
+const grab = async () => {
+  const { ball: [x, y] } = await boxes();
+  await page.mouse.move(x, y);
+  await page.mouse.down();
+  await page.mouse.move(x + 20, y + 5, { steps: 3 });
+};
+await grab();
+await page.waitForFunction(() => document.querySelector('#reach').textContent.startsWith('reached'), null, { timeout: 60000 });
+say({ ...begun, answered: (await boxes()).reach, armed: await on('#arm') });
+await told();
+await page.mouse.up();
+await page.click('#arm');
+say({ armed: await on('#arm') });
+await told();
+await grab();
+await page.waitForTimeout(400);
+await page.evaluate(() => femsense.shown.stage.renderer.setAnimationLoop(null));   // no picture comes any more
+say({ held: true });
+await told();
+await page.mouse.up();
+await page.click('#drag');
+await page.waitForTimeout(300);
+say({ armed: await on('#arm') });
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_point_is_dragged_on_a_phone_and_wishes_go_on_without_pictures_for_a_second_and_no_longer(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True, commands=True)
+    before = {"status": "nearest", "text": "an answer to somebody else", "error_m": 0.1, "inputs": []}
+    source.hub.publish([Message("femsense/bar/reach", json.dumps(before).encode())])
+    browser = start_browser(request.config, DRAG, source.server.url)
+    assert browser.stdin is not None and browser.stdout is not None
+
+    def said() -> dict[str, Any]:
+        line = browser.stdout.readline()
+        assert line, browser.stderr.read() if browser.stderr else ""
+        return dict(json.loads(line))
+
+    def go() -> None:
+        browser.stdin.write("go\n")
+        browser.stdin.flush()
+
+    try:
+        seen = said()
+        assert seen["reach"].startswith("Drag a green point") and seen["answered"].startswith("reached")
+        assert seen["panel"][1] < seen["ball"][1] < seen["dragging"][0]  # the point is not covered
+        assert seen["dragging"][1] <= seen["dock"][0] and seen["armed"] == "false"
+        assert source.wishes and not any(wish["armed"] for wish in source.wishes)
+        go()
+        assert said() == {"armed": "true"} and not source.wishes[-1]["held"]
+        go()
+        assert said()["held"] and source.wishes[-1]["armed"] and source.wishes[-1]["handle"] == "top"
+        count = len(source.wishes)
+        time.sleep(0.5)
+        assert len(source.wishes) > count + 3  # a slow picture does not stop the robot
+        time.sleep(1.5)
+        count = len(source.wishes)
+        time.sleep(0.5)
+        assert len(source.wishes) == count  # who sees nothing leads nobody
+        go()
+        assert said() == {"armed": "false"} and not source.wishes[-1]["held"] and not source.wishes[-1]["armed"]
+    finally:
+        source.close()
+        browser.kill()
