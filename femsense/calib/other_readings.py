@@ -246,7 +246,7 @@ def _delays(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Re
 def _gravities(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
     own, size = robot.body.gravity, float(np.linalg.norm(robot.body.gravity))
     if recording.gravity is not None:
-        text = f"gravity{in_frames(recording)} seems to have the wrong sign (an accelerometer at rest shows it upwards)"
+        text = f"the gravity{in_frames(recording)} seems to have the wrong sign (an accelerometer at rest shows it upwards)"
         yield Reading(text, robot, replace(recording, gravity=freeze(-recording.gravity)), frames)
         return
     for j, sign in itertools.product(range(3) if size else (), (1.0, -1.0)):
