@@ -2,7 +2,7 @@
 
 The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a
 Gauss–Newton fit; the fit to the markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so the covariance
-is that of sums over cells of the surface.
+is that of a field along the surface (`residual_field`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.inputs import calibrated_inputs
+from femsense.calib.residual_field import field_scores, row_weights
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import BoolArray, FloatArray, freeze
 from femsense.core.errors import FemsenseError
@@ -35,10 +36,6 @@ DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1)
 """Of a step, in units of what the best known direction is held by."""
 LOST = 0.01
 """A step may lose this share of the points that lie on the body: rays at a silhouette come and go."""
-HUBER = 2.5
-"""Whitened residuals beyond this count linearly."""
-CELLS = 12.0
-"""Cells of the surface along the body's diagonal whose points err together."""
 USUAL = CameraNoise("stereo", at_1m=0.002)
 """A camera of which nothing is known: the D415 at its default setting."""
 
@@ -60,8 +57,6 @@ class RaySums:
     """JᵀJ, shape (p, p)."""
     right: FloatArray
     """Jᵀr, shape (p,)."""
-    cells: FloatArray
-    """Sums of Jᵀr over cells of the surface, shape (g, p)."""
     rms: float
     """Root mean square of the residual [m]."""
     explained: float = 0.0
@@ -111,9 +106,10 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     equations = _Equations(frames, noises, pivot, size, which, held)
     for _ in range(2):  # the second time with what the clouds are worth beside the markers
         poses, gone, sums = _nearer(equations, list(calibration.poses), prior, share)
-        normal, right, scores, rms = sums.normal, sums.right, sums.cells, sums.rms
+        normal, right, rms = sums.normal, sums.right, sums.rms
         if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
             return calibration
+        scores = field_scores(equations.rows(poses), robot.body.mesh.nodes)
         worth = worth_of_clouds(normal, scores, prior, gone - np.linalg.solve(normal, right))
         if worth >= 0.9 * share:
             break
@@ -134,14 +130,14 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
 def worth_of_clouds(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
     """Return by which share the clouds count beside the markers [1].
 
-    Points of one cell err together; the scatter of the cells' scores tells how far the pose of the clouds is known.
+    Neighbouring points err together; the field that the fit leaves tells how far the pose of the clouds is known.
     Where clouds and markers are farther apart than both deviations say, the clouds err by more still (model, lens). They then
     count by so much less that the difference is one that is to be expected.
     Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
 
     Arguments:
         normal: information of the clouds, points counted as independent, shape (p, p).
-        scores: sums of the gradient over cells, shape (g, p).
+        scores: rows whose sum of squares is the covariance of the gradient, shape (g, p).
         prior: information of the markers, shape (p, p).
         apart: pose of the clouds alone less that of the markers, shape (p,).
     """
@@ -160,7 +156,7 @@ def worth_of_clouds(normal: FloatArray, scores: FloatArray, prior: FloatArray, a
     for _ in range(60):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if distance(middle) < p else (low, middle)
-    counted = max(1.0, float(np.trace(np.linalg.solve(normal, scores.T @ scores))) / p)  # so many points of a cell count as one
+    counted = max(1.0, float(np.trace(np.linalg.solve(normal, scores.T @ scores))) / p)  # so many points count as one
     return low / counted
 
 
@@ -177,15 +173,15 @@ class _Equations:
     held: BoolArray
     """Nodes that are clamped, shape (n,): what holds them hides them, and lies where they should be or before."""
 
+    def rows(self, poses: list[FloatArray]) -> Iterator[tuple[RayRows, FloatArray]]:
+        """Yield the rows of each frame at poses, and how they change with them."""
+        for seen in self.frames:
+            rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * self.size).off(self.held)
+            yield rows, rows.by_pose(self.pivot, len(poses))[:, self.which]
+
     def at(self, poses: list[FloatArray]) -> RaySums:
         """Return the normal equations at poses."""
-
-        def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
-            for seen in self.frames:
-                rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * self.size).off(self.held)
-                yield rows, rows.by_pose(self.pivot, len(poses))[:, self.which]
-
-        return ray_sums(seen_rows(), len(self.which), self.size)
+        return ray_sums(self.rows(poses), len(self.which), self.size)
 
 
 def _nearer(
@@ -224,26 +220,18 @@ def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) 
     Arguments:
         frames: rows of each frame, and how their residual changes with the parameters, shape (r, p).
         p: number of parameters.
-        size: diagonal of the body [m]; cells are a share of it.
+        size: diagonal of the body [m].
     """
     normal, right, squares, count, explained = np.zeros((p, p)), np.zeros(p), 0.0, 0, 0.0
-    cells: dict[tuple[int, ...], FloatArray] = {}
     for rows, derivative in frames:
         J = derivative / rows.std[:, None]
         z = rows.residual / rows.std
-        weight = np.minimum(1.0, HUBER * max(1.0, 1.483 * float(np.median(np.abs(z)))) / np.maximum(np.abs(z), 1e-12))
+        weight = row_weights(rows)
         normal += J.T @ (weight[:, None] * J)
         right += J.T @ (weight * z)
         squares, count = squares + float((rows.residual**2).sum()), count + len(z)
         explained += float(np.maximum(1.0 - (rows.residual / (REACH * size)) ** 2, 0.0).sum())
-        cell, group = np.unique(np.floor(rows.points / (size / CELLS)).astype(np.int64), axis=0, return_inverse=True)
-        part = np.zeros((len(cell), p))
-        np.add.at(part, group.ravel(), J * (weight * z)[:, None])
-        for key, value in zip(map(tuple, cell.tolist()), part):
-            cells[key] = cells.get(key, np.zeros(p)) + value
-    return RaySums(
-        normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))), explained
-    )
+    return RaySums(normal, right, float(np.sqrt(squares / max(count, 1))), explained)
 
 
 def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from scipy.optimize import lsq_linear
 from femsense.calib.calibration import Calibration
 from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, worth_of_clouds
 from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.residual_field import field_scores
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, FemsenseError
@@ -66,7 +67,7 @@ def with_initial_inputs(
     end = fit.joint(calibration.poses, 1.0, derivatives)
     if known is not None:  # clouds count less where they and markers are farther apart than both say
         apart = end.gone - np.linalg.solve(end.sums.normal, end.sums.right)
-        share = worth_of_clouds(end.sums.normal, end.sums.cells, prior, apart)
+        share = worth_of_clouds(end.sums.normal, fit.scores(end), prior, apart)
         end = fit.joint(calibration.poses, share, derivatives) if share < 0.9 else end
     return _answer(fit, calibration, end, by_markers=known is not None)
 
@@ -101,12 +102,13 @@ class _Fit:
     prior: FloatArray
     """Precision of poses and inputs about where they start, shape (p + a, p + a)."""
 
-    def joint(self, first: Sequence[FloatArray], share: float, derivatives: int) -> _End:
-        """Return where Gauss–Newton leads with points that count by a share; in so many first steps the derivative is new."""
+    def joint(self, first: Sequence[FloatArray], share: float, derivatives: int, gone: FloatArray | None = None) -> _End:
+        """Return where Gauss–Newton leads with points that count by a share; in so many first steps the derivative is new.
+        `gone` is how far poses and inputs have gone before."""
         robot, recording, p = self.robot, self.recording, len(self.which)
         poses, pivot, initial = list(first), pose_pivot(robot), self.start.copy()
         low, high = input_bounds(robot, recording)
-        gone = np.zeros(p + len(initial))
+        gone = np.zeros(p + len(initial)) if gone is None else gone
         scans: dict[int, Scan] = {}
         moves: dict[int, FloatArray] = {}
         for step in range(STEPS):
@@ -115,7 +117,7 @@ class _Fit:
                 scans = _scans(robot, recording, poses, states)
             if step < derivatives:
                 moves = _moves(robot, recording, initial, states)
-            sums = _sums(robot, scans, states, moves, poses, self.noises, self.which)
+            sums = self._sums(scans, states, moves, poses)
             change = _bounded(sums, share, self.prior, gone, low - initial, high - initial)
             full = np.zeros(6 * len(poses))
             full[self.which] = change[:p]
@@ -126,23 +128,41 @@ class _Fit:
 
     def covariance(self, end: _End) -> FloatArray:
         """Return the covariance of poses and inputs, shape (p + a, p + a): of points, of what was known before, and of the law."""
-        inverse = np.linalg.inv(end.share * end.sums.normal + self.prior)
-        cells = end.share * end.sums.cells
-        by_law = inverse @ (end.share * self._turned_by_law(end))
-        return np.asarray(inverse @ (cells.T @ cells + self.prior) @ inverse + np.outer(by_law, by_law))
+        inverse, scores = np.linalg.inv(end.share * end.sums.normal + self.prior), end.share * self.scores(end)
+        by_law = self._moved_by_law(end)
+        return np.asarray(inverse @ (scores.T @ scores + self.prior) @ inverse + np.outer(by_law, by_law))
 
-    def _turned_by_law(self, end: _End) -> FloatArray:
-        """Return by how much the right side of the equations differs under the neo-Hookean law, shape (p + a,). What all cables have in common
+    def scores(self, end: _End) -> FloatArray:
+        """Return rows whose sum of squares is the covariance of the gradient (`field_scores`)."""
+        states = _states(self.robot, self.recording, end.initial)
+        return field_scores(self._rows(end.scans, states, end.moves, end.poses), self.robot.body.mesh.nodes)
+
+    def _moved_by_law(self, end: _End) -> FloatArray:
+        """Return where a fit under the neo-Hookean law ends, from here, shape (p + a,). What all cables have in common
         compresses the body, and laws that agree for small strains differ there. 0 where the robot declares a law by an effect."""
         body = self.robot.body
         if body.material.law != "corotational":
             return np.zeros(len(self.prior))
-        rights = []
-        for material in (body.material, replace(body.material, law="neo_hookean")):
-            robot = replace(self.robot, body=replace(body, material=material))
-            states = _states(robot, self.recording, end.initial)
-            rights.append(_sums(robot, end.scans, states, end.moves, end.poses, self.noises, self.which).right)
-        return np.asarray(rights[1] - rights[0])
+        other = replace(self.robot, body=replace(body, material=replace(body.material, law="neo_hookean")))
+        there = replace(self, robot=other, start=end.initial).joint(end.poses, end.share, 1, end.gone)
+        return np.asarray(there.gone - end.gone)
+
+    def _sums(
+        self, scans: dict[int, Scan], states: dict[int, FloatArray], moves: dict[int, FloatArray], poses: list[FloatArray]
+    ) -> RaySums:
+        size = float(np.linalg.norm(np.ptp(self.robot.body.mesh.nodes, axis=0)))
+        return ray_sums(self._rows(scans, states, moves, poses), len(self.prior), size)
+
+    def _rows(
+        self, scans: dict[int, Scan], states: dict[int, FloatArray], moves: dict[int, FloatArray], poses: list[FloatArray]
+    ) -> Iterator[tuple[RayRows, FloatArray]]:
+        """Yield the rows of each frame, and how they change with poses and inputs, shape (r, p + a)."""
+        mesh, pivot = self.robot.body.mesh, pose_pivot(self.robot)
+        surface, size = body_surface(mesh), float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+        for k in scans.keys() & states.keys() & moves.keys():
+            rows = ray_rows(scans[k], Surface(states[k], surface.triangles), poses, self.noises, reach=REACH * size)
+            by_input = -(rows.operator(len(states[k])) @ moves[k])
+            yield rows, np.hstack([rows.by_pose(pivot, len(poses))[:, self.which], by_input])
 
 
 def _prior(robot: Robot, recording: Recording, poses: int) -> FloatArray:
@@ -194,27 +214,6 @@ def _moves(robot: Robot, recording: Recording, initial: FloatArray, states: dict
         for k, positions in states.items():
             columns.setdefault(k, []).append(((more.get(k, positions) - positions) / h).ravel())
     return {k: np.stack(of, axis=1) for k, of in columns.items()}
-
-
-def _sums(
-    robot: Robot,
-    scans: dict[int, Scan],
-    states: dict[int, FloatArray],
-    moves: dict[int, FloatArray],
-    poses: list[FloatArray],
-    noises: tuple[CameraNoise, ...],
-    which: IntArray,
-) -> RaySums:
-    surface, pivot = body_surface(robot.body.mesh), pose_pivot(robot)
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-
-    def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
-        for k in scans.keys() & states.keys() & moves.keys():
-            rows = ray_rows(scans[k], Surface(states[k], surface.triangles), poses, noises, reach=REACH * size)
-            by_input = -(rows.operator(len(states[k])) @ moves[k])
-            yield rows, np.hstack([rows.by_pose(pivot, len(poses))[:, which], by_input])
-
-    return ray_sums(seen_rows(), len(which) + len(robot.body.cables), size)
 
 
 def _bounded(sums: RaySums, share: float, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
