@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from femsense.calib.scan import REACH
+from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
@@ -92,7 +93,7 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
         DataError: nothing fits, or two poses fit alike (a body with a symmetry).
     """
     poses = search_cloud_poses(views)
-    size = _size(views[0].surface)
+    size = size_of(views[0].surface)
     if not poses or poses[0].gain < LEAST:
         raise DataError(
             "no pose was found at which the clouds of the free frames show the robot. Record markers, write "
@@ -119,7 +120,7 @@ def settle_cloud_pose(views: Sequence[View], T_robot_camera: FloatArray) -> Clou
         views: one a frame.
         T_robot_camera: off by a tenth of the body's diagonal at most, shape (4, 4).
     """
-    size = _size(views[0].surface)
+    size = size_of(views[0].surface)
     return _settled([_Fine(view, size) for view in views], T_robot_camera, size)
 
 
@@ -133,13 +134,13 @@ def difference(T: FloatArray, other: FloatArray, surface: Surface) -> tuple[floa
 
 def search_cloud_poses(views: Sequence[View]) -> list[CloudPose]:
     """Return poses of a camera under which the clouds show the body, best first, each different from those before."""
-    first, size = views[0], _size(views[0].surface)
+    first, size = views[0], size_of(views[0].surface)
     scene = _scene(first, size)
     if len(scene) < 50:
         return []
-    samples, normals = _samples(first.surface, 3 * SAMPLES)
-    starts = _on_the_grid(scene, samples, normals, size)
-    closer = _closest_points(scene, samples, normals, starts, size)
+    samples = spread_samples(first.surface, 3 * SAMPLES)
+    starts = _on_the_grid(scene, samples, size)
+    closer = _closest_points(scene, samples, starts, size)
     fine = [_Fine(view, size) for view in views]
     fitted = [_settled(fine, T, size) for T in closer]
     found: list[CloudPose] = []
@@ -152,10 +153,6 @@ def search_cloud_poses(views: Sequence[View]) -> list[CloudPose]:
 def _different(one: CloudPose, other: CloudPose, surface: Surface, size: float) -> bool:
     turn, shift = difference(one.T_robot_camera, other.T_robot_camera, surface)
     return turn > TURNED or shift > SHIFTED * size
-
-
-def _size(surface: Surface) -> float:
-    return float(np.linalg.norm(np.ptp(surface.positions[np.unique(surface.triangles)], axis=0)))
 
 
 def _scene(view: View, size: float) -> FloatArray:
@@ -173,18 +170,6 @@ def _scene(view: View, size: float) -> FloatArray:
     return points
 
 
-def _samples(surface: Surface, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return points spread over the surface (by area) and their outward normals, each (p, 3)."""
-    a, b, c = (surface.positions[surface.triangles[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
-    area = np.linalg.norm(cross, axis=1)
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(area), count, p=area / area.sum())
-    w = rng.dirichlet(np.ones(3), size=len(chosen))[:, :, None]
-    places = w[:, 0] * a[chosen] + w[:, 1] * b[chosen] + w[:, 2] * c[chosen]
-    return places, cross[chosen] / area[chosen][:, None]
-
-
 def _rotations() -> FloatArray:
     """Return rotations spread evenly over all, shape (ROTATIONS, 3, 3) (Alexa, "Super-Fibonacci spirals", 2022)."""
     from scipy.spatial.transform import Rotation
@@ -197,15 +182,16 @@ def _rotations() -> FloatArray:
     )
 
 
-def _on_the_grid(scene: FloatArray, samples: FloatArray, normals: FloatArray, size: float) -> list[FloatArray]:
+def _on_the_grid(scene: FloatArray, samples: Samples, size: float) -> list[FloatArray]:
     """Return T_camera_robot of the best poses of the grid, each (4, 4)."""
     near = _DistanceMap(scene, 0.02 * size, CAP * size)
     seeds = scene[_spread(scene, 0.15 * size)]
     scored: list[tuple[float, int, FloatArray]] = []
     rotations = _rotations()
     for i, R in enumerate(rotations):
-        turned, facing = samples @ R.T, normals @ R.T
-        looking = np.einsum("pc,c->p", facing, seeds.mean(axis=0)) < -0.2 * np.linalg.norm(seeds.mean(axis=0))
+        turned, facing = samples.places @ R.T, samples.normals @ R.T
+        bare = samples.seen[int(np.argmax(samples.eyes @ R.T @ -seeds.mean(axis=0)))]
+        looking = bare & (np.einsum("pc,c->p", facing, seeds.mean(axis=0)) < -0.2 * np.linalg.norm(seeds.mean(axis=0)))
         side = turned[looking][:SAMPLES]
         if len(side) < 10:
             continue
@@ -250,17 +236,16 @@ class _DistanceMap:
         return np.asarray(np.where(inside, self.map[at[..., 0], at[..., 1], at[..., 2]], self.cap))
 
 
-def _closest_points(
-    scene: FloatArray, samples: FloatArray, normals: FloatArray, starts: Sequence[FloatArray], size: float
-) -> list[FloatArray]:
+def _closest_points(scene: FloatArray, samples: Samples, starts: Sequence[FloatArray], size: float) -> list[FloatArray]:
     """Return T_robot_camera of the poses to which closest points lead, best first, FINAL at most, each (4, 4)."""
     tree = cKDTree(scene)
     done: list[tuple[float, FloatArray]] = []
     for T in starts:
         score = np.inf
         for step in range(12):
-            placed, facing = samples @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
-            side = np.einsum("pc,pc->p", facing, placed) < -0.1 * np.linalg.norm(placed, axis=1)
+            placed, side = samples.looking(T, 0.1)
+            if not side.any():
+                break
             distance, index = (np.asarray(found) for found in tree.query(placed[side]))
             score = float(np.minimum(distance, CAP * size).mean())
             limit = max(np.quantile(distance, 0.7), 1e-9)
@@ -272,7 +257,7 @@ def _closest_points(
     result: list[FloatArray] = []
     for _, T in sorted(done, key=lambda d: d[0]):
         T_robot_camera = invert_pose(T)
-        if all(_apart(T_robot_camera, other, samples) > 0.05 * size for other in result):
+        if all(_apart(T_robot_camera, other, samples.places) > 0.05 * size for other in result):
             result.append(T_robot_camera)
         if len(result) == FINAL:
             break
@@ -299,7 +284,7 @@ class _Fine:
 
     def __init__(self, view: View, size: float) -> None:
         self.surface = view.surface
-        self.samples, self.normals = _samples(view.surface, FINE)
+        self.samples = spread_samples(view.surface, FINE)
         self.points = voxel_grid(PointCloud(view.points[view.mine]), 0.01 * size).points
         self.rays = view.points[:: max(1, len(view.points) // RAYS)]
 
@@ -317,7 +302,7 @@ def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) ->
     for reach in size * np.geomspace(CAP, REACH, FINE_STEPS):
         a, b = [], []
         for view, tree in zip(views, trees):
-            placed, looking = _visible(view.samples, view.normals, T)
+            placed, looking = view.samples.looking(T, 0.1)
             distance, index = tree.query(placed[looking], distance_upper_bound=reach)
             good = np.isfinite(distance)
             a.append(tree.data[index[good]])
@@ -328,18 +313,12 @@ def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) ->
     return _judged(views, trees, invert_pose(T), size)
 
 
-def _visible(samples: FloatArray, normals: FloatArray, T_camera_robot: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return samples in the camera's frame [m], and which of them look at it."""
-    placed, facing = transform_points(T_camera_robot, samples), normals @ T_camera_robot[:3, :3].T
-    return placed, np.einsum("pc,pc->p", facing, placed) < -0.1 * np.linalg.norm(placed, axis=1)
-
-
 def _judged(views: Sequence[_Fine], trees: Sequence[Any], T: FloatArray, size: float) -> CloudPose:
     """Return how a pose fits: each visible sample has a measured point beside it or not,
     each ray ends on the body or behind it."""
     limit, squares = REACH * size, []
     for view, tree in zip(views, trees):
-        placed, looking = _visible(view.samples, view.normals, invert_pose(T))
+        placed, looking = view.samples.looking(invert_pose(T), 0.1)
         squares.append(np.minimum(tree.query(placed[looking])[0] / limit, 1.0) ** 2)
     bare = float(np.concatenate(squares).mean())
     through = float(np.mean([_seen_through(view, T, limit) for view in views]))

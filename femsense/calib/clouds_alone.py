@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.cloud_pose_search import View, find_cloud_pose
 from femsense.calib.from_clouds import refine_poses
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.io.clouds.frame_clouds import read_frame_cloud
@@ -111,8 +109,7 @@ def _different(recording: Recording, frames: list[int]) -> list[int]:
 
 
 def _seen(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:
-    mesh, seen = robot.body.mesh, []
-    triangles = without_cavities(body_surface(mesh).triangles, mesh.nodes)
+    triangles, seen = body_surface(robot.body.mesh).triangles, []
     for k, state in states.items():
         cloud = read_frame_cloud(recording, k, view=view)
         if cloud is None:
@@ -124,22 +121,6 @@ def _seen(robot: Robot, recording: Recording, states: dict[int, Equilibrium], vi
         ahead = points[:, 2] > 0
         seen.append(View(points[ahead], mine[ahead], Surface(state.positions, triangles), colored))
     return seen
-
-
-def without_cavities(triangles: IntArray, nodes: FloatArray) -> IntArray:
-    """Return the triangles of a body's boundary without the walls of closed cavities, which no camera sees: their volume is negative.
-
-    Arguments:
-        triangles: facing out of the material, shape (t, 3).
-        nodes: [m], shape (n, 3).
-    """
-    links = sp.coo_array(
-        (np.ones(2 * len(triangles)), (triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel())), (len(nodes),) * 2
-    )
-    part = connected_components(links, directed=False)[1][triangles[:, 0]]
-    a, b, c = nodes[triangles].swapaxes(0, 1)
-    volume = np.bincount(part, np.einsum("tc,tc->t", a, np.cross(b, c)))
-    return np.asarray(triangles[volume[part] > 0.0])
 
 
 def _status(recording: Recording, start: Calibration, fitted: Calibration, views: Sequence[int]) -> str:
