@@ -182,13 +182,17 @@ def print_pairs(out: Path, data: Path) -> None:
     bare, heavy = (trunk.read_run(data, loaded=loaded) for loaded in (False, True))
     frames = trunk.still_frames([bare, heavy], 48)[1::2]
     pairs = ("with the weight", heavy, -trunk.WEIGHT_N), ("half a second later", trunk.later(bare), 0.0)
+    parts = {"all": (slice(None), slice(None)), "sideways": (slice(None), slice(2)), "along the hose": (slice(None), slice(2, 3))}
+    parts |= {f"disc {i + 1}": (slice(i, i + 1), slice(None)) for i in range(len(trunk.DISCS_MM))}
     for name, other, true in pairs:
-        force, std, frame_std = trunk.force_between(model, bare, other, frames)
-        seen = ", ".join(f"{f:+.2f} ± {s:.2f}" for f, s in zip(force, std))
-        print(
-            f"| by pairs | {name} | [{seen}] N | over frames {frame_std.round(2).tolist()} N | true [0, 0, {true:.2f}] N |",
-            flush=True,
-        )
+        responses, differences = trunk.shifts_between(model, bare, other, frames)
+        for part, (discs, axes) in parts.items():
+            force, std, frame_std = trunk.force_of(responses[:, discs, axes], differences[:, discs, axes])
+            seen = ", ".join(f"{f:+.2f} ± {s:.2f}" for f, s in zip(force, std))
+            print(
+                f"| by pairs | {name} | {part} | [{seen}] N | over frames {frame_std.round(2).tolist()} N | true [0, 0, {true:.2f}] N |",
+                flush=True,
+            )
 
 
 def print_fitted(rows: list[Asked]) -> None:

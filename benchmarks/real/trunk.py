@@ -142,15 +142,13 @@ def later(run: Run) -> Run:
     return Run(np.roll(run.angles, -50, axis=0), np.roll(run.discs, -50, axis=0))
 
 
-def force_between(
+def shifts_between(
     robot: Robot, first: Run, second: Run, frames: IntArray, *, step: float = 0.1
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the force at the tip [N] that acts in one run and not in another, with the std of its mean over frames,
-    and over frames, each (3,).
+) -> tuple[FloatArray, FloatArray]:
+    """Return how the discs of each frame answer to a force at the tip [m/N], shape (f, disc, axis, 3), and by how much they differ
+    between two runs beyond what the model makes of their inputs [m], shape (f, disc, axis).
 
-    Differences between the runs at the same frame are compared with those of the model under the inputs of both:
-    what is common to both, errors of the model and of the pose too, drops out. A force in each direction has its response in each
-    frame; least squares over the discs.
+    What is common to both runs, errors of the model and of the pose too, drops out.
     """
     tip = np.flatnonzero(robot.body.mesh.nodes[:, 2] < robot.body.mesh.nodes[:, 2].min() + 1e-6)
     responses, differences = [], []
@@ -164,20 +162,27 @@ def force_between(
             pushed = solve_equilibrium(
                 robot.body, shortening=drawn(robot, second.angles[k]), nodal_forces=forces, start=states[1]
             )
-            columns.append((robot.markers.positions(pushed.positions) - at_rest).ravel() / step)
+            columns.append((robot.markers.positions(pushed.positions) - at_rest) / step)
         measured = (second.discs[k] - first.discs[k]) @ R_ROBOT_MOCAP.T
-        differences.append((measured - (at_rest - robot.markers.positions(states[0].positions))).ravel())
-        responses.append(np.stack(columns, axis=1))
-    J, d = np.array(responses), np.array(differences)
-    blocks = np.array_split(np.arange(len(frames)), 8)
+        differences.append(measured - (at_rest - robot.markers.positions(states[0].positions)))
+        responses.append(np.stack(columns, axis=2))
+    return np.array(responses), np.array(differences)
+
+
+def force_of(responses: FloatArray, differences: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the force at the tip [N] that explains shifts of some discs along some axes (see `shifts_between`) by least squares,
+    the std of its mean over frames, and over frames, each (3,)."""
+    count = len(responses)
+    J, d = responses.reshape(count, -1, 3), differences.reshape(count, -1)
+    blocks = np.array_split(np.arange(count), 8)
 
     def fit(some: IntArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(J[some].reshape(-1, 3), d[some].ravel(), rcond=None)[0])
 
-    left_out = np.array([fit(np.setdiff1d(np.arange(len(frames)), block)) for block in blocks])
+    left_out = np.array([fit(np.setdiff1d(np.arange(count), block)) for block in blocks])
     std = np.sqrt(len(blocks) - 1.0) * left_out.std(axis=0)  # jackknife
-    each = np.array([fit(np.array([i])) for i in range(len(frames))])
-    return fit(np.arange(len(frames))), std, each.std(axis=0)
+    each = np.array([fit(np.array([i])) for i in range(count)])
+    return fit(np.arange(count)), std, each.std(axis=0)
 
 
 def drawn(robot: Robot, angles: FloatArray) -> dict[str, float]:
