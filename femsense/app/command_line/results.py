@@ -101,6 +101,9 @@ def view(
 ) -> Answer:
     """Show a run or a stream on a page for browsers and headsets."""
     if stream is not None:
+        from femsense.xr.stream.access import without_password
+
+        say(f"connecting to {without_password(stream)}")
         from femsense.app.stream_command import need_one, show_stream
 
         need_one([] if run is None else [run], stream)
