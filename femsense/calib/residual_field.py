@@ -8,7 +8,7 @@ are those under which the residual is likeliest, the parameters' own share left 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -59,7 +59,10 @@ def field_scores(frames: Iterable[tuple[RayRows, FloatArray]], rest: FloatArray)
         frames: rows of each frame at the end of the fit, and how their residual changes with the parameters, shape (r, p).
         rest: nodes of the body at rest [m], shape (n, 3).
     """
-    seen = [(rows, derivative) for rows, derivative in frames if len(rows.residual)]
+    every = list(frames)
+    seen = [(rows, derivative) for rows, derivative in every if len(rows.residual)]
+    if not seen:
+        return np.zeros((0, every[0][1].shape[1] if every else 0))
     cell = CELL
     cells = _gathered(seen, rest, cell)
     while len(cells.residual) > MOST:
@@ -114,11 +117,11 @@ def _alike(cells: Cells, reach: float, *, own: bool) -> FloatArray:
 def _gathered(seen: list[tuple[RayRows, FloatArray]], rest: FloatArray, cell: float) -> Cells:
     size = float(np.linalg.norm(np.ptp(rest, axis=0)))
     parts = [_cells_of(rows, derivative, rows.hits.place(rest) / size, k, cell) for k, (rows, derivative) in enumerate(seen)]
-    return Cells(*(np.concatenate(column) for column in zip(*parts)))
+    return Cells(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Cells)))
 
 
-def _cells_of(rows: RayRows, derivative: FloatArray, place: FloatArray, frame: int, cell: float) -> tuple[FloatArray, ...]:
-    """Return the columns of `Cells` for a frame."""
+def _cells_of(rows: RayRows, derivative: FloatArray, place: FloatArray, frame: int, cell: float) -> Cells:
+    """Return the cells of a frame."""
     normal = rows.hits.normal
     keys = np.hstack([np.floor(place / cell), np.sign(normal) * (np.abs(normal) > 0.5)]).astype(np.int64)
     group = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
@@ -131,4 +134,4 @@ def _cells_of(rows: RayRows, derivative: FloatArray, place: FloatArray, frame: i
     facing = mean(normal)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
     frames = np.full(len(information), frame)
-    return mean(rows.residual[:, None])[:, 0], mean(derivative), information, mean(place), facing, frames
+    return Cells(mean(rows.residual[:, None])[:, 0], mean(derivative), information, mean(place), facing, frames)
