@@ -126,7 +126,7 @@ def _cells_of(rows: RayRows, derivative: FloatArray, place: FloatArray, frame: i
     keys = np.hstack([np.floor(place / cell), np.sign(normal) * (np.abs(normal) > 0.5)]).astype(np.int64)
     group = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     weight = row_weights(rows) / rows.std**2
-    information = np.bincount(group, weight)
+    information = np.asarray(np.bincount(group, weight), dtype=np.float64)
 
     def mean(values: FloatArray) -> FloatArray:
         return np.stack([np.bincount(group, weight * column) for column in values.T], axis=1) / information[:, None]
