@@ -23,8 +23,7 @@ from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, tange
 from femsense.sensing.types import Response, Rows, Sensor, Touch
 
 ACROSS = 0.5
-"""Forces along the surface beside those along the normal: one that is spread evenly over the disc of a friction cone with μ = 1 has the standard
-deviation μ/2 along each axis. Twice as wide, errors on `bar-tangential` fall by a percent, and on `arm-two` double (docs/forces.md, Limits)."""
+"""Forces along the surface are expected to be so much smaller than those along the normal: rubber on plastic or skin slides at 0.5 to 1, and few slide."""
 WIDER = 2.0
 """The size of the forces is itself uncertain: standard deviations are those of a prior so much wider than the likeliest."""
 SIZINGS = 8

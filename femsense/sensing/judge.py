@@ -11,7 +11,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.mesh import TetMesh
 from femsense.sensing.measurement_rows import rows_at, seen_through
-from femsense.sensing.nuisance import FAR_OFF, misfit, misfit_of, nuisance_columns, nuisance_excess
+from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess
 from femsense.sensing.responses import response_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
@@ -27,9 +27,6 @@ On a soft beam whose touch was lost they were off by 9 to 60 times; in frames wi
 
 UNKNOWN = "an object may touch whose force is not known"
 """What a frame is said to be whose other forces hold."""
-
-NUDGED = 0.1
-"""How far a camera may have moved, in radians and shares of the body's diagonal: so far that this does not hold it."""
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -58,8 +55,6 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
         size = times if limit_of(sensor, fit) != FAR_OFF else f"{np.sqrt(left):.1f} standard deviations"
         return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {size}, {what}"
     excess = shared_errors(sensor, fit)
-    if unseen(fit) and moved_camera_cost(sensor, free) < fit.cost:
-        return "a camera that moved would explain more than the contact that only the shape shows"
     if excess > sensor.knowledge.nuisance_limit:
         more = exceeding(excess / sensor.knowledge.nuisance_limit)
         return f"not explained: a smooth error takes up what is left, {more} free frames and noise let expect"
@@ -140,19 +135,6 @@ def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
     if most and max(most) > max(sure):
         return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
     return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK
-
-
-def unseen(fit: Fit) -> bool:
-    """Return whether a fit to clouds has contacts, and only such as the shape alone shows."""
-    return fit.rows.of_clouds and bool(fit.touches) and all(touch.source == "shape" for touch in fit.touches)
-
-
-def moved_camera_cost(sensor: Sensor, free: Fit) -> float:
-    """Return what the fit without forces would cost had the cameras moved as far as the frame asks for: near its clamp, a body that is pushed
-    moves as one does before a camera that was nudged."""
-    columns, known = nuisance_columns(sensor.knowledge, free.rows, _sag_of(sensor, free))
-    steps = free.rows.by_pose * np.tile(np.repeat([NUDGED, NUDGED * sensor.size], 3), free.rows.by_pose.shape[1] // 6)
-    return misfit_of(free.rows.residual - known, np.hstack([columns, steps]), free.rows)[0]
 
 
 def left_over(sensor: Sensor, fit: Fit) -> float:

@@ -1,4 +1,4 @@
-"""The material's law where none is declared, and how far forces may be off because it is not known."""
+"""How far forces are off because the material's law is not known: what another law would have them be in the same state."""
 
 from __future__ import annotations
 
@@ -11,24 +11,15 @@ from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.robot import Robot
 from femsense.sensing.types import Fit, Sensor
-
-LIKELY = "neo_hookean"
-"""The law of an elastomer whose robot declares none. The corotational law, linear in stretch, lets a body yield ever more where it is squeezed
-(docs/forces.md, Measured, has both on the same recordings)."""
-
-
-def with_likely_law(robot: Robot) -> Robot:
-    """Return a robot with the law that an elastomer likely has, from the same modulus and Poisson ratio."""
-    return robot.with_body(robot.body.with_material(replace(robot.body.material, law=LIKELY)))
 
 
 def law_std(sensor: Sensor, fit: Fit, free: Equilibrium) -> FloatArray:
-    """Return how much each force of a fit would differ under the corotational law, relative [1], shape (m,).
+    """Return how much each force of a fit would differ under the neo-Hookean law, relative [1], shape (m,).
 
-    Where a contact squeezes the body, laws that agree for small strains differ. What the other law adds to the nodal forces between the free
-    and the touched state moves the rows; so much of the forces moves them alike. 0 where the law is not assumed, but declared by an effect.
+    The corotational law is linear in stretch. Where a contact squeezes the body, laws that agree for small strains differ. What the other law adds
+    to the nodal forces between the free and the touched state moves the rows; so much of the forces moves them alike. 0 where the robot
+    declares a law by an effect.
 
     Arguments:
         fit: the frame with its contacts.
@@ -36,9 +27,9 @@ def law_std(sensor: Sensor, fit: Fit, free: Equilibrium) -> FloatArray:
     """
     m, body = len(fit.touches), sensor.robot.body
     sizes = np.linalg.norm(fit.forces, axis=1)
-    if not m or not sensor.law_is_assumed or not sizes.all():
+    if not m or body.material.law != "corotational" or not sizes.all():
         return np.zeros(m)
-    other = replace(body, material=replace(body.material, law="corotational"))
+    other = replace(body, material=replace(body.material, law="neo_hookean"))
     extra = _between(other, fit, free) - _between(body, fit, free)
     if not np.isfinite(extra).all():
         return np.ones(m)

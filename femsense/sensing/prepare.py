@@ -28,7 +28,6 @@ from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.law import with_likely_law
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
 from femsense.sensing.places import near_places, object_touches, objects_near
@@ -100,8 +99,6 @@ def prepare(
     options = options or SensingOptions()
     recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
     robot = robot.in_recording(recording.label)
-    law_is_assumed = recording.has_clouds and options.method != "paper" and robot.body.material.law == "corotational"
-    robot = with_likely_law(robot) if law_is_assumed else robot
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     surface = body_surface(robot.body.mesh)
@@ -138,7 +135,6 @@ def prepare(
         knowledge,
         Answers(),
         correction_std,
-        law_is_assumed=law_is_assumed,
     )
     sensor = replace(sensor, scenery=_scenery(sensor))
     free = _free_frames(sensor)

@@ -206,7 +206,8 @@ class Start:
     """Where a fit may begin: a state, and forces for its touches."""
 
     state: Equilibrium
-    forces: FloatArray  # [N], shape (m, 3)
+    forces: FloatArray
+    """[N], shape (m, 3)."""
     response: Response | None = None  # near the state, where it is known
     firm: bool = False
     """Whether it is so near the answer that outliers are known from the first step on (see `robust_std`)."""
@@ -366,7 +367,8 @@ class Knowledge:
 class Answers:
     """How the body answers to unit forces at the candidates near one state; made anew when the body has moved far from it."""
 
-    state: Equilibrium | None = None  # with which an estimate that was stopped goes on
+    state: Equilibrium | None = None
+    """That state; an estimate that was stopped goes on with it, and makes the answers anew."""
     columns: FloatArray | None = None
     """Moves of the nodes by unit forces along x, y, z at each candidate [m/N], shape (3n, 3c)."""
 
@@ -396,5 +398,3 @@ class Sensor:
     """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""
     scenery: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""
-    law_is_assumed: bool = False
-    """Whether the robot declares no law, and has that of `with_likely_law`."""
