@@ -16,7 +16,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without,
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
-from femsense.loop.search.refit import evidence, tried
+from femsense.loop.search.refit import beyond, evidence, tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
 from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
@@ -77,9 +77,9 @@ def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:
     return float(a.step @ b.step) > 0.0 and confounding(a, b) >= decides.alike
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate, decides: Thresholds) -> list[float]:
-    """Return by how much the steps of those that explain nearly as much as the best scatter."""
-    steps = [c.step for c in seen if c.gain >= best.gain - decides.evidence]
+def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, decides: Thresholds) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best beside a fit scatter."""
+    steps = [c.step for c in seen if fit.chi2 + best.gain - c.gain <= beyond(fit, decides.evidence)]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
@@ -94,7 +94,7 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
         if here is None:  # it does nothing to these markers
             return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
-        scatter = _scatter(around, best, data.thresholds)
+        scatter = _scatter(around, best, fitted.fit, data.thresholds)
         made = _moved(data, fitted, best, noise) if best.gain >= here.gain + data.thresholds.swap else None
         if made is None or made.fit.chi2 > fitted.fit.chi2 - data.thresholds.swap:
             return fitted, scatter
