@@ -64,20 +64,11 @@ class Groups:
         return Groups(marker, frame, sweep, state, surface, None if self.turns is None else self.turns[rows])
 
     @property
-    def distinct(self) -> int:
-        """Number of rows, where those of a marker that repeat a state count once."""
-        return int(self.state.max(initial=-1)) + 1
-
-    def without_repeats(self, rows: FloatArray) -> FloatArray:
-        """Return rows (k, c), each as the mean of those of its marker that repeat the state."""
-        count = np.bincount(self.state)
-        means = [np.bincount(self.state, column) / count for column in rows.T]
-        return np.stack(means, axis=1)[self.state]
-
-    @property
     def observations(self) -> int:
         """Number of independent observations, as BIC counts them: coordinates of markers, or crossings of a surface, in distinct states."""
-        return 3 * self.distinct if self.surface is None else self.surface.cells()
+        if self.surface is None:
+            return 3 * (int(self.state.max(initial=-1)) + 1)
+        return self.surface.cells()
 
     def members(self) -> dict[str, IntArray]:
         """Return the groupings that are distinguishable here: each has groups of several rows, and several groups."""

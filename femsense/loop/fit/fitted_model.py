@@ -228,10 +228,9 @@ def held_chi2(data: Data, fitted: FittedModel, noise: Noise) -> float:
 
 
 def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
-    """Return the mean square of whitened residuals; 1 is noise. Rows that repeat a state count as their mean: how they differ tells of noise alone."""
-    rows = [whiten(noise.whitener(t.groups, t.mesh_error), t.groups.without_repeats(r)) for t, r in zip(trials, residuals)]
-    count = sum(r.shape[1] * t.groups.distinct for t, r in zip(trials, residuals))
-    return float(sum((row**2).sum() for row in rows) / count) if count else 0.0
+    """Return the mean square of whitened residuals; 1 is noise."""
+    rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
+    return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
 
 def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:

@@ -304,8 +304,10 @@ def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
     """Return the scatter of repeated rows about their mean [m]."""
     above, below = 0.0, 0
     for r, g in zip(residuals, groups):
-        above += float(((r - g.without_repeats(r)) ** 2).sum())
-        below += r.shape[1] * (len(r) - g.distinct)
+        count = np.bincount(g.state)
+        mean = np.stack([np.bincount(g.state, column) for column in r.T], axis=1) / count[:, None]
+        above += float(((r - mean[g.state]) ** 2).sum())
+        below += r.shape[1] * int((count - 1).sum())
     return float(np.sqrt(above / below)) if below else 0.0
 
 
