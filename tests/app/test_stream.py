@@ -169,15 +169,20 @@ def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, 
 def test_the_command_line_says_at_once_what_it_does_and_at_the_end_what_was_streamed(tmp_path: Path, end: signal.Signals) -> None:
     run = write_run_with_mesh(tmp_path / "bar")
     call = [sys.executable, "-m", "femsense", "stream", str(run), "--port", "0"]
-    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as program:
-        assert program.stdout is not None and program.stderr is not None
-        assert program.stderr.readline() == f"reading {run}\n"
-        url = program.stdout.readline().strip()
-        with connect(f"{url.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
-            assert viewer.recv(5)
-        program.send_signal(end)
-        assert program.wait(20) == 0
-        said = program.stderr.read()
+    with subprocess.Popen(
+        call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=heeding_interrupts
+    ) as program:
+        try:
+            assert program.stdout is not None and program.stderr is not None
+            assert program.stderr.readline() == f"reading {run}\n"
+            url = program.stdout.readline().strip()
+            with connect(f"{url.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
+                assert viewer.recv(5)
+            program.send_signal(end)
+            assert program.wait(20) == 0
+            said = program.stderr.read()
+        finally:
+            program.kill()
     assert re.fullmatch(r"streamed [1-9]\d* poses? of bar in \d+\.\d s, to 1 viewer\n", said), said
 
 
@@ -269,6 +274,11 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
             time.sleep(0.2)
     (said,) = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)["markers"]
     assert said["position_m"]["z"] < rest[2] + 2e-3
+
+
+def heeding_interrupts() -> None:
+    """Heed SIGINT, which a shell has what it starts in the background ignore."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.model_error import excess_of
 from femsense.loop.fit.noise_components import Noise
@@ -64,11 +64,13 @@ def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None
 
 
 def _nothing_explains(course: SearchProgress) -> bool:
-    """Return whether the last model has a large error of its own: the noise of the richest linear model then weighs only how states differ, and lets a
-    pose and input offsets go wherever these agree."""
+    """Return whether the last model has a large error of its own, or is much farther from the markers than the noise of the richest linear model
+    allows: that noise then weighs only how states differ, and lets a pose and input offsets go wherever these agree."""
     data, fitted, noise = course.data, course.fitted, course.noise
     if course.holds_error or noise is None or "clouds" in data.measured:
         return False
+    if mean_square(data.train, [jet.residual for jet in fitted.fit.jets], noise) > data.thresholds.lacks:
+        return True
     return excess_of(data, course.base, fitted, fitted, noise, repeatability(data, fitted, noise)).is_large
 
 
