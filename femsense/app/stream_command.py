@@ -65,8 +65,8 @@ class LiveStream:
     closers: list[Callable[[], None]] = field(default_factory=list)
     watched: list[Watched] = field(default_factory=list)
     """Connections to elsewhere, and where readings come from."""
-    brokers: tuple[str, ...] = ()
-    """Elsewhere, that it is sent to."""
+    brokers: dict[str, MqttSink] = field(default_factory=dict)
+    """Elsewhere, that it is sent to, by address."""
     begun: float = field(default_factory=time.monotonic)
 
     @property
@@ -84,7 +84,8 @@ class LiveStream:
         """What was streamed so far, and who got it."""
         poses = {publisher.twin.name: publisher.sent for publisher in self.publishers}
         clients = None if self.broker is None else self.broker.clients
-        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, self.brokers)
+        brokers = {where: sink.was_connected for where, sink in self.brokers.items()}
+        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
@@ -286,8 +287,9 @@ def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> Liv
         if options.mqtt is not None:
             address = broker_address(options.mqtt, password=password, authority=options.authority)
             sink = MqttSink(hub, address, first)
-            live.brokers = (f"{address.host}:{address.port}",)
-            live.watched.append(connection(live.brokers[0], lambda: sink.trouble))
+            where = f"{address.host}:{address.port}"
+            live.brokers[where] = sink
+            live.watched.append(connection(where, lambda: sink.trouble))
         undo.pop_all()
     return live
 

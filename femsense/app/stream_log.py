@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,8 +63,8 @@ class Streamed:
     """Of the page and its WebSocket."""
     clients: int | None = None
     """Of the embedded broker; None: there was none."""
-    brokers: Sequence[str] = ()
-    """Elsewhere, that it was sent to."""
+    brokers: Mapping[str, bool] = field(default_factory=dict)
+    """Elsewhere, and whether it was ever connected."""
 
     @property
     def text(self) -> str:
@@ -72,8 +72,9 @@ class Streamed:
         robots = [f"{_count(count, 'pose')} of {name}" for name, count in self.poses.items()]
         places = [_count(self.viewers, "viewer")]
         places += [] if self.clients is None else [_count(self.clients, "client of the broker", "clients of the broker")]
-        places += [f"the broker {where}" for where in self.brokers]
-        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}"
+        places += [f"the broker {where}" for where, reached in self.brokers.items() if reached]
+        silent = "".join(f"; the broker {where} was never reached" for where, reached in self.brokers.items() if not reached)
+        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}{silent}"
 
 
 def _count(number: int, one: str, many: str = "") -> str:

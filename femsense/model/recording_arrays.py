@@ -35,17 +35,18 @@ def recording_from_arrays(
         free: frames in which nothing undeclared touches, shape (F,); None: not known.
 
     Raises:
-        InputError: shapes that do not fit, times that do not increase.
+        InputError: no frame, shapes that do not fit, times that do not increase, values that are not finite.
     """
     times = as_numbers(time_s, "time_s", expected="the time of each frame [s]").reshape(-1)
     frames = times.size
+    if not frames:
+        raise InputError("no frame", where="time_s", found="no time", expected="the time of each frame [s]")
     places = {
         name: as_numbers(x, f"markers[{name!r}]", expected=f"places [m], shape {(frames, 3)}")
-        for name, x in (markers or {}).items()
+        for name, x in _named(markers, "markers").items()
     }
     for name, x in places.items():
-        if x.shape != (frames, 3):
-            raise InputError("places of another shape", where=f"markers[{name!r}]", found=x.shape, expected=(frames, 3))
+        _check_places(x, frames, f"markers[{name!r}]")
     grid = np.stack(list(places.values()), axis=1) if places else np.zeros((frames, 0, 3))
     frame, index = np.nonzero(np.isfinite(grid).all(axis=2))
     return make_recording(
@@ -62,9 +63,30 @@ def recording_from_arrays(
     )
 
 
+def _named(series: Mapping[str, npt.ArrayLike] | None, what: str) -> Mapping[str, npt.ArrayLike]:
+    if series is not None and not isinstance(series, Mapping):
+        raise InputError("no names", where=what, found=f"a {type(series).__name__}", expected=f'{what}={{"name": values, …}}')
+    return series or {}
+
+
+def _check_places(places: npt.NDArray[np.float64], frames: int, where: str) -> None:
+    """Raise InputError unless there is a place, or three nan, in each frame."""
+    if places.shape != (frames, 3):
+        raise InputError("places of another shape", where=where, found=places.shape, expected=(frames, 3))
+    wrong = ~np.isfinite(places).all(axis=1) & ~np.isnan(places).all(axis=1)
+    if wrong.any():
+        k = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            "not a place",
+            where=where,
+            found=f"{places[k].tolist()} in frame {k}",
+            expected="three numbers [m], or three nan where it is hidden",
+        )
+
+
 def _columns(series: Mapping[str, npt.ArrayLike] | None, frames: int, what: str) -> npt.NDArray[np.float64]:
     wanted = f"a number for each of {frames} frames"
-    columns = {name: as_numbers(values, f"{what}[{name!r}]", expected=wanted) for name, values in (series or {}).items()}
+    columns = {name: as_numbers(values, f"{what}[{name!r}]", expected=wanted) for name, values in _named(series, what).items()}
     for name, values in columns.items():
         if values.shape != (frames,):
             raise InputError("a series of another length", where=f"{what}[{name!r}]", found=values.shape, expected=(frames,))

@@ -27,8 +27,12 @@ def test_each_connection_and_source_is_said_for_itself_when_it_goes_and_when_it_
     [
         (Streamed({"arm": 1}, 2.04, 0), "streamed 1 pose of arm in 2.0 s, to no viewers"),
         (
-            Streamed({"a": 120, "b": 60}, 3.0, 1, 2, ("box:1883",)),
+            Streamed({"a": 120, "b": 60}, 3.0, 1, 2, {"box:1883": True}),
             "streamed 120 poses of a and 60 poses of b in 3.0 s, to 1 viewer, 2 clients of the broker and the broker box:1883",
+        ),
+        (
+            Streamed({"a": 3}, 1.0, 0, None, {"box:1": False}),
+            "streamed 3 poses of a in 1.0 s, to no viewers; the broker box:1 was never reached",
         ),
         (Streamed({"a": 0}, 3.0, 2, 0), "streamed no poses of a in 3.0 s, to 2 viewers and no clients of the broker"),
     ],

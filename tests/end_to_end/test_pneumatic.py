@@ -106,7 +106,7 @@ def test_columns_are_matched_by_name_and_pressures_beyond_the_limit_warn(folder:
         check_against(robot, fits)
     assert state_key(fits, 0) != state_key(fits, 1)
     for names, values in ((["other"], [[0.0]]), ([], None)):
-        with pytest.raises(InputError, match=r"(?s)other chambers than those.*chamber_core"):
+        with pytest.raises(InputError, match=r"(?s)pressures: other chambers than those.*core"):
             check_against(robot, make_recording(Timeline([0.0]), drives=Drives(chamber_names=names, pressures=values)))
 
 

@@ -41,6 +41,13 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         fs.Recording.from_arrays(TIME, inputs={"top": ["x", 1, 2]})
     with pytest.raises(InputError, match=r"pressures\['air'\]: not finite\n  found:    nan in frame 1"):
         fs.Recording.from_arrays(TIME, pressures={"air": [0.0, np.nan, 1.0]})
+    for hidden in (np.inf, np.nan):  # of a marker that is hidden nothing is known
+        with pytest.raises(InputError, match=r"markers\['tip'\]: not a place\n  found:    \[0.0, (inf|nan), 2.0\] in frame 0"):
+            fs.Recording.from_arrays(TIME, markers={"tip": np.where(PLACES["tip"] == 1.0, hidden, PLACES["tip"])})
+    with pytest.raises(InputError, match=r"inputs: no names\n  found:    a list\n  expected: inputs="):
+        fs.Recording.from_arrays(TIME, inputs=[1.0, 2.0])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="time_s: no frame"):
+        fs.Recording.from_arrays([])
     with pytest.raises(InputError, match=r"time_s: time does not increase\n  found:    \[2.0, 1.0\] s from position 1 on"):
         fs.Recording.from_arrays([0.0, 2.0, 1.0])
 

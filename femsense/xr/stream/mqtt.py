@@ -71,6 +71,7 @@ class MqttSink:
         self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
         self._client.on_connect = self._greet
         self.connected = Event()
+        self.was_connected = False
         self._client.on_disconnect = lambda *_: self.connected.clear()
         self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
         self._client.connect_async(address.host, address.port, keepalive=5)
@@ -100,6 +101,7 @@ class MqttSink:
             return
         client.subscribe([(one, 0) for one in WANTED])
         self.connected.set()
+        self.was_connected = True
         self.send(tuple(message for message in self.hub.newest().values() if message.retained))
 
 

@@ -199,7 +199,9 @@ def _datagrams(source: str, stop: Event) -> Iterator[bytes]:
     parts = urlsplit(source)
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        endpoint.bind((parts.hostname or "127.0.0.1", parts.port or 0))
+        if parts.port is None:
+            raise ValueError("no port: whoever sends has to know it")
+        endpoint.bind((parts.hostname or "127.0.0.1", parts.port))
     except (OSError, ValueError) as error:
         endpoint.close()
         raise InputError(

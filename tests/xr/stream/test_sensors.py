@@ -185,7 +185,9 @@ def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
     assert next(readings)[1].tolist() == [3, 4]
 
 
-@pytest.mark.parametrize("source", ["no-such.csv", "udp://127.0.0.1:99999", "mqtt://host", "serial:/dev/no-such-port", "ftp://x"])
+@pytest.mark.parametrize(
+    "source", ["no-such.csv", "udp://127.0.0.1:99999", "udp://127.0.0.1", "mqtt://host", "serial:/dev/no-such-port", "ftp://x"]
+)
 def test_what_is_no_source_is_refused_at_once(source: str) -> None:
     with pytest.raises(InputError):
         readings_of(source, CHANNELS, Event())
