@@ -224,6 +224,13 @@ console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.e
       }
     }
     return found;
+  }),
+  noise: await page.evaluate(() => {                           // the first force that is shown is one that noise may make
+    const { arrows } = femsense.shown.robots.get('bar').body;
+    const weak = { point_m: [0, 0, 0], force_vector_n: [0, 0, 0.003], force_n: 0.003, std_n: 0.01, force_std_n: null, point_std_m: null };
+    arrows.largest = 1e-9;
+    arrows.show([weak]);
+    return arrows.ends([weak])[0].length() / arrows.size;
   }) }));
 await opened.close();
 """
@@ -254,6 +261,7 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
     assert told["state"] == "stale" and 100.0 <= age < 200.0 and told["live"] == "live"
     assert 40 < float(told["rate"].removeprefix("live, ").removesuffix(" Hz")) < 110  # what is sent: ten times what arrives
     assert all(told["spoken"]) and not any(told["unspoken"])  # nobody speaks of forces of the third robot
+    assert told["noise"] == pytest.approx(0.42 * 0.003 / (3 * 0.01))  # no long arrow
     side = 1.0 - 2 * 10 / 700  # a label stays in the picture, ten pixels from its edges
     assert told["edges"][1] == pytest.approx(side, abs=0.01) and told["edges"][2] == pytest.approx(-side, abs=0.01)
 

@@ -25,14 +25,17 @@ import { newtons, type Contact, type Vector } from "./data";
 const COLOR = 0xff9c33;
 const UP = new Vector3(0, 1, 0);
 const LONGEST = 0.42; // arrow, of the body's size
+const NOISE = 3; // standard deviations: what may be noise gets no long arrow
 const HANGING = [0.5, -0.25] as const; // a label stands above its point
 const LABEL_HEIGHT = 0.046; // of the distance to the viewer
 
 export class ForceArrows {
   /** To be placed in the robot's frame. */
   readonly group = new Group();
-  /** The force that gets the longest arrow [N]; grows with what is shown. */
+  /** The largest force so far [N]. */
   largest = 1e-9;
+  /** The force that gets the longest arrow now [N]. */
+  full = 1e-9;
   private arrows: Arrow[] = [];
   private stale = false;
 
@@ -46,6 +49,7 @@ export class ForceArrows {
 
   show(contacts: Contact[]): void {
     for (const c of contacts) this.largest = Math.max(this.largest, c.force_n ?? 0);
+    this.full = Math.max(this.largest, ...contacts.map((c) => NOISE * (c.std_n ?? 0)));
     const placed = contacts.filter((c) => c.point_m && c.force_vector_n && c.force_n !== null && c.force_n > 0);
     while (this.arrows.length < placed.length) {
       const arrow = new Arrow(this.size);
@@ -53,14 +57,14 @@ export class ForceArrows {
       this.arrows.push(arrow);
       this.group.add(arrow.group);
     }
-    this.arrows.forEach((arrow, i) => arrow.set(placed[i], (LONGEST * this.size) / this.largest));
+    this.arrows.forEach((arrow, i) => arrow.set(placed[i], (LONGEST * this.size) / this.full));
   }
 
   /** Returns where arrows begin, in glTF's frame (Y up). */
   ends(contacts: Contact[]): Vector3[] {
     const placed = contacts.filter((c) => c.point_m && c.force_vector_n);
     return placed.map((c) => {
-      const [x, y, z] = new Vector3(...c.point_m!).addScaledVector(new Vector3(...c.force_vector_n!), (-LONGEST * this.size) / this.largest).toArray();
+      const [x, y, z] = new Vector3(...c.point_m!).addScaledVector(new Vector3(...c.force_vector_n!), (-LONGEST * this.size) / this.full).toArray();
       return new Vector3(x, z, -y);
     });
   }

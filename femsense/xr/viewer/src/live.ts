@@ -169,7 +169,7 @@ class Streams {
     if (robot.body) element("legend-scale").textContent = `${(1000 * robot.body.residualScale).toPrecision(1)} mm`;
     const shown = robot.shown;
     if (!shown) return;
-    showFrame(shown, robot.model.inputs, Math.max(robot.body?.arrows.largest ?? 0, 1e-9));
+    showFrame(shown, robot.model.inputs, Math.max(robot.body?.arrows.full ?? 0, 1e-9));
     element("panel").dataset.stale = String(state !== "live");
     const newest = robot.newest?.time_s ?? 0;
     const end = this.paused ? Math.max(this.at, newest - KEPT_S + PLOTTED_S) : newest;

@@ -53,7 +53,7 @@ class Player {
     this.times = Array.from(clip?.tracks[0]?.times ?? [0]);
     const box = this.space();
     stage.robot.add(body.group);
-    body.arrows.largest = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
+    body.arrows.largest = body.arrows.full = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
     for (const frame of run?.frames ?? []) for (const end of body.arrows.ends(frame.contacts)) box.expandByPoint(end);
     stage.fit(box);
     const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
@@ -82,7 +82,7 @@ class Player {
     if (now !== this.shown && now >= 0) {
       this.body.show(frames[now]!.contacts);
       this.body.painter.frame(now);
-      showFrame(frames[now]!, this.run!.inputs, this.body.arrows.largest);
+      showFrame(frames[now]!, this.run!.inputs, this.body.arrows.full);
       this.plot.draw(frames, 0, this.duration, frames[now]!.time_s);
     }
     this.shown = now;
