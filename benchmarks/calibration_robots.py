@@ -1,12 +1,13 @@
 """Each way of calibrating on the robots that come along, one and two cameras, against the truth of the virtual rig.
 
-    python benchmarks/calibration_robots.py [--robots NAME …] [--seeds N] [--first SEED] [--out FOLDER]
+    python benchmarks/calibration_robots.py [--robots NAME …] [--ways WAY …] [--seeds N] [--first SEED] [--out FOLDER]
 
 Each seed puts two cameras anywhere above, 2 to 3.5 sizes of the robot away, and gives each cable (chambers: none) an initial input that
 the recording does not tell. The truth has a finer mesh and another law; markers have noise of 0.2 mm, clouds that of a stereo camera.
 *Over stated* is the root mean square of error over standard deviation: 1 is the bound by Cramér and Rao where the model is right. A pose is
 *wrong* where it is more than 10 mm or 10° off and nothing is said; *said* counts what is refused, or has not settled.
-Recordings are kept below OUT. Prints the table "On the robots that come along" of docs/calibration.md.
+Recordings are kept below OUT. Prints the table "On the robots that come along" of docs/calibration.md, and for each way which share of all
+coordinates of poses and of all inputs lies within one, two and three of its standard deviations.
 """
 
 from __future__ import annotations
@@ -124,6 +125,8 @@ class Errors:
     """Error over the largest tension, each cable."""
     stated: FloatArray
     """Standard deviation over the largest tension, each cable."""
+    coordinates: FloatArray
+    """Errors of the pose over their standard deviations, shape (6,)."""
 
 
 def errors_of(robot: Robot, found: Calibration, truth: dict) -> Errors:
@@ -133,13 +136,14 @@ def errors_of(robot: Robot, found: Calibration, truth: dict) -> Errors:
     names = [c.name for c in robot.body.cables] if found.cable_tension_n else []
     off = np.array([found.cable_tension_n[n] - truth["cable_tension_n"][n] for n in names])
     std = np.array([found.tension_std_n[n] or np.inf for n in names])
+    coordinates = step / np.sqrt(np.diag(found.pose_covariance))
     pose = float(np.sqrt(step @ np.linalg.solve(found.pose_covariance, step) / 6.0))
     scale = most[: len(names)]
-    return Errors(float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3])), pose, off / scale, std / scale)
+    return Errors(float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3])), pose, off / scale, std / scale, coordinates)
 
 
-def row(robot: Robot, way: str, cameras: int, seeds: list[int], folder: Path) -> str:
-    """Return a line of the table."""
+def row(robot: Robot, way: str, cameras: int, seeds: list[int], folder: Path) -> tuple[str, list[Errors]]:
+    """Return a line of the table, and what ended right."""
     ended, said, wrong = list[Errors](), 0, 0
     for seed in seeds:
         there = recorded(robot, seed, folder)
@@ -163,7 +167,18 @@ def row(robot: Robot, way: str, cameras: int, seeds: list[int], folder: Path) ->
         else:
             ended.append(one)
     cells = [robot.name, way, cameras, f"{len(ended)} of {len(seeds)}", said, wrong, *told(ended)]
-    return "| " + " | ".join(map(str, cells)) + " |"
+    return "| " + " | ".join(map(str, cells)) + " |", ended
+
+
+def shares(way: str, ended: list[Errors]) -> list[str]:
+    """Return lines of the table of shares within the standard deviations."""
+    lines = []
+    for name, parts in (("pose", [e.coordinates for e in ended]), ("inputs", [e.inputs / e.stated for e in ended])):
+        size = np.abs(np.concatenate(parts)) if parts else np.zeros(0)
+        if size.size:
+            within = " | ".join(f"{100 * np.mean(size <= n):.0f} %" for n in (1, 2, 3))
+            lines.append(f"| {way}: {name} | {within} | {size.max():.1f} | {np.sqrt(np.mean(size**2)):.1f} |")
+    return lines
 
 
 def told(ended: list[Errors]) -> list[str]:
@@ -191,6 +206,7 @@ def recorded(robot: Robot, seed: int, folder: Path) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", nargs="*", default=["finger", "arm", "gripper", "four-leg", "pneu-finger"])
+    parser.add_argument("--ways", nargs="*", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--out", type=Path, help="keep recordings here")
@@ -199,10 +215,16 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as temporary:
         seeds = list(range(options.first, options.first + options.seeds))
+        right: dict[str, list[Errors]] = {way: [] for way in options.ways}
         for name in options.robots:
-            for way in WAYS:
+            for way in options.ways:
                 for cameras in (1, 2):
-                    print(row(load_robot(name), way, cameras, seeds, options.out or Path(temporary)), flush=True)
+                    line, ended = row(load_robot(name), way, cameras, seeds, options.out or Path(temporary))
+                    print(line, flush=True)
+                    right[way] += ended
+    print("\n| | within 1 | within 2 | within 3 | largest | rms |\n|---|---|---|---|---|---|")
+    for way, ended in right.items():
+        print("\n".join(shares(way, ended)))
 
 
 if __name__ == "__main__":

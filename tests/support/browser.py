@@ -50,6 +50,21 @@ def start_browser(config: pytest.Config, script: str, *given: str) -> subprocess
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def said(browser: subprocess.Popen[str]) -> Any:
+    """Return what a script logs next."""
+    assert browser.stdout is not None
+    line = browser.stdout.readline()
+    assert line, browser.stderr.read() if browser.stderr else ""
+    return json.loads(line)
+
+
+def go_on(browser: subprocess.Popen[str]) -> None:
+    """Tell a script that waits for a line to go on."""
+    assert browser.stdin is not None
+    browser.stdin.write("go\n")
+    browser.stdin.flush()
+
+
 def run_in_browser(config: pytest.Config, script: str, *given: str) -> dict[str, Any]:
     """Return the object that a script logs last."""
     process = start_browser(config, script, *given)

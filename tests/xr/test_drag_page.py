@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
-from browser import CHROMIUM, start_browser
+from browser import CHROMIUM, go_on, said, start_browser
 from live_bars import Source
 from xr_bar import write_run_with_mesh
 
@@ -71,27 +70,17 @@ def test_a_point_is_dragged_on_a_phone_and_wishes_go_on_without_pictures_for_a_s
     before = {"status": "nearest", "text": "an answer to somebody else", "error_m": 0.1, "inputs": []}
     source.hub.publish([Message("femsense/bar/reach", json.dumps(before).encode())])
     browser = start_browser(request.config, DRAG, source.server.url)
-    assert browser.stdin is not None and browser.stdout is not None
-
-    def said() -> dict[str, Any]:
-        line = browser.stdout.readline()
-        assert line, browser.stderr.read() if browser.stderr else ""
-        return dict(json.loads(line))
-
-    def go() -> None:
-        browser.stdin.write("go\n")
-        browser.stdin.flush()
 
     try:
-        seen = said()
+        seen = said(browser)
         assert seen["reach"].startswith("Drag a green point") and seen["answered"].startswith("reached")
         assert seen["panel"][1] < seen["ball"][1] < seen["dragging"][0]  # the point is not covered
         assert seen["dragging"][1] <= seen["dock"][0] and seen["armed"] == "false"
         assert source.wishes and not any(wish["armed"] for wish in source.wishes)
-        go()
-        assert said() == {"armed": "true"} and not source.wishes[-1]["held"]
-        go()
-        assert said()["held"] and source.wishes[-1]["armed"] and source.wishes[-1]["handle"] == "top"
+        go_on(browser)
+        assert said(browser) == {"armed": "true"} and not source.wishes[-1]["held"]
+        go_on(browser)
+        assert said(browser)["held"] and source.wishes[-1]["armed"] and source.wishes[-1]["handle"] == "top"
         count = len(source.wishes)
         time.sleep(0.5)
         assert len(source.wishes) > count + 3  # a slow picture does not stop the robot
@@ -99,8 +88,8 @@ def test_a_point_is_dragged_on_a_phone_and_wishes_go_on_without_pictures_for_a_s
         count = len(source.wishes)
         time.sleep(0.5)
         assert len(source.wishes) == count  # who sees nothing leads nobody
-        go()
-        assert said() == {"armed": "false"} and not source.wishes[-1]["held"] and not source.wishes[-1]["armed"]
+        go_on(browser)
+        assert said(browser) == {"armed": "false"} and not source.wishes[-1]["held"] and not source.wishes[-1]["armed"]
     finally:
         source.close()
         browser.kill()

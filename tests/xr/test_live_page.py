@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, run_in_browser, start_browser
+from browser import CHROMIUM, go_on, run_in_browser, said, start_browser
 from live_bars import Source
 from streams import read_frame, within
 from xr_bar import write_run_with_mesh
@@ -131,51 +131,42 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
     run = open_run(write_run_with_mesh(tmp_path / "bar"))
     source = Source(run, built_page)
     browser = start_browser(request.config, WATCH, source.server.url, str(tmp_path / "stale.png"))
-    assert browser.stdin is not None and browser.stdout is not None
-
-    def said() -> Any:
-        line = browser.stdout.readline()
-        assert line, browser.stderr.read() if browser.stderr else ""
-        return json.loads(line)
 
     try:
-        seen = said()
+        seen = said(browser)
         assert "Contact 1" in seen["text"] and "bar-2" in seen["text"] and "live" in seen["text"]
         within, length = (float(word) for word in seen["clock"].removesuffix(" s").split(" / "))
         assert length == 2.0 and 0.0 <= within <= length  # though it plays over and over
         frame = list(frames_of(run, rate_hz=23 / 2.0, loop=False))[11]
         unsure = replace(frame.contacts[0], force_std_n=np.array([0.1, 0.4, 0.4]))
         source.last = replace(frame, frame=999, contacts=(unsure,))
-        browser.stdin.write("go\n")
-        browser.stdin.flush()
-        scene = said()
+        go_on(browser)
+        scene = said(browser)
         check_scene(scene, run, source.last)
         assert scene["field"] == run.field[11].tolist() and scene["mode"] == 2 and scene["scale"].endswith("% strain")
         away = frame.bones + np.array([0.0, 0.15, 0.25, 0, 0, 0, 0])
         source.last = replace(source.last, frame=1000, bones=away)
-        browser.stdin.write("go\n")
-        browser.stdin.flush()
-        corners = np.array(said())
+        go_on(browser)
+        corners = np.array(said(browser))
         assert np.abs(corners[:, :2]).max() < 1.0  # all of it is still in the picture
         assert np.abs(corners[:, 1]).max() > 0.1
         source.last = replace(source.last, contacts=None, status="light = 9 is outside 0 … 1")
-        browser.stdin.write("go\n")
-        browser.stdin.flush()
-        odd = said()
+        go_on(browser)
+        odd = said(browser)
         assert 0 < odd["faded"] < 1 and odd["parts"] == [
             False,
             False,
             False,
             True,
         ]  # no forces are known; why it is faded is said
-        assert said()["watching"]
+        assert said(browser)["watching"]
         source.flowing.clear()
-        stale = said()
+        stale = said(browser)
         assert stale["grey"] < 900 and "stale" in stale["badge"]  # 0.4 s and a slow picture; the machine may be busy
         assert all(grey == (age > 0.4) for age, grey in stale["pictures"])  # each picture after 0.4 s is grey, none before
         assert any(grey for _, grey in stale["pictures"])
         source.flowing.set()
-        end = said()
+        end = said(browser)
         assert end["fresh"] and end["overflow"] == 0 and end["problems"] == []
         assert end["hosts"] == [source.server.url.split("/")[2]]
         held = [wish for wish in source.wishes if wish["held"]]
@@ -311,40 +302,30 @@ def test_a_page_says_what_it_waits_for_and_greys_what_stops_while_it_is_paused(
     publisher = Publisher(hub, replace(run.twin, name="arm"), PublishOptions(waits_for="readings of a.csv"))
     server = WebSocketServer(hub, live_page_files(built_page), options=ServerOptions(port=0))
     browser = start_browser(request.config, WAITS, server.url)
-    assert browser.stdin is not None and browser.stdout is not None
     flowing, frames = Event(), frames_of(run, rate_hz=30.0)
 
     def flow() -> None:
         while not flowing.wait(1 / 30):
             publisher.publish(next(frames))
 
-    def said() -> dict[str, Any]:
-        line = browser.stdout.readline()
-        assert line, browser.stderr.read() if browser.stderr else ""
-        return dict(json.loads(line))
-
-    def go() -> None:
-        browser.stdin.write("go\n")
-        browser.stdin.flush()
-
     try:
         waiting = {"badge": "waiting for readings of a.csv", "panel": False, "live": "false", "grey": True}
-        assert said() == waiting
+        assert said(browser) == waiting
         sender = Thread(target=flow, daemon=True)
         sender.start()
-        live = said()
+        live = said(browser)
         assert live["badge"].startswith("live") and live["panel"] and live["live"] == "true" and not live["grey"]
-        paused = said()
+        paused = said(browser)
         assert paused["badge"].startswith("paused · live") and paused["live"] == "false" and not paused["grey"]
-        assert said()["watching"]
+        assert said(browser)["watching"]
         flowing.set()  # nothing comes any more, the connection stands
-        stale = said()
+        stale = said(browser)
         assert stale["badge"].startswith("paused · stale") and stale["grey"]
         assert all(grey == (age > 0.4) for age, grey in stale["pictures"]) and any(not grey for _, grey in stale["pictures"])
         sender.join()
-        go()
+        go_on(browser)
         hub.close()
-        assert said() == {"badge": "paused · no connection", "panel": True, "live": "false", "grey": True}
+        assert said(browser) == {"badge": "paused · no connection", "panel": True, "live": "false", "grey": True}
     finally:
         flowing.set()
         hub.close()

@@ -38,9 +38,8 @@ def acceptance_test(
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
-    acts = held_shift(
-        data, fitted, made, noise
-    )  # what `held` is on average for the true effect, with a variance of four times that
+    # what `held` is on average for the true effect, with a variance of four times that
+    acts = held_shift(data, fitted, made, noise)
     wanted = min(decides.held_gain * gain * held_share(data), acts - 2.0 * decides.significant * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
     fit_objection = _objection(made, candidate, score, decides)

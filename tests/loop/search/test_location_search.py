@@ -20,7 +20,7 @@ from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.effect_fields import effect_fields, fields_of, part_that_tells
 from femsense.loop.search.forward_selection import select_next
-from femsense.loop.search.location_search import climbed, located, may_lie_elsewhere, same_place, without_term
+from femsense.loop.search.location_search import climbed, closer, located, may_lie_elsewhere, same_place, without_term
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import Candidate, screen, screen_model
 from femsense.loop.search.swaps import swapped
@@ -243,3 +243,11 @@ def test_places_explain_as_much_where_the_misfit_hides_the_difference(started: t
         own = replace(data, thresholds=replace(still, evidence=evident))
         scatter = np.array(located(own, fitted, near, one, [other], NOISE)[1])
         assert bool((scatter >= 0.99 * half).all()) is as_good
+
+
+def test_neighbours_explain_as_much_where_the_misfit_hides_the_difference(started: tuple[Data, FittedModel]):
+    """At a price at which no neighbour would count by the noise alone, some do, since more than the noise is left."""
+    data, fitted = started
+    own = replace(data, thresholds=replace(DEFAULTS, swap=np.inf, evidence=200.0))  # no place is moved
+    made = refit(data, fitted, payloads(data, fitted)[0], NOISE)
+    assert min(closer(own, made, NOISE)[1]) > 0.0
