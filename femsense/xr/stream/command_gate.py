@@ -18,6 +18,8 @@ class GateOptions:
     """Commands end when no wish has come for so long: who drags must hold on."""
     range_per_s: float = 0.25
     """An input moves by this share of its range a second at most."""
+    command_hz: float = 50.0
+    """How often commands go out. A command that comes later moves no farther: what a thread has missed is not made up for at once."""
 
 
 class CommandGate:
@@ -27,8 +29,11 @@ class CommandGate:
         self.inputs, self.options = tuple(inputs), options or GateOptions()
         self.commanded: dict[str, float] = {}
         """What was commanded last; empty while nothing is."""
+        self.last: dict[str, float] = {}
+        """What was commanded last, also while nothing is: a robot that stops stays there. Empty before the first command."""
+        self.turn = 0
+        """How often it was let go: what was found for an earlier turn is not wanted in this one."""
         self._wanted: dict[str, float] = {}
-        self._last: dict[str, float] = {}
         self._held_at = self._moved_at = float("-inf")
 
     def hold(self, now: float, *, armed: bool) -> None:
@@ -38,14 +43,16 @@ class CommandGate:
         else:
             self.release()
 
-    def want(self, inputs: Mapping[str, float]) -> None:
-        """Set where the inputs are to go."""
-        self._wanted = dict(inputs)
+    def want(self, inputs: Mapping[str, float], *, turn: int | None = None) -> None:
+        """Set where the inputs are to go, unless that was found for an earlier turn."""
+        if turn in (None, self.turn):
+            self._wanted = dict(inputs)
 
     def release(self) -> None:
         """Stop at once: nothing moves any more."""
         self._held_at = float("-inf")
         self._wanted = {}
+        self.turn += 1
 
     @property
     def moving(self) -> bool:
@@ -67,8 +74,8 @@ class CommandGate:
 
         Arguments:
             now: the time [s].
-            current: where the inputs are; commands begin from there, so that nothing jumps. What the robot does not say is where
-                commands left it last.
+            current: where the robot itself says that the inputs are; commands begin from there, so that nothing jumps. What it
+                does not say is where commands left it last, however long ago.
         """
         held = now - self._held_at <= self.options.hold_s
         if not held:
@@ -76,17 +83,17 @@ class CommandGate:
         if not held or not self._wanted:
             return None
         if not self.commanded:
-            last = self._last
+            last = self.last
             self.commanded = {one.name: _within(one, current.get(one.name, last.get(one.name, one.low))) for one in self.inputs}
             self._moved_at = now
-        elapsed = min(now - self._moved_at, self.options.hold_s)
+        elapsed = min(now - self._moved_at, 1.0 / self.options.command_hz)
         self._moved_at = now
         for one in self.inputs:
             step = self.options.range_per_s * (one.high - one.low) * elapsed
             here = self.commanded[one.name]
             there = _within(one, self._wanted.get(one.name, here))
             self.commanded[one.name] = min(max(there, here - step), here + step)
-        self._last = dict(self.commanded)
+        self.last = dict(self.commanded)
         return dict(self.commanded)
 
 

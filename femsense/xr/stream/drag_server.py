@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -59,7 +59,6 @@ class DragOptions:
     """No further equilibrium is begun for an answer after so long [s]; the next answer goes on from there."""
     rest_s: float = 0.3
     """A hand that has not moved for so long rests: its target is sought from rest too where it is not reached [s]."""
-    command_hz: float = 50.0
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
     """How what is measured corrects the inputs."""
 
@@ -128,6 +127,8 @@ class DragServer:
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
         self._driver, self._driver_at = "", float("-inf")
+        self._told: dict[str, float] = {}  # the robot's own word of its inputs
+        self._told_at = float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
         self._settled_since: float | None = None
@@ -157,14 +158,16 @@ class DragServer:
             self._take(message, who)
 
     def _measure(self, payload: bytes) -> None:
-        """Take note of where the dragged marker was measured."""
-        rows = (read_document(payload) or {}).get("markers")
-        named = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-        places = {row.get("name"): _place(row.get("position_m")) for row in named}
+        """Take note of where the dragged marker was measured, and of what the robot says of its inputs."""
+        told, now = read_document(payload) or {}, time.monotonic()
+        places = {str(row.get("name")): _place(row.get("position_m")) for row in _rows(told, "markers")}
+        inputs = self._values(told)
         with self._lock:
             place = places.get(self._handle)
             if place is not None and self._is_near(place):
-                self.feedback.measured(time.monotonic(), np.array(place))
+                self.feedback.measured(now, np.array(place))
+            if inputs:
+                self._told, self._told_at = inputs, now
 
     def _take(self, message: Message, who: str) -> None:
         wish = self._read(message.payload, who)
@@ -172,11 +175,12 @@ class DragServer:
         with self._lock:
             if wish is None or (who != self._driver and now - self._driver_at < 4.0 * self.options.gate.hold_s):
                 return  # one hand at a time
-            self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
-            self.gate.hold(now, armed=wish.armed and wish.held)
-            if not wish.held or wish.handle != self._handle:
+            if not wish.held or wish.handle != self._handle or now - self._driver_at > self.options.gate.hold_s:
+                self.gate.release()  # what was wanted before is not wanted now
                 self.feedback.forget()
                 self._grabbed = wish.held
+            self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
+            self.gate.hold(now, armed=wish.armed and wish.held)
             self._handle = wish.handle if wish.held else ""
             self._wish = wish if wish.held else None
         self._fresh.set()
@@ -219,7 +223,7 @@ class DragServer:
         """
         begun = time.perf_counter()
         with self._lock:
-            grabbed, self._grabbed, current = self._grabbed, False, self._current()
+            turn, grabbed, self._grabbed, current = self.gate.turn, self._grabbed, False, self._shown()
             last = self._motion
             reached = None if last is None or last.status == REACHED else last.reached_m.get(handle)
             since = self._settled()
@@ -233,7 +237,7 @@ class DragServer:
         if motion.equilibrium.converged:
             self._motion = motion
             with self._lock:
-                self.gate.want(motion.inputs)
+                self.gate.want(motion.inputs, turn=turn)
         self._bones = self._fit(self._skin.positions(motion.positions), start=self._bones)
         self._seq += 1
         found = self._document(motion, 1e3 * (time.perf_counter() - begun))
@@ -273,9 +277,9 @@ class DragServer:
     def _command_all(self) -> None:
         """Send commands for as long as the gate lets them out; when it closes, say so once."""
         was_moving = False
-        while not self._stop.wait(1.0 / self.options.command_hz):
+        while not self._stop.wait(1.0 / self.options.gate.command_hz):
             with self._lock:
-                inputs = self.gate.step(time.monotonic(), self._current())
+                inputs = self.gate.step(time.monotonic(), self._current(time.monotonic()))
                 moving = self.gate.moving
             if inputs is not None:
                 self._command(inputs, armed=True)
@@ -295,20 +299,41 @@ class DragServer:
         }
         self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
 
-    def _current(self) -> dict[str, float]:
-        """Return the inputs that the robot has now, as far as it says so in the units of commands."""
+    def _current(self, now: float) -> dict[str, float]:
+        """Return the inputs that the robot has at a time [s], as far as it says so itself, on `measured`.
+
+        Before the first command the topic `inputs` says it; later it does not count: of a run that plays it says what was once.
+        """
+        told = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
+        return told if self.gate.last else {**self._shown(), **told}
+
+    def _shown(self) -> dict[str, float]:
+        """Return the inputs of what viewers see."""
         message = self.hub.newest().get(topic(self.name, INPUTS))
-        told = None if message is None else read_document(message.payload)
-        rows: list[dict[str, Any]] = [] if told is None else told.get("inputs", [])
+        return self._values((message and read_document(message.payload)) or {})
+
+    def _values(self, told: Mapping[str, Any]) -> dict[str, float]:
+        """Return the inputs in a document, as far as they are in the units of commands."""
         units = {one.name: one.unit for one in self.gate.inputs}
-        return {row["name"]: float(row["value"]) for row in rows if "value" in row and row.get("unit") == units.get(row["name"])}
+        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in _rows(told, "inputs")]
+        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and _is_number(v)}
+
+
+def _rows(told: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    """Return the objects in a list of a document."""
+    rows = told.get(name)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def _is_number(told: object) -> TypeGuard[float]:
+    return isinstance(told, int | float) and bool(np.isfinite(told))
 
 
 def _place(told: object) -> tuple[float, float, float] | None:
     """Return x, y, z of an object, or None."""
     if not isinstance(told, dict):
         return None
-    values = [float(v) for v in (told.get(axis) for axis in "xyz") if isinstance(v, int | float) and np.isfinite(v)]
+    values = [float(v) for v in (told.get(axis) for axis in "xyz") if _is_number(v)]
     return (values[0], values[1], values[2]) if len(values) == 3 else None
 
 

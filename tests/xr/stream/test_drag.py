@@ -22,7 +22,7 @@ from femsense.xr.skinning import fit_skin
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
 from femsense.xr.stream.drag_server import DragOptions, DragServer, drive_inputs, handles_of
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import Input, read_pose
+from femsense.xr.stream.payloads import Input, inputs_bytes, read_pose
 from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 TIP = np.array([[0.1, 0.015, 0.03], [0.1, 0.0, 0.015]])
@@ -73,6 +73,39 @@ def test_commands_end_when_nobody_holds_on_and_begin_where_the_robot_is() -> Non
     assert gate.step(5.01, {}) is None and not gate.moving
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_commands_never_jump_whatever_the_lapse_and_wherever_the_target_went(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    gate, now, sent = CommandGate(INPUTS, GateOptions(allowed=True, range_per_s=0.25, hold_s=0.25)), 0.0, []
+    for _ in range(60):
+        lapse = rng.choice([0.0, 0.03, 0.3, 7.0])  # let go and taken again, a page that stalls, a connection that is lost
+        if rng.random() < 0.5:
+            gate.release()
+        now += lapse
+        gate.want({"top": rng.choice([0.0, 4.0]), "side": rng.choice([0.5, 2.5])})  # rest is among them
+        for _ in range(rng.integers(1, 60)):
+            now += rng.choice([0.004, 0.02, 0.2])  # a thread that is held up makes nothing up for
+            gate.hold(now, armed=True)
+            out = gate.step(now, {})
+            assert out is not None
+            sent.append([out["top"], out["side"]])
+    jumps = np.abs(np.diff(sent, axis=0)).max(axis=0)
+    assert (jumps <= 0.25 * np.array([4.0, 2.0]) * 0.02 + 1e-12).all(), jumps
+    assert (np.ptp(sent, axis=0) > [1.0, 0.5]).all()
+
+
+def test_what_was_found_for_an_earlier_turn_moves_nothing() -> None:
+    gate = CommandGate(INPUTS, GateOptions(allowed=True))
+    gate.hold(0.0, armed=True)
+    turn = gate.turn
+    gate.release()
+    gate.hold(0.1, armed=True)
+    gate.want({"top": 4.0, "side": 2.5}, turn=turn)
+    assert gate.step(0.1, {}) is None
+    gate.want({"top": 4.0, "side": 2.5}, turn=gate.turn)
+    assert gate.step(0.1, {}) == {"top": 0.0, "side": 0.5}
+
+
 # ---- the server
 
 
@@ -88,6 +121,52 @@ def served() -> Iterator[tuple[Hub, DragServer, ObedientRobot]]:
     there = ObedientRobot(hub, bar((6, 2, 2)), "bar", drive_inputs(robot))
     yield hub, server, there
     server.close()
+
+
+@pytest.fixture
+def alone() -> Iterator[tuple[Hub, DragServer]]:
+    """A model that is dragged, and no robot that says where it is."""
+    robot, hub = bar((4, 1, 1)), Hub()
+    nodes = robot.body.mesh.nodes[np.unique(surface_triangles(robot.body.mesh))]
+    skin = fit_skin(nodes, nodes[None], bones=4)
+    server = DragServer(hub, robot, skin, name="bar", options=DragOptions(gate=GateOptions(allowed=True)))
+    yield hub, server
+    server.close()
+
+
+class Commands:
+    """A sink that keeps the inputs that were commanded, and says now and then that the robot is elsewhere, as a run that plays."""
+
+    def __init__(self, hub: Hub, server: DragServer) -> None:
+        self.hub, self.server, self.sent = hub, server, []
+        hub.attach(self)
+
+    def send(self, messages: tuple[Message, ...]) -> None:
+        for message in messages:
+            told = json.loads(message.payload) if message.topic == "femsense/bar/command" else {}
+            if told.get("armed"):
+                self.sent.append([row["value"] for row in told["inputs"]])
+
+    def play(self, *values: float) -> None:
+        """Say what a run says that plays."""
+        inputs = inputs_bytes(0, 0.0, self.server.gate.inputs, values)
+        self.hub.publish([Message("femsense/bar/inputs", inputs)])
+
+    def farthest(self) -> float:
+        """How far one command was from the one before, as a share of what the rate allows."""
+        gate = self.server.gate
+        most = gate.options.range_per_s * np.array([one.high - one.low for one in gate.inputs]) / gate.options.command_hz
+        return float((np.abs(np.diff(self.sent, axis=0)) / most).max())
+
+    def close(self) -> None:
+        pass
+
+
+def hold(hub: Hub, target: Any, seconds: float, **more: Any) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        drag(hub, target, **more)
+        time.sleep(0.03)
 
 
 def drag(hub: Hub, target: Any, *, armed: bool = True, held: bool = True, who: str = "me", handle: str = "tip") -> None:
@@ -184,6 +263,63 @@ def test_a_correction_is_bounded_waits_for_the_robot_and_forgets() -> None:
     assert np.isnan(feedback.missed_m)  # too old to say anything
     feedback.forget()
     np.testing.assert_array_equal(feedback.target(9.0, wanted, settled_since=1.05), wanted)
+
+
+def test_after_a_lapse_commands_go_on_from_the_last_one_though_a_run_plays_on(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
+    names, out = server.robot.body.cable_names, Commands(hub, server)
+    far, rest = (target_of(server.robot, dict(zip(names, pull))) for pull in ((1.5, 0.6), (0.0, 0.0)))
+    out.play(0.5, 0.2)
+    hold(hub, far, 1.0)
+    assert out.sent[0] == pytest.approx([0.5, 0.2])  # before the first command that is where the robot is
+    assert len(out.sent) > 10 and out.sent[-1] != out.sent[0]
+    for lapse, played, target, who in (
+        (0.0, (1.4, 0.0), far, "me"),  # armed again at once
+        (0.5, (0.0, 1.4), far, "me"),  # a connection that was away
+        (2.0, (0.7, 0.7), rest, "another"),  # long, somebody else, and back to rest
+    ):
+        count = len(out.sent)
+        if lapse:
+            time.sleep(lapse)
+        else:
+            drag(hub, far, armed=False)
+            assert within(2.0, lambda: not server.gate.moving)
+        out.play(*played)
+        hold(hub, target, 0.5, who=who)
+        assert len(out.sent) > count + 5
+    assert out.farthest() <= 1.0 + 1e-9
+
+
+def test_commands_begin_where_the_robot_itself_says_that_it_is(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
+    names, out = server.robot.body.cable_names, Commands(hub, server)
+    far = target_of(server.robot, dict(zip(names, (1.5, 0.6))))
+    hold(hub, far, 0.5)
+    drag(hub, far, held=False)
+    assert within(2.0, lambda: not server.gate.moving)
+    count, rows = len(out.sent), [{"name": name, "unit": "N", "value": v} for name, v in zip(names, (2.5, 1.5))]
+    rubbish = [
+        {"name": ["a list"], "unit": "N", "value": 1.0},
+        {"name": names[0], "unit": "Pa", "value": 3.0},
+        {"name": names[1], "unit": "N", "value": float("nan")},
+        7,
+    ]
+    for told in (rows, rubbish, "no list"):
+        hub.received(Message("femsense/bar/measured", json.dumps({"inputs": told, "markers": told}).encode()), "the robot")
+    hold(hub, far, 0.5)
+    assert out.sent[count] == pytest.approx([2.5, 1.5])
+
+
+def test_who_comes_back_after_a_lapse_begins_anew(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
+    far = target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6))))
+    drag(hub, far)
+    turn = server.gate.turn
+    drag(hub, far)
+    assert server.gate.turn == turn
+    time.sleep(1.5 * server.gate.options.hold_s)
+    drag(hub, far)
+    assert server.gate.turn == turn + 1
 
 
 def test_without_arming_the_ghost_moves_and_the_robot_does_not(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
