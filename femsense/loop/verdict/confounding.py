@@ -18,7 +18,7 @@ from femsense.loop.thresholds import Thresholds
 def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
     """Return pairs that these data cannot distinguish: what is named, and what might be in its place."""
     found: dict[frozenset[str], ConfoundedPair] = {}
-    asked = _as_evident, _absorbed, _in_common, _alike
+    asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common, _alike
     for pair in (pair for ask in asked for pair in ask(search, names, decides)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
@@ -40,15 +40,20 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
     )
 
 
-def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str]) -> str:
-    """Return a sentence on what might be in the place of what is named, by refits or by what calibration absorbs; nothing where there is nothing."""
+def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thresholds) -> str:
+    """Return sentences on what might be in the place of what is named, by refits or by what calibration absorbs; nothing where there is nothing."""
     instead: dict[str, list[str]] = {}
+    stands_for: dict[str, list[str]] = {}
     for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
+        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= decides.evidence
         for own, other in (pair.pair, pair.pair[::-1]):
             if own in names and other not in names:
-                instead.setdefault(own, []).append(other)
+                (stands_for if far else instead).setdefault(own, []).append(other)
     said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
-    return f" These data do not tell {', nor '.join(said)}." if said else ""
+    told = [f"{own} may stand for {' or '.join(others)}" for own, others in stands_for.items()]
+    return (f" These data do not tell {', nor '.join(said)}." if said else "") + (
+        f" As the model still errs, {', and '.join(told)}." if told else ""
+    )
 
 
 def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
@@ -66,6 +71,18 @@ def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> It
     swap = search.in_place
     if swap is not None and abs(swap.ahead) < decides.evidence and {OFFSETS, swap.name} & set(names):
         yield ConfoundedPair((OFFSETS, swap.name), dbic_gap=abs(swap.ahead))
+
+
+def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects that pass alone and have nothing left beside what is named, where the weights hold the error of the model: by how much the named
+    one is ahead then says how well it makes up for that error, too."""
+    if search.noise.assumed is None:
+        return
+    left = {c.effect.name for c in search.last if c.score > 0.0}
+    for own in _named(search, names):
+        for r in search.refits:
+            if r.passes and r.answers_as(own) and r.name not in left and r.name not in names:
+                yield ConfoundedPair((own.name, r.name), dbic_gap=own.evidence - r.evidence)
 
 
 def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:

@@ -84,7 +84,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     return LoopResult(
         verdict=verdict,
         sentence=verdict_in_words(verdict, effects, found, before, back, budget, data.thresholds)
-        + in_words(pairs, names)
+        + in_words(pairs, names, data.thresholds)
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)

@@ -6,6 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.result.tables import table_of
 from femsense.loop.search.search_state import Search
@@ -27,14 +28,23 @@ def candidate(name: str, *field: float) -> SimpleNamespace:
     )
 
 
-def searched(refits: list[RefitRecord], first: list[SimpleNamespace] | None = None) -> Search:
-    """Return a search that went so, with a modulus fitted along."""
+def searched(refits: list[RefitRecord], first: list[SimpleNamespace] | None = None, *, errs: bool = False) -> Search:
+    """Return a search that went so, with a modulus fitted along, by weights that hold an error of the model or not."""
     hypothesis = SimpleNamespace(terms=((SimpleNamespace(name="stiffness"), {}, (None,)),), names=("stiffness",))
     jacobian = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
     fitted = SimpleNamespace(fit=SimpleNamespace(fit=SimpleNamespace(jacobian=jacobian), own=1, hypothesis=hypothesis))
     return cast(
         Search,
-        SimpleNamespace(refits=refits, first=first or [], history=[("", fitted)], base=fitted, final=fitted, in_place=None),
+        SimpleNamespace(
+            refits=refits,
+            first=first or [],
+            last=[],
+            history=[("", fitted)],
+            base=fitted,
+            final=fitted,
+            in_place=None,
+            noise=Noise({"white": 1e-4}, "", assumed=1e-4 if errs else None),
+        ),
     )
 
 
@@ -48,7 +58,17 @@ def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_know
         "dbic_gap": 3.0,
         "cosine": pytest.approx(0.9975, abs=1e-4),
     }
-    assert in_words(pairs, ["cable_friction"]) == " These data do not tell cable_friction from cable_gain."
+    assert in_words(pairs, ["cable_friction"], DEFAULTS) == " These data do not tell cable_friction from cable_gain."
+
+
+def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_said() -> None:
+    refits = [refit("payload", 200.0, "named"), refit("density", 126.0), refit("creep", 90.0), refit("cable_gain", 50.0, "no")]
+    search = searched(refits, errs=True)
+    search.last[:] = [candidate("creep", 0, 0, 1)]  # creep still explains something beside the payload
+    pairs = confounded(search, ["payload"], DEFAULTS)
+    assert [(p.pair, p.dbic_gap) for p in pairs] == [(("payload", "density"), 74.0)]
+    assert in_words(pairs, ["payload"], DEFAULTS) == " As the model still errs, payload may stand for density."
+    assert not confounded(searched(refits), ["payload"], DEFAULTS)  # by the noise, evidence tells them apart
 
 
 def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> None:
@@ -58,7 +78,7 @@ def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> Non
     ]
     pairs = confounded(searched([refit("creep", 30.0, "named")], fields), ["creep"], DEFAULTS)
     assert [p.pair for p in pairs] == [("creep", "cable_gain")]
-    assert in_words(pairs, ["creep"]) == ""  # fields alone: no refit says so
+    assert in_words(pairs, ["creep"], DEFAULTS) == ""  # fields alone: no refit says so
 
 
 def test_an_effect_that_makes_the_modulus_needless_is_its_rival_unless_another_one_is_far_ahead() -> None:
@@ -107,6 +127,6 @@ def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None
     hidden.retained, hidden.response = 0.02, np.zeros((2, 1))
     pairs = confounded(searched([], [hidden]), ["stiffness"], DEFAULTS)
     assert table_of(pairs) == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
-    assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"]) == (
+    assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"], DEFAULTS) == (
         " These data do not tell stiffness from cable_friction, nor gravity from cable_offset."
     )
