@@ -34,7 +34,7 @@ def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], 
 def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
     """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
     _seek(course, checkpoint, say)
-    if _nothing_explains(course):
+    if nothing_explains(course):
         say("nothing explains what is left: asking again with weights that hold the error of the model")
         weights = noise_of(course.data, course.fitted, None, course.noise)[0]
         course.begin_again(with_turning_placements(course.data, course.base), weights)
@@ -63,7 +63,7 @@ def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None
     checkpoint.keep(course)
 
 
-def _nothing_explains(course: SearchProgress) -> bool:
+def nothing_explains(course: SearchProgress) -> bool:
     """Return whether the last model has a large error of its own, or is much farther from the markers than the noise of the richest linear model
     allows: that noise then weighs only how states differ, and lets a pose and input offsets go wherever these agree."""
     data, fitted, noise = course.data, course.fitted, course.noise

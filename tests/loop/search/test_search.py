@@ -11,7 +11,7 @@ from arm import arm, record, sweeps
 from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.fitted_model import fit_model, mean_square, with_nuisance
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.search import _nothing_explains
+from femsense.loop.search.search import nothing_explains
 from femsense.loop.search.search_state import SearchProgress
 
 
@@ -35,16 +35,16 @@ def test_weights_as_large_as_what_is_left_do_not_hide_what_the_model_leaves(off)
     data, fitted = off
     swallows = Noise({"white": 4e-3}, "")  # so that the residual looks like noise to the weights
     assert mean_square(data.train, [jet.residual for jet in fitted.fit.jets], swallows) < data.thresholds.lacks
-    assert _nothing_explains(course(data, fitted, swallows))
+    assert nothing_explains(course(data, fitted, swallows))
 
 
 def test_what_is_left_at_the_size_of_what_repeats_is_not_asked_again(off):
     data, fitted = off
     trials = [replace(t, scene=replace(t.scene, recording=replace(t.scene.recording, marker_noise_m=8e-3))) for t in data.train]
     calm = replace(data, train=trials)
-    assert not _nothing_explains(course(calm, fitted, Noise({"white": 5e-3}, "")))
+    assert not nothing_explains(course(calm, fitted, Noise({"white": 5e-3}, "")))
 
 
 def test_weights_that_hold_the_error_are_not_asked_for_twice(off):
     data, fitted = off
-    assert not _nothing_explains(replace(course(data, fitted, Noise({"white": 1e-4}, "")), holds_error=True))
+    assert not nothing_explains(replace(course(data, fitted, Noise({"white": 1e-4}, "")), holds_error=True))
