@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -63,6 +64,12 @@ def exists(file: str, page: Path) -> bool:
     return any((folder / file).exists() for folder in (page.parent, ROOT, ROOT / "femsense", ROOT / "meshes"))
 
 
+def extras_of(text: str) -> set[str]:
+    """Return the extras of femsense that a text tells to install."""
+    named = re.findall(r"(?:femsense|pip install[^\n`]*[ \"]\.)\[([a-z, ]+)\]", text)
+    return {extra.strip() for group in named for extra in group.split(",")}
+
+
 def top_level_names(file: Path) -> set[str]:
     """Return what a module defines or imports."""
     names: set[str] = set()
@@ -115,6 +122,12 @@ def test_names_beside_a_file_are_in_that_file(page: Path) -> None:
     assert not missing
 
 
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "femsense").rglob("*.py"))], ids=lambda page: page.stem)
+def test_extras_that_a_text_names_exist(page: Path) -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert extras_of(page.read_text(encoding="utf-8")) <= set(declared)
+
+
 @pytest.mark.parametrize(
     "page", [p for p in PAGES if p.name != "files.md"], ids=lambda p: p.stem
 )  # that one is made of the schema's own words
@@ -140,6 +153,13 @@ def test_what_does_not_exist_is_found() -> None:
     assert [file for file in files_of(text) if not exists(file, ROOT / "docs/page.md")] == gone
     assert modules_of(text) == ["femsense.no.such"] and not is_there("femsense.no.such") and is_there("femsense.core.pose")
     assert named_in_tables(text) == [("femsense/core/pose.py", "no_such")]
+    assert extras_of('pip install "femsense[no]", femsense[such,xr]\npip install -e ".[all]" or\npip install .[these]') == {
+        "no",
+        "such",
+        "xr",
+        "all",
+        "these",
+    }
     assert "no_such" not in top_level_names(ROOT / "femsense/core/pose.py")
 
 

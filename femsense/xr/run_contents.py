@@ -67,7 +67,7 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
     Returns:
         `format`, `name`, `frame` ("robot"), and `frames`: for each state its time from the first [s], the frame's
         number, status, residual and inputs where `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` names
-        the inputs, with their units and the range that the run has;
+        the inputs, with their units and ranges: "declared" by robot.toml, or "reached" by the run where nothing is;
         `markers` and `cameras` are what the real robot shares with it; `field` is what `stress_of_run` holds.
 
     Raises:
@@ -89,7 +89,8 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
         state = frames[_nearest(times, row.number("time_s"))]
         state["frame"] = row.integer("frame") if state["frame"] is None else state["frame"]
         state["contacts"].append(_contact(row))
-    inputs = [_input(column, told) for column in columns]
+    robot = robot_table(run)
+    inputs = [_input(column, told, robot) for column in columns]
     known = landmarks_of_run(run)
     return {
         "format": FORMAT,
@@ -192,21 +193,33 @@ def _contact(row: _Row) -> dict[str, Any]:
     }
 
 
-INPUT_COLUMNS = (("tension_", "_n", "N"), ("pressure_", "_pa", "Pa"))
-"""How frames.csv names what drives the robot: before and after the name, and its unit."""
+INPUT_COLUMNS = (("tension_", "_n", "N", "cables", "tension_n"), ("pressure_", "_pa", "Pa", "chambers", "pressure_pa"))
+"""How frames.csv names what drives the robot: before and after the name, and its unit; and how robot.toml names its limits."""
 
 
 def _input_columns(rows: list[_Row]) -> list[str]:
     names = rows[0].values if rows else {}
-    return [name for before, after, _ in INPUT_COLUMNS for name in names if name.startswith(before) and name.endswith(after)]
+    return [name for before, after, *_ in INPUT_COLUMNS for name in names if name.startswith(before) and name.endswith(after)]
 
 
-def _input(column: str, rows: list[_Row]) -> dict[str, Any]:
-    """Return name, unit and range of an input; the range reaches from 0 to the largest value."""
-    before, after, unit = next(kind for kind in INPUT_COLUMNS if column.startswith(kind[0]))
+def _input(column: str, rows: list[_Row], robot: dict[str, Any]) -> dict[str, Any]:
+    """Return name, unit and range of an input: what robot.toml allows, or from 0 to the largest value of the run where it
+    says nothing, or less than the run has."""
+    before, after, unit, table, limit = next(kind for kind in INPUT_COLUMNS if column.startswith(kind[0]))
     values = [value for value in (row.optional(column) for row in rows) if value is not None]
     name = column[len(before) : -len(after)]
-    return {"name": name, "unit": unit, "low": min(0.0, *values, 0.0), "high": max(0.0, *values, 0.0)}
+    low, high = min(0.0, *values, 0.0), max(0.0, *values, 0.0)
+    declared: dict[str, Any] = next((row for row in robot.get(table, ()) if row.get("name") == name), {})
+    most = float(declared.get(f"max_{limit}", np.inf))
+    if high <= most < np.inf:
+        return {
+            "name": name,
+            "unit": unit,
+            "low": min(low, float(declared.get(f"min_{limit}", 0.0))),
+            "high": most,
+            "range": "declared",
+        }
+    return {"name": name, "unit": unit, "low": low, "high": high, "range": "reached"}
 
 
 def _rows(path: Path, columns: Iterable[str]) -> list[_Row]:

@@ -197,6 +197,21 @@ def test_landmarks_are_markers_of_the_robot_and_the_calibrated_camera(tmp_path: 
     assert places[name] == [1.0, 2.0, 3.0] and "another" not in places and len(places) > 1
 
 
+@pytest.mark.parametrize(
+    ("limit", "high", "whose"),
+    [("max_tension_n = 1.6", 1.6, "declared"), ("", 1.4, "reached"), ("max_tension_n = 1.0", 1.4, "reached")],
+)
+def test_the_range_of_an_input_is_the_robot_s_or_said_to_be_the_run_s(
+    tmp_path: Path, limit: str, high: float, whose: str
+) -> None:
+    run, robot = write_run(tmp_path / "run"), tmp_path / "robot"
+    (run / "run.json").write_text(json.dumps({"inputs": {"robot": {"path": str(robot)}}}), encoding="utf-8")
+    (run / "frames.csv").write_text("frame,time_s,tension_top_n\n7,2.0,0.0\n8,4.0,1.4\n", encoding="utf-8")
+    robot.mkdir()
+    (robot / "robot.toml").write_text(f'[[cables]]\nname = "top"\n{limit}\n', encoding="utf-8")
+    assert view.contacts_of_run(run)["inputs"] == [{"name": "top", "unit": "N", "low": 0.0, "high": high, "range": whose}]
+
+
 # ---- the sources of the page ----------------------------------------------------------------------------------------------------
 
 

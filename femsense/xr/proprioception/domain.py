@@ -1,10 +1,11 @@
 """Whether a reading lies inside what was learnt: the range of each channel, and how channels go together.
 
-A channel is judged twice: against the range in which it was seen, and against what the other channels make of it,
+A channel is judged against the range in which it was seen, and against what the other channels make of it: by a straight line,
 
     z_i = (P x)_i / √P_ii,   P the inverse covariance of the normalised readings,
 
-the deviation of channel i from its regression on all others, in standard deviations of that regression.
+the deviation of channel i from its regression on all others, in standard deviations of that regression; and by a curve, where one
+tells more (`curves`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.xr.proprioception.bayes import inverse_spread
+from femsense.xr.proprioception.curves import Curve, learn_curves
 
 MARGIN = 0.05
 """Share of its range by which a channel may leave it before that is said. With both limits, of rows that repeat what was learnt
@@ -22,6 +25,8 @@ FLOOR = 0.01
 """Standard deviation of a regression, as a share of the channel's own, below which it is not believed."""
 JOINT_MARGIN = 1.5
 """Times the largest joint deviation seen; new rows of the same motion reach 1.06 times it."""
+SAME = 1e-12
+"""A channel that moves by less, relative to its reading, does not move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,19 +35,22 @@ class Outside:
 
     channel: str
     kind: str
-    """"range", "joint" (each channel is in its range, but not together) or "missing" (no finite number)."""
+    """"range", "still" (it never moved while it was learnt), "joint" (each channel is in its range, but not together) or
+    "missing" (no finite number)."""
     value: float
     low: float
     high: float
     """Between these it was seen; for "joint", between these the other channels would have it."""
     far: float
-    """How far outside, in widths of that interval."""
+    """How far outside, in widths of that interval; infinite where it has none."""
 
     @property
     def text(self) -> str:
         """One line for people."""
         if self.kind == "missing":
             return f"{self.channel}: no number"
+        if self.kind == "still":
+            return f"{self.channel} = {self.value:.4g}, but it never moved while it was learnt: it stood at {self.low:.4g}"
         seen = "learnt" if self.kind == "range" else "expected from the other channels"
         return (
             f"{self.channel} = {self.value:.4g} is outside {self.low:.4g} … {self.high:.4g} ({seen}), by {self.far:.2g} "
@@ -64,6 +72,8 @@ class Domain:
     """Inverse covariance of the normalised readings, shape (c, c)."""
     limit: FloatArray
     """Largest joint deviation of each channel that was seen, shape (c,)."""
+    curves: tuple[Curve, ...] = ()
+    """Of the normalised readings, for channels that depend on the others by a curve."""
 
     def check(self, row: FloatArray, channels: tuple[str, ...]) -> tuple[Outside, ...]:
         """Return the channels of a row, shape (c,), that are outside, the farthest first."""
@@ -73,47 +83,67 @@ class Domain:
         found = self._range(row, channels) or self._joint(row, channels)
         return tuple(sorted(found, key=lambda item: -item.far))
 
-    def inside(self, rows: FloatArray) -> np.ndarray:
+    def inside(self, rows: FloatArray) -> BoolArray:
         """Return which rows, shape (n, c), are inside, shape (n,)."""
-        width = MARGIN * self._width()
-        ranged = ((rows >= self.low - width) & (rows <= self.high + width)).all(axis=1)
-        joint = np.abs(self._deviation(rows)) <= JOINT_MARGIN * self.limit
-        return np.asarray(ranged & joint.all(axis=1))
+        inside = np.asarray(np.isfinite(rows).all(axis=1))
+        inside[inside] = (self._far(rows[inside]) <= MARGIN).all(axis=1)
+        z = self._normalised(rows[inside])
+        together = (np.abs(self._deviation(z)) <= JOINT_MARGIN * self.limit).all(axis=1)
+        inside[inside] = np.logical_and.reduce([together, *(curve.inside(z) for curve in self.curves)])
+        return inside
 
-    def _width(self) -> FloatArray:
-        return np.maximum(self.high - self.low, 1e-9 / self.scale)
+    def _far(self, rows: FloatArray) -> FloatArray:
+        """Return how far the channels of rows, shape (n, c), are beyond their range, in its widths; of a channel that never moved
+        infinitely far."""
+        beyond, width = np.maximum(self.low - rows, rows - self.high), self.high - self.low
+        least = SAME * (1.0 + np.abs(self.high))
+        still = np.where(beyond > least, np.inf, 0.0)
+        return np.asarray(np.divide(beyond, width, out=still, where=width > least))
 
-    def _deviation(self, rows: FloatArray) -> FloatArray:
-        z = (rows - self.centre) * self.scale
+    def _normalised(self, rows: FloatArray) -> FloatArray:
+        return np.asarray((rows - self.centre) * self.scale)
+
+    def _deviation(self, z: FloatArray) -> FloatArray:
         return np.asarray(z @ self.precision / np.sqrt(np.diag(self.precision)))
 
     def _range(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
-        width = self._width()
-        far = np.maximum(self.low - row, row - self.high) / width
+        far = self._far(row[None])[0]
         return [
-            Outside(channels[i], "range", float(row[i]), float(self.low[i]), float(self.high[i]), float(far[i]))
+            Outside(
+                channels[i],
+                "range" if np.isfinite(far[i]) else "still",
+                float(row[i]),
+                float(self.low[i]),
+                float(self.high[i]),
+                float(far[i]),
+            )
             for i in np.flatnonzero(far > MARGIN)
         ]
 
     def _joint(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
-        deviation = self._deviation(row[None])[0]
-        found = []
-        for i in np.flatnonzero(np.abs(deviation) > JOINT_MARGIN * self.limit):
-            std = 1.0 / (np.sqrt(self.precision[i, i]) * self.scale[i])
-            expected, half = row[i] - deviation[i] * std, JOINT_MARGIN * self.limit[i] * std
-            far = (abs(deviation[i]) / (JOINT_MARGIN * self.limit[i]) - 1.0) / 2.0
-            found.append(Outside(channels[i], "joint", float(row[i]), float(expected - half), float(expected + half), float(far)))
-        return found
+        """Return the channels that are off their line or their curve; of both, the farther."""
+        z = self._normalised(row[None])
+        std = 1.0 / np.sqrt(np.diag(self.precision))
+        lines = zip(range(len(row)), self._deviation(z)[0] * std, JOINT_MARGIN * self.limit * std)
+        curves = [(curve.channel, float(curve.deviation(z)[0]), curve.half) for curve in self.curves]
+        found: dict[int, Outside] = {}
+        for i, off, half in (*lines, *curves):
+            far = 0.5 * (abs(off) / half - 1.0)
+            if far > (found[i].far if i in found else 0.0):
+                expected, width = row[i] - off / self.scale[i], half / self.scale[i]
+                found[i] = Outside(
+                    channels[i], "joint", float(row[i]), float(expected - width), float(expected + width), float(far)
+                )
+        return list(found.values())
 
 
 def learn_domain(values: FloatArray) -> Domain:
-    """Return the domain of readings, shape (n, c)."""
+    """Return the domain of readings in the order of time, shape (n, c)."""
     low, high = values.min(axis=0), values.max(axis=0)
-    centre = values.mean(axis=0)
-    std = values.std(axis=0)
-    scale = 1.0 / np.where(std > 0, std, 1.0)
+    centre, scale = values.mean(axis=0), inverse_spread(values)
+    scale = np.where(scale > 0, scale, 1.0)
     z = (values - centre) * scale
     precision = np.linalg.inv(z.T @ z / len(z) + FLOOR**2 * np.eye(z.shape[1]))
-    deviation = z @ precision / np.sqrt(np.diag(precision))
-    limit = np.maximum(np.abs(deviation).max(axis=0), 1.0)
-    return Domain(low, high, centre, scale, precision, limit)
+    std = 1.0 / np.sqrt(np.diag(precision))
+    limit = np.maximum(np.abs(z @ precision * std).max(axis=0), 1.0)
+    return Domain(low, high, centre, scale, precision, limit, learn_curves(z, JOINT_MARGIN * limit * std))

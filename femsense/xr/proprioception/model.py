@@ -50,7 +50,8 @@ class ProprioceptiveModel:
         """Return the markers [m], shape (m, 3) for one row of readings, shape (c,), or (n, m, 3) for several, shape (n, c).
 
         Arguments:
-            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before.
+            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before. Where one is no finite
+                number, the markers are nan.
             time_s: when several rows were read [s], shape (n,); needed where the model has a memory.
 
         Raises:
@@ -63,9 +64,14 @@ class ProprioceptiveModel:
     def armature(self, row: npt.ArrayLike) -> BonePoses:
         """Return the bones of one steady row of readings, shape (c,).
 
-        Raises InputError as `markers`, and where there is no chain.
+        Raises InputError as `markers`, where a reading is no finite number, and where there is no chain.
         """
         x, _ = self._rows(row)
+        if not np.isfinite(x).all():
+            unread = ", ".join(item.channel for item in self.check(x[0]))
+            raise InputError(
+                "no bones without all readings", where="row", found=unread, expected="a finite number for each channel"
+            )
         return self.bones_of(self._inputs(x[:1], True, None))
 
     def bones_of(self, inputs: FloatArray) -> BonePoses:
@@ -106,7 +112,7 @@ class ProprioceptiveModel:
         x = as_numbers(rows, "rows", expected=expected, hint="numbers in the order of the channels")
         if x.ndim not in (1, 2) or x.shape[-1] != count:
             raise InputError("another number of channels", where="rows", found=f"shape {x.shape}", expected=expected)
-        return np.atleast_2d(x), x.ndim == 1
+        return np.atleast_2d(np.where(np.isfinite(x), x, np.nan)), x.ndim == 1
 
     def _inputs(self, x: FloatArray, steady: bool, time_s: npt.ArrayLike | None) -> FloatArray:
         if steady or not self.memory_s:

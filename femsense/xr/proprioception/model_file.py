@@ -18,6 +18,7 @@ from femsense.core.errors import InputError
 from femsense.io.files import check_target, json_text
 from femsense.io.own_files import MODEL
 from femsense.xr.armature import Armature
+from femsense.xr.proprioception.curves import Curve
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.model import ProprioceptiveModel
@@ -73,7 +74,7 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
         tuple(document["markers"]),
         _network("markers", document["networks"]["markers"], numbers),
         tuple(document["memory_s"]),
-        Domain(*(freeze(document["domain"][key]) for key in DOMAIN)),
+        _domain(document["domain"]),
         None if chain is None else _chain(chain),
         _network("bones", document["networks"]["bones"], numbers) if "bones" in document["networks"] else None,
         document["report"],
@@ -86,6 +87,23 @@ def _chain(chain: dict[str, Any]) -> Armature:
     return Armature(points, knots, at, normal, tangent, chain["planar"], chain["inextensible"])
 
 
+def _domain(table: dict[str, Any]) -> Domain:
+    """Return a domain; files of older versions hold no curves."""
+    curves = (
+        Curve(row["channel"], Network("radial", *(freeze(row[key]) for key in NUMBERS)), row["half"])
+        for row in table.get("curves", ())
+    )
+    low, high, centre, scale, precision, limit = (freeze(table[key]) for key in DOMAIN)
+    return Domain(low, high, centre, scale, precision, limit, tuple(curves))
+
+
+def _domain_table(domain: Domain) -> dict[str, Any]:
+    curves = [
+        {"channel": one.channel, "half": one.half} | {key: getattr(one.network, key) for key in NUMBERS} for one in domain.curves
+    ]
+    return {key: getattr(domain, key) for key in DOMAIN} | {"curves": curves}
+
+
 def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[str, Any]:
     chain = model.chain
     return {
@@ -95,7 +113,7 @@ def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[
         "frame": model.frame,
         "memory_s": model.memory_s,
         "networks": {name: network.kind for name, network in networks.items()},
-        "domain": {key: getattr(model.domain, key) for key in DOMAIN},
+        "domain": _domain_table(model.domain),
         "chain": None
         if chain is None
         else {key: getattr(chain, key) for key in CHAIN} | {"planar": chain.planar, "inextensible": chain.inextensible},

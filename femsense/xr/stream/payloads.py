@@ -70,6 +70,9 @@ class Input:
     """"N", "m" or "Pa"; for sensors the unit of their file, or ""."""
     low: float
     high: float
+    range: str = "declared"
+    """Whose: "declared" (limits of the robot), "reached" (by the run that is shown; no limits are declared) or "learnt" (seen when a
+    model of sensors was learnt)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -240,7 +243,9 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
                 "force_unit": "N",
                 "pose": "FSP1",
                 "bones": bones,
-                "inputs": [_known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high}) for i in twin.inputs],
+                "inputs": [
+                    _known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high, "range": i.range}) for i in twin.inputs
+                ],
                 "handles": [{"name": h.name, "position_m": _vector(h.position_m)} for h in twin.handles],
                 "commands": twin.commands,
                 "markers": [{"name": m.name, "position_m": _vector(m.position_m)} for m in known.markers],

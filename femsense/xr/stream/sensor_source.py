@@ -27,7 +27,7 @@ def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
     still = np.tile(skin.skeleton.T_robot_bone, (1, 1, 1, 1))
     glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], name=name)
     inputs = tuple(
-        Input(channel, "", float(low), float(high))
+        Input(channel, "", float(low), float(high), "learnt")
         for channel, low, high in zip(model.channels, model.domain.low, model.domain.high)
     )
     return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs, frame=model.frame)

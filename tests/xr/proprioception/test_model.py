@@ -111,6 +111,51 @@ def test_a_reading_outside_what_was_learnt_names_its_channel_and_how_far() -> No
     ]
 
 
+def on_a_curve(count: int, seed: int) -> np.ndarray:
+    """Return readings: the second the square of the first, with noise, the third at rest."""
+    rng = np.random.default_rng(seed)
+    a = np.sin(np.linspace(0.0, 25.0, count)) * np.cos(np.linspace(0.3, 4.0, count))
+    return np.stack([a, a**2, np.full(count, 1.02)], axis=1) + [0.01, 0.01, 0.0] * rng.normal(size=(count, 3))
+
+
+def test_readings_off_the_curve_on_which_channels_go_together_are_outside(tmp_path: Path) -> None:
+    model = replace(some_model("linear"), domain=learn_domain(on_a_curve(600, seed=1)))
+    assert [curve.channel for curve in model.domain.curves] == [1]
+    off = [0.2, 0.75, 1.02]  # each in its range, where a² is 0.04
+    (found,) = model.check(off)
+    assert (found.channel, found.kind) == ("green", "joint") and found.low < 0.04 < found.high < 0.3 and found.far > 1.0
+    assert model.domain.inside(on_a_curve(400, seed=2)).all() and not model.domain.inside(np.array([off])).any()
+    path = save_model(model, tmp_path / "model.onnx")
+    assert load_model(path).check(off) == (found,)
+    path.write_bytes(path.read_bytes().replace(b'"curves"', b'"others"'))  # files of older versions have none
+    assert load_model(path).check(off) == () and load_model(path).check([0.2, 9.0, 1.02])
+
+
+def test_a_straight_line_needs_no_curve() -> None:
+    rows = on_a_curve(600, seed=1)
+    rows[:, 1] = 2.0 * rows[:, 0] + 0.01 * np.random.default_rng(3).normal(size=600)
+    assert learn_domain(rows).curves == ()
+
+
+def test_a_channel_that_never_moved_is_said_in_words_when_it_does() -> None:
+    model = replace(some_model("linear"), domain=learn_domain(on_a_curve(600, seed=1)))
+    (found,) = model.check([0.2, 0.04, 1.1])
+    assert (found.channel, found.kind, found.far) == ("blue", "still", np.inf)
+    assert found.text == "blue = 1.1, but it never moved while it was learnt: it stood at 1.02"
+    assert model.check([0.2, 0.04, 1.02]) == () and model.domain.inside(np.array([[0.2, 0.04, 1.1]])).tolist() == [False]
+
+
+def test_what_is_no_finite_number_makes_no_markers_and_no_alarm_of_numpy() -> None:
+    model = some_model("sigmoid", memory=(0.5,))
+    for unread in (np.inf, -np.inf, np.nan):
+        row = [0.0, unread, 1.0]
+        assert np.isnan(model.markers(row)).all() and np.isnan(model.markers([row], [0.0])).all()
+        assert model.domain.inside(np.array([row, model.domain.centre])).tolist() == [False, True]
+        assert [item.text for item in model.check(row)] == ["green: no number"]
+        with pytest.raises(InputError, match="green"):
+            model.armature(row)
+
+
 def test_bones_and_their_numbers() -> None:
     poses = make_armature([[0, 0, 0], [0, 0.01, 0.05], [0.02, 0.02, 0.09]]).rest
     numbers = bone_numbers(poses)

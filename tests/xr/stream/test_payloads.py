@@ -74,7 +74,7 @@ def test_documents_say_what_is_known_and_leave_out_what_is_not() -> None:
     assert model["schema"] == "femsense-model-1" and model["bones"][1]["position"] == pytest.approx(
         {"x": 0.0, "y": 0.0, "z": 0.1}
     )
-    assert model["inputs"] == [{"name": "top", "unit": "N", "low": 0.0, "high": 5.0}]
+    assert model["inputs"] == [{"name": "top", "unit": "N", "low": 0.0, "high": 5.0, "range": "declared"}]
     inputs = json.loads(payloads.inputs_bytes(0, 0.0, twin().inputs, [2.0]))
     mirror = json.loads(payloads.pose_json_bytes(0, 0.0, moment(0.0, x=0.3).bones))
     assert mirror["poses"][1]["position"]["x"] == pytest.approx(-0.3) and mirror["header"]["frame_id"] == "unity"
