@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
+from femsense.sensing.run_arrays import count_of, sensed
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run
@@ -77,13 +78,13 @@ def run_document(run: Run) -> dict[str, Any]:
     """Return a run in numbers."""
     good = [frame for frame in run.frames if frame.status == "ok"]
     touched = [frame for frame in good if frame.contacts] or good
-    strongest = _strongest(run)
+    strongest, felt = _strongest(run), sensed(run.contacts)
     return {
         "robot": run.robot.name,
         "frames": len(run.frames),
         "frames_ok": len(good),
-        "contacts": len(run.contacts),
-        "frames_with_contact": len({contact.frame for contact in run.contacts}),
+        "contacts": count_of(run),
+        "frames_with_contact": len({contact.frame for contact in felt}),
         "largest_force_n": None if strongest is None else strongest.force_n,
         "rms_before_m": _median([frame.rms_before_m for frame in touched]),
         "rms_after_m": _median([frame.rms_after_m for frame in touched]),
@@ -107,7 +108,7 @@ def run_text(run: Run) -> str:
     facts, strongest = run_document(run), _strongest(run)
     rows = [["frames", f"{facts['frames_ok']} of {facts['frames']} ok"]]
     touched = f"{facts['contacts']} in {facts['frames_with_contact']} frames"
-    doubted = len({c.frame for c in run.contacts} - {frame.frame for frame in run.frames if frame.status == "ok"})
+    doubted = len({c.frame for c in sensed(run.contacts)} - {frame.frame for frame in run.frames if frame.status == "ok"})
     rows.append(["contacts", f"{touched}, {doubted} of them not ok" if doubted else touched])
     if facts["rms_after_m"] is not None:
         rows.append(

@@ -12,6 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.result_folder import read_document
 from femsense.io.tables import read_csv
+from femsense.sensing.run_arrays import sensed
 from femsense.sensing.types import ContactForce, Run
 
 TRUTH = "femsense-truth-1"
@@ -67,7 +68,7 @@ class Comparison:
 
 
 def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
-    """Return how far a run is from the truth.
+    """Return how far a run is from the truth. Forces that noise may make are no contacts, neither are true ones of nothing.
 
     Arguments:
         run: of `estimate`.
@@ -82,8 +83,9 @@ def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
         _check_recording(run, Path(truth))
         truth = read_truth(Path(truth))
     size = float(np.linalg.norm(np.ptp(run.states.rest_nodes_m, axis=0)))
-    pairs = [(true, found) for true in truth if (found := _nearest(run.contacts, true, SAME_PLACE * size)) is not None]
-    return Comparison(tuple(pairs), len(truth), len(run.contacts) - len({id(found) for _, found in pairs}))
+    truth, contacts = [true for true in truth if true.force_n_xyz.any()], sensed(run.contacts)
+    pairs = [(true, found) for true in truth if (found := _nearest(contacts, true, SAME_PLACE * size)) is not None]
+    return Comparison(tuple(pairs), len(truth), len(contacts) - len({id(found) for _, found in pairs}))
 
 
 def read_truth(recording: Path) -> tuple[TrueContact, ...]:

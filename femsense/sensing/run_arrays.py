@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +11,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import MissingDependency
 
 AXES = "xyz"
+NOISE = 3.0
+"""A force of less than so many standard deviations noise may make: no contact is counted for it, and the page draws it no long arrow."""
 
 
 class RunLike(Protocol):
@@ -31,6 +34,17 @@ def forces_of(run: RunLike) -> FloatArray:
 def positions_of(run: RunLike) -> FloatArray:
     """Return the places of the tracks on the deformed body [m], shape (frames, tracks, 3), nan where a track is not there."""
     return _filled(run, "position_m")
+
+
+def sensed(contacts: Iterable[Any]) -> list[Any]:
+    """Return the contacts whose force is more than noise may make: a given place without a force is no contact."""
+    return [contact for contact in contacts if contact.force_n > 0.0 and not contact.force_n < NOISE * contact.std_n]
+
+
+def count_of(run: RunLike) -> int:
+    """Return how many contacts a run has: one over time counts once."""
+    felt = {id(contact) for contact in sensed(run.contacts)}
+    return len({track for contact, track in zip(run.contacts, identities_of(run)) if id(contact) in felt})
 
 
 def tracks_of(run: RunLike) -> tuple[int, ...]:
@@ -57,7 +71,7 @@ def data_frame_of(run: RunLike) -> Any:
 def describe_run(run: RunLike) -> str:
     """Return a run in one line."""
     ok = sum(frame.status == "ok" for frame in run.frames)
-    sizes, count = [contact.force_n for contact in run.contacts], len(tracks_of(run))
+    sizes, count = [contact.force_n for contact in sensed(run.contacts)], count_of(run)
     forces = f"{count} contact{'s' if count > 1 else ''}, up to {max(sizes):.3g} N" if sizes else "no contact"
     return f"Run({run.robot.name}: {len(run.frames)} frames, {ok} ok; {forces})"
 

@@ -23,6 +23,7 @@ from femsense.io.own_files import RUN
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
 from femsense.io.result_folder import RUN_FILES, check_folder, read_document, results_folder, table_of
 from femsense.io.tables import read_csv
+from femsense.sensing.run_arrays import count_of
 from femsense.sensing.types import SensingOptions
 
 if TYPE_CHECKING:
@@ -218,7 +219,7 @@ def _run_document(run: Run, inputs: Mapping[str, Any], seconds: float | None) ->
         "robot": run.robot.name,
         "frames": len(run.frames),
         "frames_ok": good,
-        "contacts": len(run.contacts),
+        "contacts": count_of(run),
         "known_loads": [asdict(load) for load in run.known_loads],
         "inputs": inputs,
         "versions": versions(),

@@ -13,14 +13,17 @@ from femsense.sensing.judge import unspoken
 from femsense.sensing.law import law_std
 from femsense.sensing.nuisance import response_std
 from femsense.sensing.touches import contact_radius, touch_normal
-from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
+from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor, Touch
 
 SAME = 0.15
 """A contact nearer than this share of the body's diagonal to one of the frame before is the same one: it slid."""
 
 
 def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
-    """Return the contacts of a fit, `free` the state without them; those that begin a track have track −1."""
+    """Return the contacts of a fit, `free` the state without them; those that begin a track have track −1.
+
+    A contact at a given place is that place's all along, whatever its force is.
+    """
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     contacts: list[ContactForce] = []
     cloudy = fit.rows.of_clouds
@@ -43,13 +46,18 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
                 force_n=size,
                 std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
                 source=touch.source,
-                track=-1,
+                track=_place_of(sensor, touch) if touch.source == "given" else -1,
                 position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0))),
                 radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
         )
     return tuple(_tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
+
+
+def _place_of(sensor: Sensor, touch: Touch) -> int:
+    """Return which of the given places a touch is at."""
+    return int(np.linalg.norm(sensor.places - touch.place, axis=1).argmin())
 
 
 def size_std(force: FloatArray, covariance: FloatArray) -> float:

@@ -47,6 +47,18 @@ def test_a_force_at_a_given_place_comes_out_of_markers(touched):
     assert run.frames[3].rms_after_m < 0.2 * run.frames[3].rms_before_m
 
 
+def test_a_contact_at_a_given_place_is_the_same_one_after_a_frame_that_is_not_trusted():
+    recording, _ = record(INPUTS, noise=1e-4, forces={1: (TIP, FORCE), 3: (TIP, FORCE)})
+    recording = replace(recording, free=np.array([True, False, False, False]))
+    calibration = calibrate(arm(), recording)
+    spoiled = np.where(
+        recording.marker_frame[:, None] == 2, 0.01 * np.random.default_rng(0).normal(size=(len(recording.marker_xyz), 3)), 0.0
+    )
+    run = estimate(arm(), replace(recording, marker_xyz=recording.marker_xyz + spoiled), calibration, at=TIP)
+    assert [frame.status == "ok" for frame in run.frames] == [True, True, False, True]
+    assert {contact.frame: contact.track for contact in run.contacts if contact.frame != 2} == {0: 0, 1: 0, 3: 0}
+
+
 @pytest.mark.parametrize("along", [0.6, -0.6])
 def test_a_force_along_the_arm_has_its_size_and_its_sign(along: float):
     true = np.array([along, 0.1, -0.2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from small_run import make_run
 
 import femsense as fs
 from femsense.core.errors import InputError
+from femsense.report.text import run_document, run_text
 from femsense.rig.truth_files import CONTACT_COLUMNS
 from femsense.sensing.comparison import TrueContact, read_truth
 from femsense.sensing.run_arrays import tracks_of
@@ -40,6 +42,16 @@ def test_a_contact_keeps_its_column_by_its_track(run: Run) -> None:
     assert np.isnan(tracked.forces[2, 0]).all()
 
 
+def test_one_contact_over_time_is_counted_once(run: Run, tmp_path: Path) -> None:
+    pressing = [replace(run.contacts[0], frame=k, force_n=1.0, std_n=0.01, track=5) for k in (1, 4)]
+    one = replace(run, contacts=tuple(pressing))
+    assert "1 contact, up to" in repr(one) and "1 in 2 frames" in run_text(one)
+    folder = fs.write_run(one, tmp_path / "run", inputs={})
+    assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["contacts"] == 1
+    two = replace(one, contacts=(pressing[0], replace(pressing[1], track=6)))
+    assert "2 contacts, up to" in repr(two) and "2 in 2 frames" in run_text(two)
+
+
 def test_a_run_as_a_table(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     table = run.to_dataframe()
@@ -64,7 +76,7 @@ def test_a_figure_of_the_forces(run: Run) -> None:
 
 def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
     near = replace(run.contacts[2], position_m=np.array([0.05, 0.0, 0.03]), force_n_xyz=np.array([0.0, 0.0, -1.1]))
-    sensed = replace(run, contacts=(run.contacts[0], near))
+    sensed = replace(run, contacts=tuple(replace(contact, std_n=1e-3) for contact in (run.contacts[0], near)))
     truth = (TrueContact(4, np.array([0.05, 0.002, 0.03]), np.array([0, 0, -1.0])), TrueContact(0, np.zeros(3), np.ones(3)))
     found = fs.compare(sensed, truth)
     assert (found.contacts_found, found.contacts_true, found.contacts_false) == (1, 2, 1)
@@ -73,6 +85,22 @@ def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
     assert "0 of 0 contacts" in repr(fs.compare(sensed, ()))
     with pytest.raises(InputError, match="no truth beside the recording"):
         fs.compare(sensed, tmp_path)
+
+
+def test_forces_that_noise_may_make_are_no_contacts(run: Run) -> None:
+    """A ramp that begins at nothing: of three frames at a given place one has a contact, and of its three truths two are."""
+    place = np.array([0.05, 0.0, 0.03])
+    rows = [(0, 0.0006, 0.0015, 0.0), (1, 0.01, 0.005, 0.02), (4, 1.0, 0.005, 1.01)]
+    felt = [
+        replace(run.contacts[0], frame=k, force_n_xyz=np.array([0.0, 0.0, -f]), force_n=f, std_n=std, position_m=place, track=0)
+        for k, f, std, _ in rows
+    ]
+    ramp = replace(run, contacts=tuple(felt))
+    found = fs.compare(ramp, [TrueContact(k, place, np.array([0.0, 0.0, -true])) for k, *_, true in rows])
+    assert (found.contacts_found, found.contacts_true, found.contacts_false) == (1, 2, 0)
+    assert np.isfinite(found.force_shares).all()
+    assert "1 contact, up to 1 N" in repr(ramp) and "no contact" in repr(replace(run, contacts=tuple(felt[:2])))
+    assert (run_document(ramp)["contacts"], run_document(ramp)["frames_with_contact"]) == (1, 1)
 
 
 def test_a_truth_of_another_recording_or_robot_is_refused(run: Run, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
 
 
 def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> str:
-    base = f"{words.counted(facts.contacts, 'contact')} in {words.counted(facts.frames, 'frame')}"
+    base = f"{words.counted(_count(facts, contacts), 'contact')} in {words.counted(facts.frames, 'frame')}"
     doubted = 0 if frames is None else int((~frames.good & np.isfinite(frames.after_m)).sum())
     lost = facts.frames - facts.frames_ok - doubted
     if lost:
@@ -58,10 +58,17 @@ def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable
     )
 
 
+def _count(facts: RunFacts, contacts: ContactTable | None) -> int:
+    """Return how many contacts there are: one over time counts once."""
+    return facts.contacts if contacts is None else len(set(contacts.contact[contacts.sensed].tolist()))
+
+
 def _summary(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> Html:
     items = [("Frames ok", f"{facts.frames_ok} of {facts.frames}", "")]
-    touched = 0 if contacts is None else len(set(contacts.frame.tolist()))
-    items.append(("Contacts", str(facts.contacts), f"in {words.counted(touched, 'frame')}" if contacts is not None else ""))
+    touched = 0 if contacts is None else len(set(contacts.frame[contacts.sensed].tolist()))
+    items.append(
+        ("Contacts", str(_count(facts, contacts)), f"in {words.counted(touched, 'frame')}" if contacts is not None else "")
+    )
     if frames is not None and len(frames):
         rows = frames.good & (frames.contacts > 0) if (frames.good & (frames.contacts > 0)).any() else frames.good
         before, after = median_of(frames.before_m[rows]), median_of(frames.after_m[rows])

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
-from femsense.io.tables import read_csv
+from femsense.io.tables import Table, read_csv
+from femsense.sensing.run_arrays import NOISE
 from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS
 
 
@@ -19,6 +20,7 @@ class ContactTable:
 
     frame: IntArray
     contact: IntArray
+    """Who each is over the frames: its track; its number in the frame where two of a frame have one track, or there is none."""
     time_s: FloatArray
     place_m: FloatArray
     """shape (k, 3)."""
@@ -27,6 +29,11 @@ class ContactTable:
     size_n: FloatArray
     std_n: FloatArray
     source: tuple[str, ...]
+
+    @property
+    def sensed(self) -> npt.NDArray[np.bool_]:
+        """Whose force is more than noise may make."""
+        return np.asarray((self.size_n > 0.0) & ~(self.size_n < NOISE * self.std_n))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -59,9 +66,10 @@ def read_contacts(file: Path) -> ContactTable:
     """Return contacts.csv. Raises InputError."""
     table_ = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
     values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
+    frames = table_.integers("frame")
     return ContactTable(
-        table_.integers("frame"),
-        table_.integers("contact"),
+        frames,
+        _identities(table_, frames),
         values[:, 0],
         values[:, 1:4],
         values[:, 7:10],
@@ -69,6 +77,12 @@ def read_contacts(file: Path) -> ContactTable:
         values[:, 11],
         table_.text("source"),
     )
+
+
+def _identities(table_: Table, frames: IntArray) -> IntArray:
+    tracks = table_.integers("track") if "track" in table_.columns else np.zeros(len(frames), dtype=np.int64)
+    distinct = len(np.unique(np.column_stack([frames, tracks]), axis=0)) == len(frames)
+    return tracks if distinct and "track" in table_.columns else table_.integers("contact")
 
 
 def read_frames(file: Path) -> FrameTable:
