@@ -45,6 +45,8 @@ class Case:
     """Three times the dropouts, more flying pixels."""
     colors: bool = True
     """Whether the camera has colours."""
+    released: tuple[int, ...] = ()
+    """Of the touched frames, those in which the objects have left again and hover beside the robot."""
     calm: int = 0
     """So many frames in place of the touched ones, in which the objects hover beside the robot and the inputs swing."""
 
@@ -70,6 +72,11 @@ CASES = (
     Case("slab-rod", "slab", (Touch("rod"),), "displacement", "tof", 0.3, declared_noise=True),
     Case("post-two", "post", (Touch(scale=0.6), Touch(first=4)), "displacement", "stereo", 0.3),
     Case("post-plate", "post", (Touch("plate", scale=1.4),), "tension", "stereo", 0.4, images=True, colors=False),
+    Case("bar-release", "bar", (Touch(),), colors=False, released=(3, 4, 8)),
+    Case("arm-release", "arm", (Touch(),), "displacement", colors=False, released=(3, 4, 8)),
+    Case(
+        "slab-release", "slab", (Touch(scale=1.5),), camera="tof", distance_m=0.45, images=True, colors=False, released=(3, 4, 8)
+    ),
     Case("bar-calm", "bar", (Touch(),), calm=120),
     Case("arm-calm", "arm", (Touch("rod"),), "displacement", "tof", 0.5, images=True, calm=120),
     Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=120),

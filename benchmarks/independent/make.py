@@ -147,7 +147,7 @@ def _touch(
 
 def _level(case: Case, k: int, one: Placed) -> float:
     last = TOUCHED
-    if case.calm or k < one.touch.first or k >= last:
+    if case.calm or k < one.touch.first or k >= last or k in case.released:
         return 0.0
     if case.jump:
         return (1.0, 1.0, 0.6, 0.6, 1.0, 0.3, 1.0, 1.0, 0.5, 0.8)[k]

@@ -66,9 +66,13 @@ class _Colourless:
         self.response = None if previous is None else previous.free_response
 
     def as_before(self, near: Equilibrium) -> Seen | None:
-        """Return what the contacts of the frame before show of the robot; None where they do not explain this one, or show less of it."""
+        """Return what the contacts of the frame before show of the robot; None where they do not explain this one, or show less of it.
+
+        They have to be earned anew: where the points lie closer to the state without forces, what touched is gone, or going. Separated by
+        a state that it makes no more, points of the body would be taken for an object beside it, and the rest would show a force.
+        """
         sensor, previous = self.sensor, self.previous
-        if previous is None or near is self.alone:
+        if previous is None or near is self.alone or not _closer(sensor, self.scan, near, self.alone):
             return None
         few, free = self.seen_at(near)
         start = Start(near, previous.forces, previous.response, firm=True)

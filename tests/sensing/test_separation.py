@@ -15,6 +15,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.sensing.pipeline import sense_frame
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.separation import segmented
+from femsense.sensing.states import free_state
 from femsense.sensing.types import SensedFrame, Sensor
 
 FORCE = np.array([0.0, 0.0, -0.05])
@@ -60,3 +61,25 @@ def test_contacts_that_are_gone_tell_nothing(pushed):
     after = sense_frame(frames, 2, frame)
     assert not after.contacts
     assert after.report.matched > 0.95 * frame.report.matched
+
+
+def test_points_are_not_separated_by_a_touch_that_is_gone(pushed):
+    """Frame 2 is free again: its points are told apart as if nothing had touched before."""
+    sensor, frame, _ = pushed
+    frames = replace(sensor, recording=replace(sensor.recording, free=None))
+    alone = free_state(frames, 2, frame.free_state, None)
+    scan = scan_of(frames, 2, alone)
+    after, fresh = (segmented(frames, 2, scan, alone, previous, None)[0] for previous in (frame, None))
+    np.testing.assert_array_equal(after.others, fresh.others)
+    np.testing.assert_allclose(after.camera_points, fresh.camera_points)
+
+
+def test_a_touch_that_is_gone_leaves_no_contact_under_another_law(tmp_path: Path):
+    """With the arm's own law a touch that is gone left 1.2 ± 1.2 mN, with status ok."""
+    own = arm(law="neo_hookean")
+    seen = touched(tmp_path, FORCE, ball=True)
+    sensor = make_sensor(replace(own, color_rgb=None), seen, calibrate(own, seen))
+    frame = sense_frame(sensor, 3, None)
+    after = sense_frame(replace(sensor, recording=replace(seen, free=None)), 2, frame)
+    assert frame.contacts and not after.contacts
+    assert after.report.status == "ok" and after.report.matched > 0.99 * frame.report.matched
