@@ -59,7 +59,8 @@ def explain(
     if said_free(sensor, k):
         return scan, free, free
     again = _held(sensor, k, scan, shapes, free, previous, before)
-    if again is not None and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
+    earned = again is not None and _earned(sensor, scan, shapes, again, free)
+    if again is not None and earned and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
         return scan, again, free
     fit = _with_objects(sensor, k, scan, shapes, free, free if again is None else again, before)
     scan, fit, free = from_afar(sensor, k, whole, scan, fit, free, before)
@@ -184,7 +185,20 @@ def _with_objects(
         ]
         start = _start_of(sensor, fit, [*found, *own])
         fit = better(free, attempt(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
-    return _significant(sensor, k, scan, fit, free, before)
+    fit = _significant(sensor, k, scan, fit, free, before)
+    return fit if _earned(sensor, scan, shapes, fit, free) else free
+
+
+def _earned(sensor: Sensor, scan: Scan, shapes: list[Shape], fit: Fit, free: Fit) -> bool:
+    """Return whether contacts are more than what free frames leave where no colour tells what is an object and what the robot.
+
+    There a few points beside the robot are mostly its own. Where no completed object touches, contacts have to explain as much as those that only the
+    shape shows.
+    """
+    completed = [shape for shape in shapes if shape.kind != "points"]
+    if scan.segmented or not fit.touches or object_touches(sensor, completed, fit.state):
+        return True
+    return fit.cost <= free.cost - 2.0 * sensor.knowledge.gain_limit
 
 
 def _held(

@@ -12,8 +12,12 @@ from arm import arm
 from touched_arm import touched
 
 from femsense.calib.calibrate import calibrate
+from femsense.pointcloud.primitives import fit_shape
+from femsense.pointcloud.rays import Surface
 from femsense.sensing.pipeline import sense_frame
+from femsense.sensing.places import seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
+from femsense.sensing.search import explain
 from femsense.sensing.separation import segmented
 from femsense.sensing.states import free_state
 from femsense.sensing.types import SensedFrame, Sensor
@@ -83,3 +87,17 @@ def test_a_touch_that_is_gone_leaves_no_contact_under_another_law(tmp_path: Path
     after = sense_frame(replace(sensor, recording=replace(seen, free=None)), 2, frame)
     assert frame.contacts and not after.contacts
     assert after.report.status == "ok" and after.report.matched > 0.99 * frame.report.matched
+
+
+def test_a_few_points_beside_the_body_have_to_explain_more_than_free_frames_leave(pushed):
+    """The ball that is seen whole makes a contact; eight of its points, which may be the robot's own, do where they explain enough."""
+    sensor, frame, _ = pushed
+    scan = scan_of(sensor, 3, frame.state)
+    few, free = segmented(sensor, 3, scan, frame.free_state, frame, None)
+    (ball,) = seen_objects(sensor, 3, few, frame.state)
+    gap = Surface(frame.state.positions, sensor.surface.triangles).gap(ball.points)
+    stray = fit_shape(ball.points[np.argsort(gap)[:8]], np.full(8, 1e-3), np.zeros((8, 3)))
+    assert stray.kind == "points"
+    for shapes, limit, found in (([ball], 1e9, True), ([stray], 1e9, False), ([stray], sensor.knowledge.gain_limit, True)):
+        asked = replace(sensor, knowledge=replace(sensor.knowledge, gain_limit=limit))
+        assert bool(explain(asked, 3, scan, few, shapes, free, None, None)[1].touches) == found
