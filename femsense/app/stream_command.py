@@ -24,6 +24,7 @@ from femsense.xr.view import PAGE, live_page_files
 
 if TYPE_CHECKING:
     from femsense.xr.stream.drag_server import DragOptions, DragServer
+    from femsense.xr.stream.readings import Readings
 
 PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
@@ -142,8 +143,10 @@ def stream_runs(
     return live
 
 
-def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, name: str | None = None) -> LiveStream:
-    """Send what a learnt model makes of sensors while they are read; return at once.
+def stream_sensors(
+    source: str, model_file: Path, options: StreamOptions, *, name: str | None = None, say: Callable[[str], None] = quiet
+) -> LiveStream:
+    """Send what a learnt model makes of sensors while they are read; return at once. `say` is told that a file is waited for.
 
     Raises:
         InputError: no model, no such source, or an address that cannot be used.
@@ -159,6 +162,7 @@ def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, nam
     readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
     live = _serve(options, twin.name, stop)
     shown = without_password(source)
+    say_of_file(readings, source, say)
     live.watched.append(readings_from(shown, lambda: readings.trouble))
     _play(live, twin, frames_of_sensors(readings, model), options, readings=f"readings of {shown}")
     return live
@@ -179,7 +183,7 @@ def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
     return server
 
 
-def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
+def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Callable[[str], None] = quiet) -> None:
     """Say on `measured` where sensors put the markers of the first robot that `live` plays, while they are read.
 
     This closes the loop of a drag (see `let_drag`, which comes before).
@@ -211,8 +215,9 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
             expected=WORDS[ROBOT],
             hint="learn with -c CALIBRATION, or with --robot-frame where they are in it",
         )
-    readings = readings_of(source, model.channels, live.stop)
-    live.watched.append(readings_from(without_password(source), lambda: readings.trouble))
+    readings, shown = readings_of(source, model.channels, live.stop), without_password(source)
+    say_of_file(readings, source, say)
+    live.watched.append(readings_from(shown, lambda: readings.trouble))
 
     def run() -> None:
         for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
@@ -259,6 +264,12 @@ def stream_text(live: LiveStream) -> str:
     if live.server.access.password and live.server.access.certificate is None:
         lines.append("the password travels unencrypted: --certificate and --key encrypt")
     return "\n".join([*lines, "Ctrl-C ends it"])
+
+
+def say_of_file(readings: Readings, source: str, say: Callable[[str], None]) -> None:
+    """Say at once that a file is waited for; connections are given some time first."""
+    if "://" not in source and readings.away:
+        say(f"waiting for {source}: {readings.away}")
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
@@ -317,21 +328,3 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread.start()
     if readings:
         Thread(target=watch, daemon=True, name=f"femsense-watch-{twin.name}").start()
-
-
-def need_stream(runs: Sequence[Path], sensors: str | None, *, drag: bool) -> None:
-    """Raise InputError unless there are runs or sensors; both go together where sensors measure what is dragged."""
-    if not (runs and sensors is not None and drag):
-        need_one(runs, sensors)
-
-
-def need_one(runs: Sequence[Path], source: str | None) -> None:
-    """Raise InputError unless there are runs or a live source, and not both."""
-    if bool(runs) == (source is not None):
-        raise InputError("one of both is needed", where="femsense", expected="RUN, or a live source (--sensors, --stream)")
-
-
-def need_model(sensors: str | None, model: Path | None) -> None:
-    """Raise InputError where sensors come without a model, or a model without sensors."""
-    if (sensors is None) != (model is None):
-        raise InputError("sensors go with a model", where="femsense stream", expected="--sensors SOURCE --model MODEL")

@@ -27,13 +27,13 @@ from femsense.app.stream_command import (
     StreamOptions,
     let_drag,
     measure_by_sensors,
-    need_one,
     show_stream,
     stream_document,
     stream_runs,
     stream_sensors,
     stream_text,
 )
+from femsense.app.stream_options import need_one
 from femsense.calib.calibration import Calibration
 from femsense.calib.files import write_calibration
 from femsense.core.errors import InputError
@@ -47,6 +47,7 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.model_file import save_model
 from femsense.xr.proprioception.network import linear_network
+from femsense.xr.stream.connecting import REFUSED
 from femsense.xr.stream.drag_server import DragOptions
 from femsense.xr.stream.hub import Message
 from femsense.xr.stream.websocket import pack, unpack
@@ -110,12 +111,27 @@ def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, 
     nowhere = stream_runs([run], StreamOptions(page=page, mqtt="127.0.0.1:1"), loop=False)
     with nowhere, show_stream("http://127.0.0.1:1", page=page) as shown:
         assert within(5.0, lambda: "Connection refused" in shown.trouble)
-        assert nowhere.trouble == "no connection to 127.0.0.1:1 (no answer), trying again"
+        assert within(5.0, lambda: REFUSED in nowhere.trouble)
+        assert nowhere.trouble == f"no connection to 127.0.0.1:1 ({REFUSED}), trying again"
         Timer(4.0, shown.stop.set).start()
         shown.wait(said.append)
         assert len(said) == 1 and said[0].startswith("no connection to http://127.0.0.1:1 (")
     with stream_runs([run], StreamOptions(page=page)) as live, show_stream(live.url, page=page) as shown:
         assert within(5.0, lambda: shown.trouble == "")
+
+
+def test_a_stream_that_ends_has_ended_for_a_viewer_of_a_viewer_too(tmp_path: Path, page: Path) -> None:
+    run = write_run_with_mesh(tmp_path / "bar")
+    with stream_runs([run], StreamOptions(page=page, broker_port=0)) as live:
+        broker = show_stream(f"mqtt://127.0.0.1:{live.broker.port}", page=page) if live.broker else None
+        shown = [one for one in (broker, show_stream(live.url, page=page)) if one is not None]
+        for one in shown:
+            assert within(10.0, lambda one=one: "femsense/bar/pose" in one.hub.newest())
+    assert len(shown) == 2
+    for one in shown:
+        with one:
+            assert within(5.0, lambda one=one: one.trouble != "")
+            assert json.loads(one.hub.newest()["femsense/bar/status"].payload) == {"state": "ended", "detail": ""}
 
 
 def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, page: Path) -> None:
@@ -128,7 +144,8 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     with stream_sensors("mqtt://me:secret@127.0.0.1:1/arm", model, StreamOptions(page=page)) as live:
-        assert live.trouble == "no readings of mqtt://127.0.0.1:1/arm (no connection, no answer), waiting"
+        assert within(5.0, lambda: REFUSED in live.trouble)
+        assert live.trouble == f"no readings of mqtt://127.0.0.1:1/arm (no connection, {REFUSED}), waiting"
     with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=page)) as live:
         assert live.trouble == f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting"
 
@@ -311,6 +328,20 @@ def test_commands_that_name_nothing_or_too_much_are_refused(capsys: pytest.Captu
         run(["stream", "no-such-run", "--sensors", "x.csv", "--model", "m.onnx"]) == 2
         and "one of both" in capsys.readouterr().err
     )
+    for call, needs in (
+        (["stream", "a-run", "--commands"], "--commands does nothing without --drag"),
+        (["stream", "--sensors", "x.csv", "--model", "m.onnx", "--drag"], "--drag does nothing without RUN"),
+        (["stream", "--sensors", "x.csv", "--model", "m.onnx", "--once"], "--once does nothing without RUN"),
+        (["stream", "a-run", "--broker-port", "0"], "--broker-port does nothing without --broker"),
+        (["stream", "a-run", "--mqtt", "box", "--authority", "ca.pem"], "--authority does nothing without --mqtt mqtts://"),
+        (["view", "--stream", "http://127.0.0.1:1", "-o", "page"], "--output does nothing without RUN"),
+        (["view", "a-run", "--password-file", "word"], "--password-file does nothing without --stream"),
+        (
+            ["view", "--stream", "http://127.0.0.1:1", "--authority", "ca.pem"],
+            "--authority does nothing without --stream https://",
+        ),
+    ):
+        assert run(call) == 2 and needs in capsys.readouterr().err
     assert run(["view"]) == 2 and "nothing to show" in capsys.readouterr().err
     assert run(["view", "a-run", "--stream", "http://127.0.0.1:1"]) == 2
     with pytest.raises(InputError):

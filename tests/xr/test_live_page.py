@@ -198,6 +198,33 @@ console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.e
     }
     return robot.state(performance.now(), true)[1];
   }, JSON.parse(given[1])),
+  late: await page.evaluate(() => {                            // what waited while the page was busy comes all at once
+    const pace = new (femsense.shown.robots.get('bar-2').pace.constructor)();
+    for (let ms = 0, seq = 0; ms < 1500; ms += 1000 / 60, seq += 1) {
+      if (ms > 500) pace.take(ms, seq);
+      if (Math.floor(ms / 100) > Math.floor((ms - 1000 / 60) / 100)) pace.count(ms);
+    }
+    const even = pace.hz(), busy = new pace.constructor();
+    for (let k = 0; k < 90; k++) busy.take(1000 + 0.3 * k, k);    // a second and a half of poses, taken in 30 ms, with a count amid
+    for (let k = 0; k < 90; k++) {
+      if (k === 0) busy.count(1010);
+      busy.take(1030 + k * 1000 / 60, 90 + k);
+      if (k % 6 === 0) busy.count(1030 + k * 1000 / 60);
+    }
+    return [even, busy.hz()];
+  }),
+  times: await page.evaluate(() => {
+    const robot = femsense.shown.robots.get('mute');
+    const clock = (time) => {
+      robot.newest = { ...robot.newest, time_s: time };
+      robot.history.length = 0;
+      robot.shown = robot.newest;
+      femsense.shown.read(performance.now());
+      return document.querySelector('#clock').textContent;
+    };
+    const day = new Date();
+    return [12.34, 86938.2, 125, day.getTime() / 1000].map(clock).concat(day.toLocaleTimeString());
+  }),
   edges: await page.evaluate(async () => {                     // the picture is pushed aside until the label would be cut
     const { stage, robots } = femsense.shown, { body } = robots.get('bar'), { camera } = stage;
     const arrow = body.arrows.arrows[0], { sprite, canvas } = arrow.label, found = [];
@@ -251,6 +278,8 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
     age = float(told["badge"].removeprefix("stale, ").removesuffix(" s old"))
     assert told["state"] == "stale" and 100.0 <= age < 200.0 and told["live"] == "live"
     assert 40 < float(told["rate"].removeprefix("live, ").removesuffix(" Hz")) < 110  # what is sent: ten times what arrives
+    assert told["late"] == pytest.approx([60.0, 60.0], rel=0.05)
+    assert told["times"][:3] == ["12.3 s", "24:08:58", "2:05"] and told["times"][3] == told["times"][4]
     assert all(told["spoken"]) and not any(told["unspoken"])  # nobody speaks of forces of the third robot
     assert told["noise"] == pytest.approx(0.42 * 0.003 / (3 * 0.01))  # no long arrow
     side = 1.0 - 2 * 10 / 700  # a label stays in the picture, ten pixels from its edges
@@ -290,6 +319,10 @@ say({ ...await seen(), pictures: await page.evaluate(() => globalThis.pictures) 
 await told();
 await badge('lost');
 say(await seen());
+await told();
+await badge('ended');
+await page.waitForTimeout(600);                                // the connection is closed by now
+say(await seen());
 await opened.close();
 """
 
@@ -326,6 +359,12 @@ def test_a_page_says_what_it_waits_for_and_greys_what_stops_while_it_is_paused(
         go_on(browser)
         hub.close()
         assert said(browser) == {"badge": "paused · no connection", "panel": True, "live": "false", "grey": True}
+        go_on(browser)
+        again = WebSocketServer(hub, live_page_files(built_page), options=ServerOptions(port=server.port))
+        assert within(20.0, lambda: again.viewers == 1)
+        publisher.end()
+        hub.close()
+        assert said(browser) == {"badge": "paused · ended", "panel": True, "live": "false", "grey": True}
     finally:
         flowing.set()
         hub.close()

@@ -100,13 +100,18 @@ def view(
     json: Json = False,
 ) -> Answer:
     """Show a run or a stream on a page for browsers and headsets."""
+    from femsense.app.stream_options import is_encrypted, need_one, need_with
+
+    need_with("--output", output is not None, "RUN", stream is None)
+    need_with("--password-file", password_file is not None, "--stream", stream is not None)
+    need_with("--authority", authority is not None, "--stream https:// or mqtts://", is_encrypted(stream))
     if stream is not None:
         from femsense.xr.stream.access import without_password
 
-        say(f"connecting to {without_password(stream)}")
-        from femsense.app.stream_command import need_one, show_stream
-
         need_one([] if run is None else [run], stream)
+        say(f"connecting to {without_password(stream)}")
+        from femsense.app.stream_command import show_stream
+
         return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
     if run is None:
         raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
@@ -149,7 +154,12 @@ def stream(
         typer.Option("--mqtt", metavar="HOST[:PORT]", help="Send to this broker; mqtts:// encrypts.", show_default=False),
     ] = None,
     broker: Annotated[bool, typer.Option("--broker", help="Serve a broker for this machine.")] = False,
-    broker_port: Annotated[int, typer.Option("--broker-port", min=0, max=65535, help="Of --broker; 0: a free one.")] = 1883,
+    broker_port: Annotated[
+        int | None,
+        typer.Option(
+            "--broker-port", min=0, max=65535, help="Of --broker; 1883 if not given, 0: a free one.", show_default=False
+        ),
+    ] = None,
     json_mirror: Annotated[bool, typer.Option("--json-mirror", help="Send pose_json too, for Unity's JsonUtility.")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000.0, help="Most poses a second.")] = 60.0,
     once: Annotated[bool, typer.Option("--once", help="Play once and end.")] = False,
@@ -167,25 +177,24 @@ def stream(
     json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
+    from femsense.app.stream_options import is_encrypted, need_model, need_stream, need_with
+
+    need_stream(runs or [], sensors, drag=drag)
+    need_model(sensors, model)
+    need_with("--commands", commands, "--drag", drag)
+    need_with("--drag", drag, "RUN", bool(runs))
+    need_with("--once", once, "RUN", bool(runs))
+    need_with("--broker-port", broker_port is not None, "--broker", broker)
+    need_with("--authority", authority is not None, "--mqtt mqtts://HOST", is_encrypted(mqtt))
     for what in [str(run) for run in runs or []] + ([] if model is None else [str(model)]):
         say(f"reading {what}")
-    from femsense.app.stream_command import (
-        StreamOptions,
-        let_drag,
-        measure_by_sensors,
-        need_model,
-        need_stream,
-        stream_runs,
-        stream_sensors,
-    )
+    from femsense.app.stream_command import StreamOptions, let_drag, measure_by_sensors, stream_runs, stream_sensors
 
-    need_stream(runs or [], sensors, drag=drag or commands)
-    need_model(sensors, model)
     options = StreamOptions(
         host=host,
         port=port,
         mqtt=mqtt,
-        broker_port=broker_port if broker else None,
+        broker_port=(1883 if broker_port is None else broker_port) if broker else None,
         json_mirror=json_mirror,
         password_file=password_file,
         certificate=certificate,
@@ -194,16 +203,16 @@ def stream(
         rate_hz=rate,
     )
     if sensors is not None and model is not None and not runs:
-        return _live(stream_sensors(sensors, model, options), browser)
+        return _live(stream_sensors(sensors, model, options, say=say), browser)
     live = stream_runs(runs or [], options, loop=not once, say=say)
-    if drag or commands:
+    if drag:
         from femsense.xr.stream.command_gate import GateOptions
         from femsense.xr.stream.drag_server import DragOptions
 
         say("making ready for drags")
         let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=commands)))
         if sensors is not None and model is not None:
-            measure_by_sensors(live, sensors, model)
+            measure_by_sensors(live, sensors, model, say)
     return _live(live, browser)
 
 

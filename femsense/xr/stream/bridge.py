@@ -6,15 +6,16 @@ import base64
 import contextlib
 import ssl
 import urllib.request
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from femsense.core.errors import InputError
+from femsense.xr.stream.connecting import NO_ANSWER, why_not
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import NO_ANSWER, MqttSource, broker_address
+from femsense.xr.stream.mqtt import MqttSource, broker_address
 from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
 from femsense.xr.stream.websocket import pack, require_websockets, unpack
 
@@ -83,9 +84,12 @@ class Bridge:
             self._robots.add(known[0])
             self.hub.publish([message])
 
-    def lost(self, robots: Iterable[str], where: str) -> None:
-        """Say of robots that there is no connection any more."""
-        self.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", where)) for robot in robots])
+    def lost(self, robots: Collection[str], where: str) -> None:
+        """Say of robots that there is no connection any more; those that have ended said so before."""
+        newest = {robot: self.hub.newest().get(topic(robot, STATUS)) for robot in robots}
+        states = {robot: read_document(told.payload) or {} for robot, told in newest.items() if told is not None}
+        gone = [robot for robot in robots if states.get(robot, {}).get("state") != "ended"]
+        self.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", where)) for robot in gone])
 
 
 class _Viewer:
@@ -129,7 +133,7 @@ class _Viewer:
                 self._read()
                 attempt, self.trouble = 0, NO_ANSWER
             except (OSError, WebSocketException, EOFError, InputError) as error:
-                self.trouble = str(error) or NO_ANSWER
+                self.trouble = why_not(error, tls=self._secure, password="Authorization" in self._headers)
             self._connection = None
             self._bridge.lost(list(self._known), self._at)
             self._stop.wait(AGAIN_S[min(attempt, len(AGAIN_S) - 1)])

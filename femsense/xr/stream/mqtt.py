@@ -7,6 +7,7 @@ import contextlib
 import logging
 import socket
 import ssl
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from urllib.parse import unquote, urlsplit
 
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.access import Access
+from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
 
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 PLAIN_PORT, TLS_PORT = 1883, 8883
-NO_ANSWER = "no answer"
 WANTED = tuple(f"{PREFIX}/+/{kind}" for kind in RECEIVED)
 """Topics that clients of a broker may send to us."""
 
@@ -56,6 +57,34 @@ def broker_address(text: str, *, password: str | None = None, authority: Path | 
     return BrokerAddress(parts.hostname, port or (TLS_PORT if tls else PLAIN_PORT), user, known, tls, authority)
 
 
+class Refusal:
+    """Why a client is not connected to a broker."""
+
+    def __init__(self, client: Client, address: BrokerAddress) -> None:
+        """Listen to what fails before the broker answers."""
+        self.text = NO_ANSWER
+        self._address, self._said = address, False
+        client.on_connect_fail = self._failed
+
+    def refused(self, reason: Any) -> bool:
+        """Return whether the broker's answer to a client is that it may not come in."""
+        self._said = bool(reason.is_failure)
+        if self._said:
+            is_password = any(word in str(reason).lower() for word in ("password", "not authorized"))
+            self.text = not_let_in(password=self._address.password is not None) if is_password else str(reason)
+        return self._said
+
+    def closed(self, *, was_connected: bool) -> None:
+        """Take note of the end of a connection."""
+        if was_connected or not self._said:
+            self.text = NO_ANSWER if was_connected or self._address.tls else NO_BROKER
+        self._said = False
+
+    def _failed(self, _client: Any, _data: Any) -> None:
+        error = sys.exc_info()[1]  # paho calls this while it handles what the system said
+        self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
+
+
 class MqttSink:
     """Sends a hub's messages to a broker; comes back by itself where the broker goes away.
 
@@ -66,13 +95,13 @@ class MqttSink:
     def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
         self.hub = hub
-        self._status, self._refusal = topic(robot, STATUS), NO_ANSWER
-        self._client = make_client(address)
+        self._status, self._client = topic(robot, STATUS), make_client(address)
+        self._refusal = Refusal(self._client, address)
         self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
         self._client.on_connect = self._greet
         self.connected = Event()
         self.was_connected = False
-        self._client.on_disconnect = lambda *_: self.connected.clear()
+        self._client.on_disconnect = self._leave
         self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
@@ -81,7 +110,7 @@ class MqttSink:
     @property
     def trouble(self) -> str:
         """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal
+        return "" if self.connected.is_set() else self._refusal.text
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to the broker if there is one; returns at once."""
@@ -96,13 +125,16 @@ class MqttSink:
         self._client.loop_stop()
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if reason.is_failure:
-            self._refusal = str(reason)
+        if self._refusal.refused(reason):
             return
         client.subscribe([(one, 0) for one in WANTED])
         self.connected.set()
         self.was_connected = True
         self.send(tuple(message for message in self.hub.newest().values() if message.retained))
+
+    def _leave(self, *_: object) -> None:
+        self._refusal.closed(was_connected=self.connected.is_set())
+        self.connected.clear()
 
 
 class MqttSource:
@@ -120,7 +152,8 @@ class MqttSource:
 
         Raises MissingDependency.
         """
-        self._client, self._refusal = make_client(address), NO_ANSWER
+        self._client = make_client(address)
+        self._refusal = Refusal(self._client, address)
         self.connected = Event()
         self._topics = tuple(topics)
         self._client.on_connect = self._greet
@@ -131,20 +164,20 @@ class MqttSource:
         self._client.loop_start()
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if reason.is_failure:
-            self._refusal = str(reason)
+        if self._refusal.refused(reason):
             return
         client.subscribe([(one, 0) for one in self._topics])
         self.connected.set()
 
     def _leave(self, *_: object) -> None:
+        self._refusal.closed(was_connected=self.connected.is_set())
         self.connected.clear()
         self._lost()
 
     @property
     def trouble(self) -> str:
         """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal
+        return "" if self.connected.is_set() else self._refusal.text
 
     def send(self, message: Message) -> None:
         """Publish a message."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import os
 import queue
 import socket
 import time
@@ -14,13 +11,14 @@ from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError, MissingDependency
+from femsense.xr.stream.growing_file import GrowingFile
 from femsense.xr.stream.mqtt import MqttSource, broker_address
 
 if TYPE_CHECKING:
@@ -29,14 +27,12 @@ if TYPE_CHECKING:
 LONGEST_LINE = 65_536
 SHOWN = 60
 """Characters of a line that is no reading."""
-POLL_S = 0.002
-"""How often a file is asked whether it has grown."""
 WAIT_S = 0.1
 QUIET_S = 3.0
 """After which readings have stopped, as it is said to people."""
 
 Reading = tuple[float, FloatArray]
-"""Time [s], and one value for each channel, nan where there is none."""
+"""Time [s], and one value for each channel; nan where there is none."""
 
 
 class Readings(Iterator[Reading]):
@@ -45,7 +41,7 @@ class Readings(Iterator[Reading]):
     def __init__(self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: "") -> None:
         """Read items; `away` says why the source is not there, or nothing."""
         self._items, self._read, self._away = items, read, away
-        self._came = float("nan")
+        self._begun, self._came = time.monotonic(), float("nan")
         self._passed: Any = None
 
     def __next__(self) -> Reading:
@@ -53,15 +49,21 @@ class Readings(Iterator[Reading]):
             found = self._read(item)
             if found is not None:
                 self._came = time.monotonic()
-                return found
+                when, values = found
+                return (when if np.isfinite(when) else self._came - self._begun), values
             self._passed = item if self._passed is None else self._passed
         raise StopIteration
 
     @property
+    def away(self) -> str:
+        """Why the source is not there; empty where it is."""
+        return self._away()
+
+    @property
     def trouble(self) -> str:
         """Why no readings come; empty while they do and the source is there."""
-        if self._away():
-            return self._away()
+        if why := self.away:
+            return why
         if np.isfinite(self._came):
             return "they stopped" if time.monotonic() - self._came > QUIET_S else ""
         if self._passed is None:
@@ -84,6 +86,9 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
         channels: names, in the order of the values that are yielded.
         stop: ends it.
 
+    Returns:
+        the readings. A time that a source does not say counts from when the source was opened.
+
     Raises:
         InputError: no such source, one that cannot be opened, a CSV file without a channel.
         MissingDependency: the package for it is not installed.
@@ -99,14 +104,8 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
     if parts.scheme == "serial":
         line = _serial(source)
         return Readings(_lines(line, stop), read, lambda: "" if line.is_open else "unplugged")
-    if not Path(source).is_file():
-        raise InputError(
-            "no such source",
-            where="--sensors",
-            found=source,
-            expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC or serial:PORT?baud=115200",
-        )
-    return Readings(_grown(Path(source), channels, stop), lambda row: _of_object(row, channels))
+    file = GrowingFile(Path(source), channels)
+    return Readings(file.rows(stop), lambda row: _of_object(row, channels), lambda: file.away)
 
 
 def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
@@ -123,7 +122,7 @@ def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
         return None
     if len(values) == len(channels) + 1:
         return (values[0], np.array(values[1:])) if np.isfinite(values[0]) else None
-    return (time.monotonic(), np.array(values)) if len(values) == len(channels) else None
+    return (float("nan"), np.array(values)) if len(values) == len(channels) else None
 
 
 def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
@@ -132,7 +131,7 @@ def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
     when, values = _number(told.get("time_s")), np.array([_number(told.get(name)) for name in channels])
     if not np.isfinite(values).any():
         return None
-    return when if np.isfinite(when) else time.monotonic(), values
+    return when, values
 
 
 def _shown(item: Any) -> str:
@@ -151,48 +150,6 @@ def _number(value: Any) -> float:
 
 
 # Sources
-
-
-def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[dict[str, str]]:
-    """Open a CSV file; yield its last row, then those that are written to it.
-
-    A file that starts anew, or is replaced, is read anew.
-    """
-    stream = file.open(newline="", encoding="utf-8")
-    columns = next(csv.reader(io.StringIO(stream.readline())), [])
-    missing = [name for name in channels if name not in columns]
-    if missing:
-        stream.close()
-        raise InputError("channels are missing", where=file, found=", ".join(columns), expected=", ".join(missing))
-    return _rows(file, stream, columns, stop)
-
-
-def _rows(file: Path, stream: TextIO, columns: list[str], stop: Event) -> Iterator[dict[str, str]]:
-    newest, rest = "", ""
-    while not stop.is_set():
-        text = rest + stream.read(1 << 20)
-        *lines, rest = text.split("\n")
-        if not newest and lines:
-            lines = lines[-1:]  # what is old is not shown
-        for line in lines:
-            newest = line
-            yield dict(zip(columns, next(csv.reader([line]), [])))
-        if not lines:
-            stop.wait(POLL_S)
-            if _began_anew(file, stream):
-                stream.close()
-                stream = file.open(newline="", encoding="utf-8")
-                stream.readline()
-                rest = ""
-    stream.close()
-
-
-def _began_anew(file: Path, stream: TextIO) -> bool:
-    """Whether a file was cut off or replaced; False while it is away."""
-    with suppress(FileNotFoundError):
-        now = file.stat()
-        return now.st_size < stream.tell() or now.st_ino != os.fstat(stream.fileno()).st_ino
-    return False
 
 
 def _datagrams(source: str, stop: Event) -> Iterator[bytes]:

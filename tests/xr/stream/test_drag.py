@@ -82,6 +82,7 @@ def test_commands_never_jump_whatever_the_lapse_and_wherever_the_target_went(see
         if rng.random() < 0.5:
             gate.release()
         now += lapse
+        sent += [[out["top"], out["side"]] for out in [gate.step(now, {})] if out]
         gate.want({"top": rng.choice([0.0, 4.0]), "side": rng.choice([0.5, 2.5])})  # rest is among them
         for _ in range(rng.integers(1, 60)):
             now += rng.choice([0.004, 0.02, 0.2])  # a thread that is held up makes nothing up for

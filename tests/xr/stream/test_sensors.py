@@ -113,6 +113,36 @@ def test_a_file_that_grows_is_followed_from_its_end_and_again_when_it_starts_ane
         readings_of(str(tmp_path / "other.csv"), CHANNELS, Event())
 
 
+def test_a_file_that_is_not_there_yet_is_waited_for_and_says_what_it_lacks(tmp_path: Path) -> None:
+    file, stop, found = tmp_path / "sensors.csv", Event(), []
+    readings = readings_of(str(file), CHANNELS, stop)
+    assert readings.away == readings.trouble == "there is no such file yet"
+    Thread(target=lambda: found.extend(readings), daemon=True).start()
+    for text, away in (
+        ("", "it is empty yet"),
+        ("time_s,be", "it is empty yet"),
+        ("time_s,bend\n1,2\n", "channels are missing: sway"),
+        ("time_s,bend,sway\n0,8,9\n1,2,3\n", ""),
+    ):
+        file.write_text(text, encoding="utf-8")
+        assert within(3.0, lambda away=away: readings.away == away)
+    assert within(3.0, lambda: bool(found)) and found[0][0] == 1.0 and found[0][1].tolist() == [2, 3]
+    stop.set()
+
+
+def test_of_a_long_file_the_last_row_is_shown(tmp_path: Path) -> None:
+    file = tmp_path / "sensors.csv"
+    file.write_text("time_s,bend,sway\n" + "".join(f"{k},{k},{2 * k}\n" for k in range(200_000)), encoding="utf-8")
+    assert next(readings_of(str(file), CHANNELS, Event()))[0] == 199_999.0
+
+
+def test_a_time_that_is_not_said_counts_from_the_beginning(tmp_path: Path) -> None:
+    file = tmp_path / "sensors.csv"
+    file.write_text("bend,sway\n1,2\n", encoding="utf-8")
+    readings = readings_of(str(file), CHANNELS, Event())
+    assert 0.0 <= next(readings)[0] < 60.0
+
+
 def test_datagrams_are_readings() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
@@ -186,7 +216,16 @@ def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "source", ["no-such.csv", "udp://127.0.0.1:99999", "udp://127.0.0.1", "mqtt://host", "serial:/dev/no-such-port", "ftp://x"]
+    "source",
+    [
+        "no-such-folder/no-such.csv",
+        ".",
+        "udp://127.0.0.1:99999",
+        "udp://127.0.0.1",
+        "mqtt://host",
+        "serial:/dev/no-such-port",
+        "ftp://x",
+    ],
 )
 def test_what_is_no_source_is_refused_at_once(source: str) -> None:
     with pytest.raises(InputError):

@@ -121,6 +121,12 @@ export class Dragging {
     this.stage.panelsChanged();
   }
 
+  /** Ends a drag and disarms: there is no connection, and when it is back nothing is to move by itself. */
+  letGo(): void {
+    this.release();
+    this.arm(false);
+  }
+
   /** Repeats the wish while it is held and seen. */
   private repeat(): void {
     const now = performance.now();

@@ -4,10 +4,11 @@ import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { Connection, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { amount, frameAt, isDoubtful, type Frame } from "./data";
+import { amount, frameAt, isDoubtful, timeText, type Frame } from "./data";
 import { Dragging } from "./dragging";
 import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model, type Status } from "./messages";
 import type { Field, Paint } from "./paint";
+import { COUNT_MS, Pace } from "./pace";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
 import { showPlaying } from "./recorded";
@@ -18,7 +19,6 @@ const STALE_S = 0.4; // what is older is greyed out: within half a second, the p
 const KEPT_S = 60;
 const PLOTTED_S = 30;
 const FRAMED_MS = 300; // how often it is asked whether all is in the picture
-const RATE_MS = 2000; // over which the rate is counted
 
 interface Moment extends Frame {
   bones: Float32Array;
@@ -52,6 +52,9 @@ class Streams {
     stage.headset.changed = (on) => this.presenting(on);
     this.connect();
     showPlaying(true);
+    window.setInterval(() => {
+      for (const robot of this.robots.values()) robot.pace.count(performance.now());
+    }, COUNT_MS);
     stage.run(() => this.step());
   }
 
@@ -128,6 +131,7 @@ class Streams {
 
   private connected(open: boolean): void {
     this.open = open;
+    if (!open) this.dragging.letGo();
     this.stage.touch();
   }
 
@@ -254,7 +258,7 @@ class Streams {
 function clockText(robot: Robot, time: number): string {
   const within = robot.shown?.run_s ?? null;
   const length = robot.model.duration;
-  return within === null || length === null ? `${time.toFixed(1)} s` : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
+  return within === null || length === null ? timeText(time) : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
 }
 
 /** One robot of the stream. */
@@ -274,7 +278,7 @@ class Robot {
   private painted: Field | null = null; // the field that the body has now
   private arrived = -Infinity; // when the newest pose came [ms of the page]
   private told: Status = { state: "", detail: "", since_s: null };
-  private readonly arrivals: { at: number; seq: number }[] = []; // when poses of the last seconds came [ms of the page], and their numbers
+  readonly pace = new Pace();
   private gone = false;
 
   constructor(
@@ -332,19 +336,13 @@ class Robot {
     const silent = state === "stale"; // the sender says so: who comes late cannot know how old its first pose is
     const told = silent && since_s !== null ? Date.now() / 1000 - since_s : 0;
     const age = Math.max((now - this.arrived) / 1000, told);
+    if (state === "ended") return ["ended", "ended"]; // so it said before it closed the connection
     if (!open) return ["lost", "no connection"];
-    if (state === "ended") return ["ended", "ended"];
     if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
     if (state === "waiting" || !Number.isFinite(age)) return ["waiting", `waiting for ${(state === "waiting" && detail) || "the first pose"}`];
     if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
-    return ["live", this.rate()];
-  }
-
-  /** How many poses a second the source sends, counted by their numbers: a page that is busy drawing takes fewer, in bursts. */
-  private rate(): string {
-    const [first, last] = [this.arrivals[0]!, this.arrivals[this.arrivals.length - 1]!];
-    const span = last.at - first.at;
-    return span < RATE_MS / 4 ? "live" : `live, ${Math.round((1000 * (last.seq - first.seq)) / span)} Hz`;
+    const hz = this.pace.hz();
+    return ["live", hz === null ? "live" : `live, ${Math.round(hz)} Hz`];
   }
 
   about(): string {
@@ -357,9 +355,7 @@ class Robot {
     if (!pose) return;
     const now = performance.now();
     this.arrived = now;
-    if (pose.seq < (this.arrivals[this.arrivals.length - 1]?.seq ?? 0)) this.arrivals.length = 0; // it counts anew
-    this.arrivals.push({ at: now, seq: pose.seq });
-    while (this.arrivals[0]!.at < now - RATE_MS) this.arrivals.shift();
+    this.pace.take(now, pose.seq);
     if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
     // as long as nobody speaks of forces, nothing estimates them
     this.newest = {

@@ -1,6 +1,6 @@
 // Forces over time: one line for each contact's identity, with one standard deviation as a band.
 
-import type { Frame } from "./data";
+import { timeText, type Frame } from "./data";
 
 const COLORS = ["#ffb454", "#5fd3c6", "#c69bff", "#ff8a8a", "#9fd35f", "#6db3ff"];
 const LEFT = 42;
@@ -59,9 +59,9 @@ export class Plot {
     }
     pen.textBaseline = "bottom";
     pen.textAlign = "left";
-    pen.fillText(`${from.toFixed(0)} s`, x(from), height);
+    pen.fillText(timeText(from, 0), x(from), height);
     pen.textAlign = "right";
-    pen.fillText(`${to.toFixed(0)} s`, x(to), height);
+    pen.fillText(timeText(to, 0), x(to), height);
   }
 
   private track(frames: Frame[], track: number, x: (t: number) => number, y: (n: number) => number): void {

@@ -1,0 +1,101 @@
+"""A CSV file that another program writes: its last row, then those that are added; it may come later, or be replaced."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+from typing import TextIO
+
+from femsense.core.errors import InputError
+
+POLL_S = 0.002
+"""How often a file is asked whether it has grown."""
+CHUNK = 1 << 20
+
+
+class GrowingFile:
+    """Rows of a CSV file as they are written."""
+
+    def __init__(self, file: Path, channels: Sequence[str]) -> None:
+        """Open the file if it is there. Raises InputError where it is and lacks a channel, or where it cannot come."""
+        self._file, self._channels = file, channels
+        self._stream: TextIO | None = None
+        self._columns: list[str] = []
+        self.away = ""
+        """Why there are no rows, as far as the file itself is the reason."""
+        if file.is_dir() or not file.absolute().parent.is_dir():
+            raise InputError(
+                "no such source",
+                where="--sensors",
+                found=file,
+                expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC or serial:PORT?baud=115200",
+            )
+        self._open()
+        if self._missing:
+            raise InputError(
+                "channels are missing", where=file, found=", ".join(self._columns), expected=", ".join(self._missing)
+            )
+
+    def rows(self, stop: Event) -> Iterator[dict[str, str]]:
+        """Yield the last row, then those that are written, column → text, until `stop` is set."""
+        rest, is_old = "", True
+        while not stop.is_set():
+            if self._stream is None and not self._open():
+                stop.wait(10 * POLL_S)
+                continue
+            assert self._stream is not None
+            if is_old:
+                rest, is_old = self._end(), False
+            *lines, rest = (rest + self._stream.read(CHUNK)).split("\n")
+            for line in lines:
+                yield dict(zip(self._columns, next(csv.reader([line]), [])))
+            if not lines:
+                stop.wait(POLL_S)
+                if self._began_anew():
+                    self._close()
+                    rest = ""
+        self._close()
+
+    def _open(self) -> bool:
+        """Open the file, and return whether it is there with all channels; `away` says what is missing."""
+        try:
+            stream = self._file.open(newline="", encoding="utf-8", errors="replace")
+        except OSError as error:
+            self.away = "there is no such file yet" if isinstance(error, FileNotFoundError) else str(error)
+            return False
+        head = stream.readline()
+        self._columns = next(csv.reader([head]), []) if head.endswith("\n") else []
+        if not self._columns or self._missing:
+            stream.close()
+            self.away = f"channels are missing: {', '.join(self._missing)}" if self._columns else "it is empty yet"
+            return False
+        self._stream, self.away = stream, ""
+        return True
+
+    @property
+    def _missing(self) -> list[str]:
+        return [name for name in self._channels if self._columns and name not in self._columns]
+
+    def _end(self) -> str:
+        """Return the last whole line and what follows: what is old is not shown."""
+        text = ""
+        while self._stream is not None and (chunk := self._stream.read(CHUNK)):
+            text = "\n".join((text + chunk).split("\n")[-2:])
+        return text
+
+    def _began_anew(self) -> bool:
+        """Whether the file was cut off or replaced; False while it is away."""
+        with suppress(FileNotFoundError):
+            now = self._file.stat()
+            stream = self._stream
+            return stream is not None and (now.st_size < stream.tell() or now.st_ino != os.fstat(stream.fileno()).st_ino)
+        return False
+
+    def _close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = None
