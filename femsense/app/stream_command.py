@@ -316,12 +316,14 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
             publisher.watch()
 
     def run() -> None:
-        if readings:
-            for frame in frames:
-                publisher.publish(frame)
-        else:
-            play(publisher, frames, live.stop)
-        publisher.end()
+        try:
+            if readings:
+                for frame in frames:
+                    publisher.publish(frame)
+            else:
+                play(publisher, frames, live.stop)
+        finally:
+            publisher.end()
 
     thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
     live.threads.append(thread)

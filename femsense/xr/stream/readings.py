@@ -221,12 +221,12 @@ def _lines(line: Serial, stop: Event) -> Iterator[bytes]:
     with closing(line):
         while not stop.is_set():
             try:
+                if not line.is_open:
+                    line.open()
                 held += line.read(max(1, min(line.in_waiting, LONGEST_LINE)))
-            except OSError:
+            except OSError:  # of the system, and of pyserial
                 held = b""
                 line.close()
                 stop.wait(WAIT_S)
-                with suppress(OSError):
-                    line.open()
             *whole, held = held[-LONGEST_LINE:].split(b"\n")
             yield from whole

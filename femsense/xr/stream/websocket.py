@@ -33,6 +33,9 @@ SMALLEST_BUFFER = 1 << 16
 """Of a socket that sends [bytes]: what waits there is old when it arrives."""
 LARGEST_FRAME, MOST_FRAMES = 4096, 240
 """Of what a viewer sends: bytes a frame, and frames a second."""
+PASSWORD_NEEDED = b"""<!doctype html><meta name="viewport" content="width=device-width"><title>femsense</title>
+<p>A password is needed: load the page again and type that of the stream, with any user name.</p>
+"""
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -269,7 +272,8 @@ class WebSocketServer:
             return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
         if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
             await asyncio.sleep(0.3)  # who guesses waits
-            return _response(HTTPStatus.UNAUTHORIZED, b"a password is needed\n", {"WWW-Authenticate": 'Basic realm="femsense"'})
+            more = {"WWW-Authenticate": 'Basic realm="femsense"', "Content-Type": TYPES[".html"]}
+            return _response(HTTPStatus.UNAUTHORIZED, PASSWORD_NEEDED, more)
         if path == "/ws":
             full = len(self._viewers) >= self.options.most_viewers
             return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n") if full else None

@@ -186,6 +186,10 @@ def test_a_serial_line_that_was_unplugged_comes_back(tmp_path: Path) -> None:
     os.close(theirs)
     os.close(first)
     port.unlink()
+    found: list[tuple[float, np.ndarray]] = []
+    Thread(target=lambda: found.append(next(readings)), daemon=True).start()
+    assert within(5.0, lambda: readings.trouble == "unplugged")
+    time.sleep(0.5)  # it is asked for again and again meanwhile
     second, theirs = pty.openpty()
     port.symlink_to(os.ttyname(theirs))
 
@@ -194,7 +198,7 @@ def test_a_serial_line_that_was_unplugged_comes_back(tmp_path: Path) -> None:
             os.write(second, b"3,4\n")
 
     Thread(target=keep_sending, daemon=True).start()
-    assert next(readings)[1].tolist() == [3, 4]
+    assert within(5.0, lambda: bool(found)) and found[0][1].tolist() == [3, 4]
     stop.set()
 
 
