@@ -242,7 +242,9 @@ def show_stream(
     except BaseException:
         bridge.close()
         raise
-    return LiveStream(hub, server, closers=[bridge.close], watched=[connection(without_password(url), lambda: bridge.trouble)])
+    watched = connection(without_password(url), lambda: bridge.trouble)
+    server.trouble = lambda: watched.trouble
+    return LiveStream(hub, server, closers=[bridge.close], watched=[watched])
 
 
 def stream_document(live: LiveStream) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from live_bars import Source
 from streams import read_frame, within
 from xr_bar import write_run_with_mesh
 
+from femsense.app.stream_command import show_stream
+from femsense.xr.stream.access import Access
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import TwinFrame, pose_bytes, status_bytes
 from femsense.xr.stream.publisher import Publisher, PublishOptions
@@ -369,6 +371,30 @@ def test_a_page_says_what_it_waits_for_and_greys_what_stops_while_it_is_paused(
         flowing.set()
         hub.close()
         browser.kill()
+
+
+WHY = """
+const page = await opened.newPage({ viewport: { width: 390, height: 700 } });
+await page.goto(given[0]);
+await page.waitForFunction(() => document.querySelector('#about').textContent.includes('password'), null, { timeout: 60000 });
+console.log(JSON.stringify({ about: await page.textContent('#about'), badge: await page.textContent('#badge'),
+  aside: await page.evaluate(() => document.documentElement.scrollWidth > innerWidth) }));
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_page_without_a_robot_says_what_keeps_it_from_the_stream(request: pytest.FixtureRequest, built_page: Path) -> None:
+    hub = Hub()
+    server = WebSocketServer(hub, live_page_files(built_page), access=Access(password="secret"))
+    try:
+        with show_stream(server.url, page=built_page) as shown:
+            told = run_in_browser(request.config, WHY, shown.url)
+            where = server.url.rstrip("/")
+    finally:
+        hub.close()
+    assert told["about"].startswith(f"no connection to {where}") and "a password is needed: --password-file FILE" in told["about"]
+    assert told["badge"] == "no robot yet" and not told["aside"]
 
 
 def check_scene(scene: dict[str, Any], run: RunStream, frame: TwinFrame) -> None:

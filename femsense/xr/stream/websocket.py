@@ -12,7 +12,7 @@ import json
 import logging
 import socket
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -125,6 +125,8 @@ class WebSocketServer:
         self.hub, self.page = hub, page
         self.access, self.options = access or Access(), options or ServerOptions()
         self.port = 0
+        self.trouble: Callable[[], str] = lambda: ""
+        """Why nothing comes to the hub, for a page that has no robot yet."""
         self.visits = 0
         """How many viewers came so far."""
         self._viewers: set[_Viewer] = set()
@@ -292,7 +294,7 @@ class WebSocketServer:
             message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], GLB))
             return None if message is None else message.payload
         if name == "stream.json":
-            return json.dumps({"format": "femsense-stream-1"}).encode()
+            return json.dumps({"format": "femsense-stream-1", "trouble": self.trouble()}).encode()
         content = self.page.get(name)
         try:
             return content.read_bytes() if isinstance(content, Path) else content

@@ -109,3 +109,8 @@ export function timeText(time: number, digits = 1): string {
   const two = (n: number): string => String(n).padStart(2, "0");
   return minutes < 60 ? `${minutes}:${two(seconds)}` : `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(seconds)}`;
 }
+
+/** The time within a run of some length where one is played over and over, else that of the source. */
+export function clockText(time: number, within: number | null, length: number | null): string {
+  return within === null || length === null ? timeText(time) : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
+}

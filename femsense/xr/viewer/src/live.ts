@@ -4,7 +4,7 @@ import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { Connection, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { amount, frameAt, isDoubtful, timeText, type Frame } from "./data";
+import { amount, clockText, frameAt, isDoubtful, type Frame } from "./data";
 import { Dragging } from "./dragging";
 import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model, type Status } from "./messages";
 import type { Field, Paint } from "./paint";
@@ -18,6 +18,7 @@ import { landmarksOf } from "./ties";
 const STALE_S = 0.4; // what is older is greyed out: within half a second, the picture included
 const KEPT_S = 60;
 const PLOTTED_S = 30;
+const ASKED_MS = 2000; // how often it is asked why no robot comes
 const FRAMED_MS = 300; // how often it is asked whether all is in the picture
 
 interface Moment extends Frame {
@@ -55,6 +56,7 @@ class Streams {
     window.setInterval(() => {
       for (const robot of this.robots.values()) robot.pace.count(performance.now());
     }, COUNT_MS);
+    window.setInterval(() => void this.ask(), ASKED_MS);
     stage.run(() => this.step());
   }
 
@@ -63,6 +65,14 @@ class Streams {
       if (kind === "model") this.announce(robot, readModel(payload));
       else this.robots.get(robot)?.take(kind, payload);
     }
+  }
+
+  /** As long as there is no robot, says why: `view --stream` knows what keeps it from the stream. */
+  private async ask(): Promise<void> {
+    if (this.robots.size || !this.open) return;
+    const told: unknown = await fetch("stream.json").then((answer) => answer.json(), () => null);
+    const trouble = (told as { trouble?: unknown } | null)?.trouble;
+    if (!this.robots.size) element("about").textContent = typeof trouble === "string" && trouble ? trouble : "waiting for a robot …";
   }
 
   private announce(id: string, model: Model | null): void {
@@ -192,7 +202,7 @@ class Streams {
     scrub.setAttribute("aria-valuetext", this.paused ? `${(newest - shown).toFixed(1)} seconds ago` : "live");
     const every = Math.max(1, Math.floor(robot.history.length / 300));
     drawCurve(robot.history.filter((_, i) => i % every === 0), oldest, newest);
-    element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : clockText(robot, shown);
+    element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : clockText(shown, robot.shown?.run_s ?? null, robot.model.duration);
   }
 
   private legend(kind: Paint): void {
@@ -252,13 +262,6 @@ class Streams {
       d: drag,
     });
   }
-}
-
-/** The time within the run where one is played over and over, else that of the source. */
-function clockText(robot: Robot, time: number): string {
-  const within = robot.shown?.run_s ?? null;
-  const length = robot.model.duration;
-  return within === null || length === null ? timeText(time) : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
 }
 
 /** One robot of the stream. */
