@@ -120,8 +120,8 @@ def test_a_file_that_is_not_there_yet_is_waited_for_and_says_what_it_lacks(tmp_p
     Thread(target=lambda: found.extend(readings), daemon=True).start()
     for text, away in (
         ("", "it is empty yet"),
-        ("time_s,be", "it is empty yet"),
         ("time_s,bend\n1,2\n", "channels are missing: sway"),
+        ("time_s,be", "it is empty yet"),
         ("time_s,bend,sway\n0,8,9\n1,2,3\n", ""),
     ):
         file.write_text(text, encoding="utf-8")
