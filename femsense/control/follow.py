@@ -94,7 +94,8 @@ class Follower:
 
         Arguments:
             target: as `reach` takes it.
-            seconds: no further equilibrium is begun after so long [s]; one is solved in any case.
+            seconds: no further equilibrium is begun after so long [s], unless the target is reached but for the fineness of the
+                state; one is solved in any case.
             stays: the target is not about to move. Where the way has ended elsewhere, further steps seek it from rest too;
                 what they find is taken where it is nearer.
 
@@ -106,9 +107,13 @@ class Follower:
         """
         end = time.perf_counter() + seconds
         search = self._advanced(self._aimed(make_goal(self.robot, target, (), ())), stays)
-        while not (self.resting if stays else self.ended) and time.perf_counter() < end:
+        while not (self.resting if stays else self.ended) and (time.perf_counter() < end or self._is_there(search)):
             search = self._advanced(search, stays)
         return found(self.robot, self.control, search, search.status or CONVERGING, self.calibration)
+
+    def _is_there(self, search: Search) -> bool:
+        """Whether a target is reached by a state that may be coarse still: solved finely, its error is no longer smaller."""
+        return search.state.converged and search.goal.error(search.state.positions) <= self.options.tolerance_m
 
     def _aimed(self, goal: Goal) -> Search:
         """Return the search for a goal: the last one, turned to it where the same points are wanted."""

@@ -126,11 +126,11 @@ def served() -> Iterator[tuple[Hub, DragServer, ObedientRobot]]:
 
 @pytest.fixture
 def alone() -> Iterator[tuple[Hub, DragServer]]:
-    """A model that is dragged, and no robot that says where it is."""
+    """A model that is dragged, an equilibrium an answer, and no robot that says where it is."""
     robot, hub = bar((4, 1, 1)), Hub()
     nodes = robot.body.mesh.nodes[np.unique(surface_triangles(robot.body.mesh))]
     skin = fit_skin(nodes, nodes[None], bones=4)
-    server = DragServer(hub, robot, skin, name="bar", options=DragOptions(gate=GateOptions(allowed=True)))
+    server = DragServer(hub, robot, skin, name="bar", options=DragOptions(gate=GateOptions(allowed=True), answer_s=0.0))
     yield hub, server
     server.close()
 
@@ -342,8 +342,8 @@ def test_a_drag_begins_where_the_robot_is(served: tuple[Hub, DragServer, Obedien
     assert {row["name"]: row["value"] for row in told[0]["inputs"]} == pytest.approx(inputs, abs=1e-6)
 
 
-def test_answers_go_on_by_themselves_until_nothing_comes_nearer(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
-    hub, server, _ = served
+def test_answers_go_on_by_themselves_until_nothing_comes_nearer(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
     told = answers(hub)
     drag(hub, target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6)))), armed=False)  # said once
     assert within(10.0, lambda: bool(told) and told[-1]["status"] == "reached")
