@@ -55,7 +55,7 @@ def from_nominal(robot: Robot, recording: Recording, nominal: FloatArray) -> tup
     declared = calibrate(robot, replace(recording, T_robot_camera=(near,)))
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     start = np.diag([START_STD[0] ** 2] * 3 + [(START_STD[1] * size) ** 2] * 3)
-    found = refine_poses(robot, recording, replace(declared, joint_covariance=start))
+    found = refine_poses(robot, recording, replace(declared, joint_covariance=start), guessed=(0,))
     scan = read_scan(robot, recording, 0, found.poses, state)
     assert scan is not None
     held = np.zeros(len(state), dtype=bool)

@@ -15,6 +15,7 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
+from femsense.calib.declared_by_clouds import check_declared_by_clouds, views_to_check
 from femsense.calib.declared_poses import Fitted, check_declared_poses
 from femsense.calib.first_poses import first_poses
 from femsense.calib.from_clouds import free_clouds, pose_pivot, refine_poses
@@ -104,11 +105,20 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
         by_markers = _declared(robot, seen, chosen)
     if by_clouds:
         by_markers = placed_by_clouds(robot, recording, by_markers, by_clouds)
-    if not len(seen.marker_frame) and recording.actuation_zero == "unknown" and robot.body.cables:
-        return _with_std(robot, with_initial_inputs(robot, recording, by_markers))
+    found = _beside_clouds(robot, recording, by_markers, by_clouds, named=bool(len(seen.marker_frame)))
+    check_declared_by_clouds(robot, recording, found, views_to_check(recording, seen.marker_view))
+    return found
+
+
+def _beside_clouds(
+    robot: Robot, recording: Recording, found: Calibration, by_clouds: Sequence[int], *, named: bool
+) -> Calibration:
+    """Return the calibration with what the clouds of free frames say of poses and of unknown initial inputs."""
+    if not named and recording.actuation_zero == "unknown" and robot.body.cables:
+        return _with_std(robot, with_initial_inputs(robot, recording, found))
     if by_clouds:
-        return _with_std(robot, by_markers)
-    return _with_clouds(robot, recording, by_markers) if len(seen.marker_frame) else by_markers
+        return _with_std(robot, found)
+    return _with_clouds(robot, recording, found) if named else found
 
 
 def _by_markers(robot: Robot, recording: Recording, chosen: IntArray) -> Calibration:
@@ -333,7 +343,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     left = rest_residual(robot, scene, poses)
     sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), PLACEMENT_STD_FLOOR)
     arm = robot.marker_points[scene.rest_marker] - robot.marker_points.mean(axis=0)
-    J = np.concatenate([np.hstack([-_cross(a), np.eye(3)]) for a in arm])
+    J = np.concatenate([np.hstack([np.cross(a, np.eye(3)), np.eye(3)]) for a in arm])
     covariance = covariance_of(J / sigma)
     state = initial_state(robot, recording, None)
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
@@ -356,10 +366,6 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
         "converged (from rest.csv alone: no frame is free)",
         placements_m,
     )
-
-
-def _cross(v: FloatArray) -> FloatArray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibration:

@@ -3,8 +3,8 @@
 Poses on a grid of rotations and places are judged by a map of distances to the measured points (Fitzgibbon,
 "Robust registration of 2D and 3D point sets", 2003); the best are refined by closest points (Besl and McKay 1992), from the
 visible side to what was measured: a silhouette holds the body in its plane. In the end each part of the visible side was measured
-or not, and each ray that meets the body ends there, or behind it, which speaks against the pose. Planes that are larger than the
-body are taken out before: a flat side fits everywhere into a table.
+or not, and each ray that meets the body ends there, or behind it, which speaks against the pose; what something else stands before
+speaks neither for it nor against it. Planes that are larger than the body are taken out before: a flat side fits everywhere into a table.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from femsense.calib.distance_map import DistanceMap, follow
 from femsense.calib.scan import REACH
 from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
@@ -32,16 +33,19 @@ SEEDS = 150
 """Places of the grid at most."""
 SAMPLES = 80
 """Points of the visible side by which a pose is judged."""
+FOLLOWED, FOLLOW_STEPS = 4000, 8
+"""Poses of the grid that follow closest points on the map of distances, and their steps: a right one is up to 10° off, which costs
+a slender body as much as a wrong one. Without this, 7 of 20 colourless scenes of benchmarks/calibration.py lost the right pose here."""
 CLOSER = 300
-"""Poses that closest points refine."""
+"""Poses that closest points refine further."""
 FINAL = 16
 """Poses that are refined with finer points."""
 FINE, FINE_STEPS = 1200, 25
 """Samples and steps of that."""
 RAYS = 10000
 """Rays of a view that judge at most."""
-MOST_CELLS = 4e6
-"""Cells of the map of distances: 16 MB; a wider scene gets larger ones."""
+UNKNOWN = 0.5
+"""What a part of the visible side counts that something hides: between measured, 0, and not measured, 1."""
 LEAST = 0.25
 """A pose needs this gain: right ones of benchmarks/calibration.py have 0.5 and more,
 wrong ones 0 and less where the robot is in sight."""
@@ -76,11 +80,11 @@ class CloudPose:
     T_robot_camera: FloatArray
     """shape (4, 4)."""
     error_m: float
-    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal;
-    rays through the body count as that far [m]."""
+    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal; rays through the body
+    count as that far, and what something hides as `UNKNOWN` of its square [m]."""
     gain: float
-    """Share of the visible side that was measured less the share that was not, and less rays that go through [1];
-    1 is perfect, below 0 is no fit."""
+    """Share of the visible side that was measured less the share that was not, and less rays that go through; what is hidden counts as
+    neither [1]; 1 is perfect, below 0 is no fit."""
 
 
 def find_cloud_pose(views: Sequence[View]) -> CloudPose:
@@ -166,7 +170,7 @@ def _scene(view: View, size: float) -> FloatArray:
         width = np.linalg.norm(np.ptp(points[on], axis=0)) if on.any() else 0.0
         if on.mean() < PLANE_SHARE or width < 1.5 * size:
             break
-        points = points[~on]
+        points = points[np.abs(plane.distance(points)) >= REACH * size]  # noise of what is far away goes with it
     return points
 
 
@@ -184,56 +188,37 @@ def _rotations() -> FloatArray:
 
 def _on_the_grid(scene: FloatArray, samples: Samples, size: float) -> list[FloatArray]:
     """Return T_camera_robot of the best poses of the grid, each (4, 4)."""
-    near = _DistanceMap(scene, 0.02 * size, CAP * size)
+    near = DistanceMap(scene, 0.02 * size, CAP * size)
     seeds = scene[_spread(scene, 0.15 * size)]
-    scored: list[tuple[float, int, FloatArray]] = []
-    rotations = _rotations()
-    for i, R in enumerate(rotations):
+    scored: list[tuple[float, FloatArray, IntArray]] = []
+    for R in _rotations():
         turned, facing = samples.places @ R.T, samples.normals @ R.T
         bare = samples.seen[int(np.argmax(samples.eyes @ R.T @ -seeds.mean(axis=0)))]
         looking = bare & (np.einsum("pc,c->p", facing, seeds.mean(axis=0)) < -0.2 * np.linalg.norm(seeds.mean(axis=0)))
-        side = turned[looking][:SAMPLES]
+        side = np.flatnonzero(looking)[:SAMPLES]
         if len(side) < 10:
             continue
-        middle = side[np.argmin(((side - side.mean(axis=0)) ** 2).sum(axis=1))]  # a visible point comes to lie on a seed
+        side = np.resize(side, SAMPLES)
+        middle = turned[side].mean(axis=0)
+        middle = turned[side[np.argmin(((turned[side] - middle) ** 2).sum(axis=1))]]  # a visible point comes to lie on a seed
         shifts = seeds - middle
-        score = near(side[None] + shifts[:, None]).mean(axis=1)
+        score = near(turned[side][None] + shifts[:, None]).mean(axis=1)
         for j in np.argsort(score)[:6]:
-            scored.append((float(score[j]), i, shifts[j]))
-    result = []
-    for _, i, t in sorted(scored, key=lambda s: s[0])[:CLOSER]:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotations[i], t
-        result.append(T)
-    return result
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = R, shifts[j]
+            scored.append((float(score[j]), T, side))
+    scored = sorted(scored, key=lambda s: s[0])[:FOLLOWED]
+    if not scored:
+        return []
+    places = samples.places[np.array([side for _, _, side in scored])]
+    poses, left = follow(near, places, np.array([T for _, T, _ in scored]), steps=FOLLOW_STEPS)
+    return list(poses[np.argsort(left)[:CLOSER]])
 
 
 def _spread(points: FloatArray, spacing: float) -> IntArray:
     """Return one point of each cube of an edge [m], SEEDS of them at most."""
     _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
     return first if len(first) <= SEEDS else np.random.default_rng(0).choice(first, SEEDS, replace=False)
-
-
-class _DistanceMap:
-    """Distances to the nearest measured point on a grid, cut off."""
-
-    def __init__(self, points: FloatArray, cell: float, cap: float) -> None:
-        from scipy.ndimage import distance_transform_edt
-
-        self.low = points.min(axis=0) - cap
-        volume = float(np.prod(points.max(axis=0) + cap - self.low))
-        self.cell, self.cap = (cell := max(cell, (volume / MOST_CELLS) ** (1 / 3))), cap
-        shape = np.ceil((points.max(axis=0) + cap - self.low) / cell).astype(int) + 1
-        empty = np.ones(shape, dtype=bool)
-        empty[tuple(((points - self.low) / cell).astype(int).T)] = False
-        self.map = np.minimum(distance_transform_edt(empty) * cell, cap).astype(np.float32)
-
-    def __call__(self, points: FloatArray) -> FloatArray:
-        """Return distances [m], shape (…,), of points (…, 3)."""
-        at = np.floor((points - self.low) / self.cell).astype(np.int64)
-        inside = ((at >= 0) & (at < self.map.shape)).all(axis=-1)
-        at = np.where(inside[..., None], at, 0)
-        return np.asarray(np.where(inside, self.map[at[..., 0], at[..., 1], at[..., 2]], self.cap))
 
 
 def _closest_points(scene: FloatArray, samples: Samples, starts: Sequence[FloatArray], size: float) -> list[FloatArray]:
@@ -287,6 +272,12 @@ class _Fine:
         self.samples = spread_samples(view.surface, FINE)
         self.points = voxel_grid(PointCloud(view.points[view.mine]), 0.01 * size).points
         self.rays = view.points[:: max(1, len(view.points) // RAYS)]
+        self.others = view.points[~view.mine] if view.colored else self.rays
+        self.others = self.others[:: max(1, len(self.others) // RAYS)]
+        self.ways = cKDTree(_unit(self.others)) if len(self.others) > 1 else None
+        self.width = (
+            0.0 if self.ways is None else 2.0 * float(np.median(np.asarray(self.ways.query(self.ways.data, k=2)[0])[:, 1]))
+        )
 
     def near(self, T: FloatArray, size: float) -> Any:
         """Return a tree of the points about the body under a pose."""
@@ -294,6 +285,14 @@ class _Fine:
         low, high = self.surface.positions.min(axis=0) - 0.3 * size, self.surface.positions.max(axis=0) + 0.3 * size
         inside = ((placed >= low) & (placed <= high)).all(axis=1)
         return cKDTree(self.points[inside] if inside.any() else np.full((1, 3), 1e3))
+
+    def hidden(self, placed: FloatArray, before: float) -> BoolArray:
+        """Return which points [m], camera frame, shape (p, 3), something else hides that was measured more than so far before them [m]."""
+        if self.ways is None:
+            return np.zeros(len(placed), dtype=bool)
+        angle, index = self.ways.query(_unit(placed))
+        in_front = np.linalg.norm(self.others[index], axis=1) < np.linalg.norm(placed, axis=1) - before
+        return np.asarray(in_front & (angle < self.width))
 
 
 def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) -> CloudPose:
@@ -319,10 +318,15 @@ def _judged(views: Sequence[_Fine], trees: Sequence[Any], T: FloatArray, size: f
     limit, squares = REACH * size, []
     for view, tree in zip(views, trees):
         placed, looking = view.samples.looking(invert_pose(T), 0.1)
-        squares.append(np.minimum(tree.query(placed[looking])[0] / limit, 1.0) ** 2)
+        square = np.minimum(tree.query(placed[looking])[0] / limit, 1.0) ** 2
+        squares.append(np.where(view.hidden(placed[looking], 2.0 * limit), np.minimum(square, UNKNOWN), square))
     bare = float(np.concatenate(squares).mean())
     through = float(np.mean([_seen_through(view, T, limit) for view in views]))
     return CloudPose(T, limit * float(np.sqrt(bare + through)), 1.0 - 2.0 * bare - 2.0 * through)
+
+
+def _unit(points: FloatArray) -> FloatArray:
+    return np.asarray(points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12))
 
 
 def _seen_through(view: _Fine, T: FloatArray, limit: float) -> float:

@@ -56,26 +56,34 @@ def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibratio
     Raises:
         DataError: no free frame with a cloud, nothing that fits, or a body with a symmetry.
     """
-    states = _states(robot, recording, calibration, views)
-    poses, covariance = list(calibration.poses), np.array(calibration.joint_covariance)
+    states = free_states(robot, recording, calibration, views)
+    start = started_at(
+        robot, calibration, {v: find_cloud_pose(seen_by(robot, recording, states, v)).T_robot_camera for v in views}
+    )
+    fitted = refine_poses(robot, recording, start, guessed=views)
+    return replace(fitted, status=_status(recording, start, fitted, views))
+
+
+def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatArray]) -> Calibration:
+    """Return the calibration with poses of some cameras from which a fit begins, each as far off as a search may be."""
+    poses, covariance = list(calibration.poses), np.zeros((6 * len(calibration.poses),) * 2)
+    if calibration.joint_covariance.size:
+        covariance[:] = calibration.joint_covariance
     turn, shift = START_STD[0], START_STD[1] * float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    for v in views:
-        poses[v] = freeze(find_cloud_pose(_seen(robot, recording, states, v)).T_robot_camera)
-        own = slice(6 * v, 6 * v + 6)
+    for v, T in starts.items():
+        own, poses[v] = slice(6 * v, 6 * v + 6), freeze(T)
         covariance[own, :], covariance[:, own] = 0.0, 0.0
         covariance[own, own] = np.diag([turn**2] * 3 + [shift**2] * 3)
-    start = replace(
+    return replace(
         calibration,
         T_robot_camera=poses[0],
         poses=tuple(poses),
         pose_covariance=freeze(covariance[:6, :6]),
         joint_covariance=freeze(covariance),
     )
-    fitted = refine_poses(robot, recording, start)
-    return replace(fitted, status=_status(recording, start, fitted, views))
 
 
-def _states(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> dict[int, Equilibrium]:
+def free_states(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> dict[int, Equilibrium]:
     """Return the equilibria of free frames in which a pose is sought."""
     free = np.zeros(recording.frame_count, dtype=bool) if recording.free is None else recording.free
     frames = [int(k) for k in np.flatnonzero(free) if all(recording.cloud_files[k][v] is not None for v in views)]
@@ -108,7 +116,8 @@ def _different(recording: Recording, frames: list[int]) -> list[int]:
     return [frames[i] for i in chosen]
 
 
-def _seen(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:
+def seen_by(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:
+    """Return what one camera sees of the body in the frames of given equilibria."""
     triangles, seen = body_surface(robot.body.mesh).triangles, []
     for k, state in states.items():
         cloud = read_frame_cloud(recording, k, view=view)

@@ -1,13 +1,13 @@
 """Pose of the cameras and noise of their depth from the clouds of free frames, together with what markers say.
 
 The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a
-Gauss–Newton fit; the fit to the markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so the covariance
-is that of a field along the surface (`residual_field`).
+Gauss–Newton fit; the fit to the markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so clouds know
+what points know under a field along the surface (`residual_field`), and count beside markers by that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,12 +82,13 @@ def measured_noises(robot: Robot, recording: Recording, calibration: Calibration
     return tuple(noise or _measured_noise(robot, frames, calibration.poses, view) for view, noise in enumerate(declared))
 
 
-def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -> Calibration:
+def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *, guessed: Sequence[int] = ()) -> Calibration:
     """Return the calibration with its undeclared poses moved to where the clouds of free frames see the body.
 
     Arguments:
         robot, recording: as loaded.
         calibration: of the markers, or a start for the poses; its covariance is the prior (zero: nothing is known but the start).
+        guessed: cameras whose pose is a start that nothing measured: its covariance is a bound, and pulls no answer of the clouds back.
 
     Returns:
         the calibration with poses, their covariance, and `normal_rms_m`; as it was where no free frame has a cloud.
@@ -100,23 +101,23 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     pivot, size = pose_pivot(robot), float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
     prior = _prior(calibration.joint_covariance, which)
-    share = 1.0
     held = np.zeros(len(robot.body.mesh.nodes), dtype=bool)
     held[robot.body.clamped] = True
     equations = _Equations(frames, noises, pivot, size, which, held)
-    for _ in range(2):  # the second time with what the clouds are worth beside the markers
-        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, share)
+    weight, center = np.eye(len(which)), np.zeros(len(which))
+    measured = prior.any() and not set(moving) <= set(guessed)
+    for _ in range(2 if measured else 1):  # the second time with what the clouds are worth beside the markers
+        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, weight, center)
         normal, right, rms = sums.normal, sums.right, sums.rms
         if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
             return calibration
-        scores = field_scores(equations.rows(poses), robot.body.mesh.nodes)
-        worth = worth_of_clouds(normal, scores, prior, gone - np.linalg.solve(normal, right))
-        if worth >= 0.9 * share:
-            break
-        share = worth
+        center = np.where(np.isin(which // 6, guessed), gone, 0.0)
+        apart = gone - center - np.linalg.solve(normal, right)
+        clouds = what_clouds_know(normal, field_scores(equations.rows(poses), robot.body.mesh.nodes))
+        clouds *= worth_of_clouds(clouds, prior, apart) if measured else 1.0
+        weight = clouds @ np.linalg.inv(normal)
     covariance = np.zeros((6 * len(poses),) * 2)
-    inverse = np.linalg.inv(share * normal + prior)
-    covariance[np.ix_(which, which)] = inverse @ (share**2 * scores.T @ scores + prior) @ inverse
+    covariance[np.ix_(which, which)] = np.linalg.inv(clouds + prior)
     return replace(
         calibration,
         T_robot_camera=freeze(poses[0]),
@@ -127,28 +128,36 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     )
 
 
-def worth_of_clouds(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
+def what_clouds_know(normal: FloatArray, scores: FloatArray) -> FloatArray:
+    """Return the information of the clouds, shape (p, p): that of points that err together, N S⁻¹ N, in no direction more than N.
+
+    Arguments:
+        normal: N, information of points that err each on its own, shape (p, p).
+        scores: rows whose sum of squares S is the covariance of the gradient, shape (g, p).
+    """
+    root = np.linalg.cholesky(normal)
+    whitened = np.linalg.solve(root, scores.T)
+    values, vectors = np.linalg.eigh(whitened @ whitened.T)
+    half = root @ vectors / np.sqrt(np.maximum(values, 1.0))
+    return np.asarray(half @ half.T)
+
+
+def worth_of_clouds(clouds: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
     """Return by which share the clouds count beside the markers [1].
 
-    Neighbouring points err together; the field that the fit leaves tells how far the pose of the clouds is known.
     Where clouds and markers are farther apart than both deviations say, the clouds err by more still (model, lens). They then
     count by so much less that the difference is one that is to be expected.
     Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
 
     Arguments:
-        normal: information of the clouds, points counted as independent, shape (p, p).
-        scores: rows whose sum of squares is the covariance of the gradient, shape (g, p).
+        clouds: information of the clouds, shape (p, p).
         prior: information of the markers, shape (p, p).
-        apart: pose of the clouds alone less that of the markers, shape (p,).
+        apart: answer of the clouds alone less that of the markers, shape (p,).
     """
-    if not prior.any():
-        return 1.0
-    p, markers = len(normal), np.linalg.inv(prior)
-    inverse = np.linalg.inv(normal)
-    clouds = inverse @ scores.T @ scores @ inverse
+    p, of_markers, of_clouds = len(clouds), np.linalg.inv(prior), np.linalg.inv(clouds)
 
     def distance(worth: float) -> float:
-        return float(apart @ np.linalg.solve(markers + clouds / worth, apart))
+        return float(apart @ np.linalg.solve(of_markers + of_clouds / worth, apart))
 
     if distance(1.0) <= p:
         return 1.0
@@ -156,8 +165,7 @@ def worth_of_clouds(normal: FloatArray, scores: FloatArray, prior: FloatArray, a
     for _ in range(60):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if distance(middle) < p else (low, middle)
-    counted = max(1.0, float(np.trace(np.linalg.solve(normal, scores.T @ scores))) / p)  # so many points count as one
-    return low / counted
+    return low
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -185,9 +193,11 @@ class _Equations:
 
 
 def _nearer(
-    equations: _Equations, poses: list[FloatArray], prior: FloatArray, share: float
+    equations: _Equations, poses: list[FloatArray], prior: FloatArray, weight: FloatArray, center: FloatArray
 ) -> tuple[list[FloatArray], FloatArray, RaySums]:
     """Return the poses to which Gauss–Newton leads, how far they went, shape (p,), and the equations there.
+
+    The rays' equations count by a weight, shape (p, p), beside a prior about a center, shape (p,).
 
     A flat side that faces the camera hardly says where it lies in its plane, and a step may leave it. Steps are damped until no
     more points than a few are lost (Levenberg 1944), those directions first that are known least.
@@ -196,10 +206,11 @@ def _nearer(
     unit = np.tile([1.0 / equations.size**2] * 3 + [1.0] * 3, len(prior) // 6)
     for _ in range(STEPS):
         root = np.sqrt(unit)
-        top = share * float(np.linalg.norm(sums.normal * np.outer(root, root), 2))
+        rays = weight @ sums.normal
+        top = float(np.linalg.norm(rays * np.outer(root, root), 2))
         for damping in DAMPINGS if sums.explained > 0.0 else ():
-            matrix = share * sums.normal + prior + np.diag(damping * top / unit)
-            step = -np.linalg.lstsq(matrix, share * sums.right + prior @ gone, rcond=None)[0]
+            matrix = rays + prior + np.diag(damping * top / unit)
+            step = -np.linalg.lstsq(matrix, weight @ sums.right + prior @ (gone - center), rcond=None)[0]
             full = np.zeros(6 * len(poses))
             full[equations.which] = step
             tried = moved_poses(poses, full, equations.pivot)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, worth_of_clouds
+from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, what_clouds_know, worth_of_clouds
 from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.residual_field import field_scores
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
@@ -36,6 +36,8 @@ DERIVATIVES = 3
 """In so many first steps the derivative by the inputs is new; in the first one where markers tell them nearly."""
 START_STD = (0.1, 0.03)
 """What the poses are off by before: [rad], and as a share of the body's diagonal; as in `clouds_alone`."""
+POINTLESS = 1e-9
+"""This share of what markers know stands in for rays where no ray knows anything, so that equations can be solved."""
 STEP = {"tension": 1e-2, "displacement": 1e-4}
 """Difference for the derivative by an input [N] or [m]."""
 
@@ -63,13 +65,20 @@ def with_initial_inputs(
         start, prior = calibrated_inputs(robot, recording, calibration), np.asarray(np.linalg.inv(known))
     assert start is not None
     fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
-    derivatives = DERIVATIVES if known is None else 1
-    end = fit.joint(calibration.poses, 1.0, derivatives)
-    if known is not None:  # clouds count less where they and markers are farther apart than both say
-        apart = end.gone - np.linalg.solve(end.sums.normal, end.sums.right)
-        share = worth_of_clouds(end.sums.normal, fit.scores(end), prior, apart)
-        end = fit.joint(calibration.poses, share, derivatives) if share < 0.9 else end
+    end = fit.joint(calibration.poses, DERIVATIVES if known is None else 1)
+    if known is not None:
+        end = fit.beside_markers(end)
     return _answer(fit, calibration, end, by_markers=known is not None)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Weighed:
+    """What clouds know beside markers, who count by it."""
+
+    clouds: FloatArray
+    """Information, shape (p + a, p + a)."""
+    gradient: FloatArray
+    """What takes the gradient of points that err on their own to it, shape (p + a, p + a)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -82,8 +91,8 @@ class _End:
     gone: FloatArray
     """How far poses and inputs went, shape (p + a,)."""
     sums: RaySums
-    share: float
-    """How much points count."""
+    weighed: _Weighed | None
+    """How the rays counted; None: each on its own."""
     scans: dict[int, Scan]
     moves: dict[int, FloatArray]
 
@@ -102,9 +111,15 @@ class _Fit:
     prior: FloatArray
     """Precision of poses and inputs about where they start, shape (p + a, p + a)."""
 
-    def joint(self, first: Sequence[FloatArray], share: float, derivatives: int, gone: FloatArray | None = None) -> _End:
-        """Return where Gauss–Newton leads with points that count by a share; in so many first steps the derivative is new.
-        `gone` is how far poses and inputs have gone before."""
+    def joint(
+        self,
+        first: Sequence[FloatArray],
+        derivatives: int,
+        weighed: _Weighed | None = None,
+        gone: FloatArray | None = None,
+    ) -> _End:
+        """Return where Gauss–Newton leads; in so many first steps the derivative is new. `weighed` says how rays count,
+        `gone` how far poses and inputs have gone before."""
         robot, recording, p = self.robot, self.recording, len(self.which)
         poses, pivot, initial = list(first), pose_pivot(robot), self.start.copy()
         low, high = input_bounds(robot, recording)
@@ -118,19 +133,38 @@ class _Fit:
             if step < derivatives:
                 moves = _moves(robot, recording, initial, states)
             sums = self._sums(scans, states, moves, poses)
-            change = _bounded(sums, share, self.prior, gone, low - initial, high - initial)
+            change = self._step(sums, weighed, gone, low - initial, high - initial)
             full = np.zeros(6 * len(poses))
             full[self.which] = change[:p]
             poses, gone, initial = moved_poses(poses, full, pivot), gone + change, initial + change[p:]
             if np.abs(change[p:]).max() < 1e-3 * STEP[recording.actuation] and np.abs(change[:p]).max(initial=0.0) < 1e-6:
                 break
-        return _End(poses, initial, gone, sums, share, scans, moves)
+        return _End(poses, initial, gone, sums, weighed, scans, moves)
+
+    def _step(self, sums: RaySums, weighed: _Weighed | None, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+        """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
+        known, right = (sums.normal, sums.right) if weighed is None else (weighed.clouds, weighed.gradient @ sums.right)
+        root = np.linalg.cholesky(known + self.prior).T
+        wanted = -np.linalg.solve(root.T, right + self.prior @ gone)
+        free = np.full(len(gone) - len(low), np.inf)
+        box = (np.append(-free, low - 1e-12), np.append(free, high + 1e-12))
+        return np.asarray(lsq_linear(root, wanted, bounds=box).x)
+
+    def beside_markers(self, end: _End) -> _End:
+        """Return where markers and clouds lead together, each by what it knows, from where they lead if each point erred on its own."""
+        normal = end.sums.normal + POINTLESS * self.prior
+        clouds = what_clouds_know(normal, self.scores(end))
+        clouds *= worth_of_clouds(clouds, self.prior, end.gone - np.linalg.solve(normal, end.sums.right))
+        weighed = _Weighed(clouds, np.asarray(clouds @ np.linalg.inv(normal)))
+        return replace(self, start=end.initial).joint(end.poses, 1, weighed, end.gone)
 
     def covariance(self, end: _End) -> FloatArray:
         """Return the covariance of poses and inputs, shape (p + a, p + a): of points, of what was known before, and of the law."""
-        inverse, scores = np.linalg.inv(end.share * end.sums.normal + self.prior), end.share * self.scores(end)
-        by_law = self._moved_by_law(end)
-        return np.asarray(inverse @ (scores.T @ scores + self.prior) @ inverse + np.outer(by_law, by_law))
+        by_law = np.outer(*[self._moved_by_law(end)] * 2)
+        if end.weighed is not None:
+            return np.asarray(np.linalg.inv(end.weighed.clouds + self.prior) + by_law)
+        inverse, scores = np.linalg.inv(end.sums.normal + self.prior), self.scores(end)
+        return np.asarray(inverse @ (scores.T @ scores + self.prior) @ inverse + by_law)
 
     def scores(self, end: _End) -> FloatArray:
         """Return rows whose sum of squares is the covariance of the gradient (`field_scores`)."""
@@ -144,7 +178,7 @@ class _Fit:
         if body.material.law != "corotational":
             return np.zeros(len(self.prior))
         other = replace(self.robot, body=replace(body, material=replace(body.material, law="neo_hookean")))
-        there = replace(self, robot=other, start=end.initial).joint(end.poses, end.share, 1, end.gone)
+        there = replace(self, robot=other, start=end.initial).joint(end.poses, 1, end.weighed, end.gone)
         return np.asarray(there.gone - end.gone)
 
     def _sums(
@@ -214,15 +248,6 @@ def _moves(robot: Robot, recording: Recording, initial: FloatArray, states: dict
         for k, positions in states.items():
             columns.setdefault(k, []).append(((more.get(k, positions) - positions) / h).ravel())
     return {k: np.stack(of, axis=1) for k, of in columns.items()}
-
-
-def _bounded(sums: RaySums, share: float, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
-    root = np.linalg.cholesky(share * sums.normal + prior).T
-    wanted = -np.linalg.solve(root.T, share * sums.right + prior @ gone)
-    free = np.full(len(gone) - len(low), np.inf)
-    box = (np.append(-free, low - 1e-12), np.append(free, high + 1e-12))
-    return np.asarray(lsq_linear(root, wanted, bounds=box).x)
 
 
 def _answer(fit: _Fit, calibration: Calibration, end: _End, *, by_markers: bool) -> Calibration:

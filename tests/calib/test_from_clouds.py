@@ -11,10 +11,10 @@ from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.files import read_calibration, write_calibration
-from femsense.calib.from_clouds import measured_noises, refine_poses
+from femsense.calib.from_clouds import measured_noises, refine_poses, what_clouds_know
 from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
-from femsense.io.clouds.cloud_files import write_cloud
+from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
 
@@ -86,3 +86,40 @@ def test_the_covariance_of_all_cameras_survives_its_file(free, tmp_path):
     again = read_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
     np.testing.assert_allclose(again.joint_covariance, calibration.joint_covariance)
     assert again.normal_rms_m == pytest.approx(calibration.normal_rms_m)
+
+
+def test_points_that_err_together_know_less_and_never_more_than_on_their_own() -> None:
+    """N S⁻¹ N: with S = c N in a direction, 1/c of what N knows there, and at most all of it."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    vectors, share = np.linalg.qr(rng.normal(size=(4, 4)))[0], np.array([0.25, 1.0, 4.0, 100.0])
+    scores = np.sqrt(share)[:, None] * (root @ vectors).T
+    expected = root @ vectors @ np.diag(1.0 / np.maximum(share, 1.0)) @ vectors.T @ root.T
+    np.testing.assert_allclose(what_clouds_know(root @ root.T, scores), expected, rtol=1e-9)
+
+
+def test_clouds_of_a_body_that_errs_smoothly_do_not_overrule_markers(free, tmp_path):
+    """All points lie off by a bow of 1 mm, as under another law: many of them, and yet one error."""
+    recording, _ = record(INPUTS, noise=1e-4)
+    files = []
+    for k in range(3):
+        cloud = read_cloud(free.cloud_files[k][0])
+        points = transform_points(T_ROBOT_CAMERA, cloud.points)
+        points[:, 1:] += 1e-3 * np.sin(np.pi * np.clip(points[:, :1], 0.0, 0.1) / 0.1)
+        write_cloud(tmp_path / f"{k}.ply", PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), points), cloud.colors))
+        files.append((tmp_path / f"{k}.ply",))
+    bowed = replace(recording, free=np.ones(3, dtype=bool), cloud_files=tuple(files), color_files=((None,),) * 3)
+    by_markers, both = calibrate(arm(), replace(bowed, cloud_files=((None,),) * 3)), calibrate(arm(), bowed)
+    alone = refine_poses(arm(), bowed, replace(by_markers, joint_covariance=np.zeros((6, 6))))
+    assert off(alone.poses[0]) > 5e-4
+    assert off(both.poses[0]) < 1e-4
+
+
+def test_a_pose_that_is_only_guessed_pulls_no_answer_back(free):
+    robot = arm()
+    near = calibrate(robot, free)
+    start = move_pose(T_ROBOT_CAMERA, [0.0, 0.0, 0.0, 0.002, -0.002, 0.003], pivot_a=[0.05, 0, 0])
+    held = replace(near, poses=(start,), T_robot_camera=start, joint_covariance=np.diag([1e-4] * 3 + [1e-8] * 3))
+    loose = replace(held, joint_covariance=np.diag([1e-2] * 3 + [1e-5] * 3))
+    assert off(refine_poses(robot, free, held).poses[0]) > 2e-3
+    assert off(refine_poses(robot, free, loose, guessed=(0,)).poses[0]) < 4e-4
