@@ -52,7 +52,7 @@ def from_nominal(robot: Robot, recording: Recording, nominal: FloatArray) -> tup
     assert cloud is not None
     ahead = cloud.points[cloud.points[:, 2] > 0]
     near = settle_cloud_pose([View(ahead, np.ones(len(ahead), dtype=bool), surface)], nominal).T_robot_camera
-    declared = calibrate(robot, replace(recording, T_robot_camera=(near,)))
+    declared = calibrate(robot, replace(recording, T_robot_camera=(near,), free=None))  # unjudged: it is only a start
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     start = np.diag([START_STD[0] ** 2] * 3 + [(START_STD[1] * size) ** 2] * 3)
     found = refine_poses(robot, recording, replace(declared, joint_covariance=start), guessed=(0,))
