@@ -29,7 +29,7 @@ def main() -> int:
         action="append",
         default=[],
         metavar="NAME",
-        help="one of the cases; may be repeated; else all but the calm ones",
+        help="one of the cases; may be repeated; else all but the calm ones and those near the clamp",
     )
     ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
@@ -46,7 +46,7 @@ def main() -> int:
         ask.error(f"no such case: {', '.join(sorted(unknown))}")
     rows = []
     for case in CASES:
-        if case.name not in given.case if given.case else case.calm:
+        if case.name not in given.case if given.case else case.calm or case.near_clamp:
             continue
         folder = given.out / case.name
         if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import meshio
@@ -52,6 +52,16 @@ class Body:
     color: tuple[float, float, float] = (0.20, 0.45, 0.80)
     touchable: Array = field(default_factory=lambda: np.array([[-1.0] * 3, [1.0] * 3]))
     """Box of the places that may be touched [m]."""
+    near_clamp: tuple[float, float] = (0.1, 0.4)
+    """From which share of its length to which a touch is near the clamp."""
+
+    def touched_near_clamp(self) -> Body:
+        """The same body, touched where it hardly yields: by forces of about the same size, which move the place less."""
+        axis = int(np.argmax(np.ptp(self.points, axis=0)))
+        low, high = self.touchable.copy()
+        start, length = self.points[:, axis].min(), np.ptp(self.points[:, axis])
+        low[axis], high[axis] = (start + share * length for share in self.near_clamp)
+        return replace(self, touchable=np.stack([low, high]), yields=(0.15 * self.yields[0], 0.25 * self.yields[1]))
 
 
 def _kuhn(*axes: Array) -> tuple[Array, Array]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .bodies import listed
 from .scene import OBJECT, ROBOT, RayScene
@@ -59,6 +60,15 @@ def look_at(target: Array, distance: float, azimuth: float, elevation: float, ro
     pose[:3, :3] = np.column_stack([c * x + s * y, -s * x + c * y, z])
     pose[:3, 3] = target + distance * out
     return pose
+
+
+def nudged(camera: Camera, shift: float, turn: float, rng: np.random.Generator) -> Camera:
+    """The camera shifted by so much [m] and turned by so much about its middle [rad], each into a direction that is drawn."""
+    way, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    pose = camera.pose.copy()
+    pose[:3, :3] = Rotation.from_rotvec(turn * axis).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += shift * way
+    return replace(camera, pose=pose)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +194,7 @@ __all__ = [
     "listed",
     "look_at",
     "measure",
+    "nudged",
     "paint",
     "seen",
     "shoot",

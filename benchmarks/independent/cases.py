@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -49,9 +50,19 @@ class Case:
     """Of the touched frames, those in which the objects have left again and hover beside the robot."""
     calm: int = 0
     """So many frames in place of the touched ones, in which the objects hover beside the robot and the inputs swing."""
+    near_clamp: bool = False
+    """Touches lie near the clamp, and move the body little."""
+    bare: bool = False
+    """Nothing stands around the robot: the camera sees no table."""
+    nudges: tuple[tuple[float, float], ...] = ()
+    """Shift [m] and turn about its middle [rad] of the camera, one a frame after the free ones; only there, into a direction of its own."""
 
 
 FREE, TOUCHED, AFTER = 6, 10, 2
+_TURNS = tuple(math.radians(angle) for angle in (0.2, 0.5, 1.0, 2.0))
+_SHIFTS = (0.0005, 0.001, 0.002, 0.003, 0.005)
+DIFFERENT_NUDGES = ((0.0, 0.0), *((shift, 0.0) for shift in _SHIFTS), *((0.0, turn) for turn in _TURNS))
+NUDGES = 2 * DIFFERENT_NUDGES
 
 CASES = (
     Case("bar-normal", "bar", (Touch(),)),
@@ -80,4 +91,23 @@ CASES = (
     Case("bar-calm", "bar", (Touch(),), calm=120),
     Case("arm-calm", "arm", (Touch("rod"),), "displacement", "tof", 0.5, images=True, calm=120),
     Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=120),
+    *(
+        Case(f"{name}-nudged", name, (), control, camera, distance, calm=len(NUDGES), nudges=NUDGES)
+        for name, control, camera, distance in (
+            ("bar", "tension", "stereo", 0.35),
+            ("arm", "displacement", "tof", 0.5),
+            ("post", "tension", "stereo", 0.35),
+            ("slab", "displacement", "tof", 0.4),
+        )
+    ),
+    *(
+        Case(f"{name}-clamp{'-hidden' * hidden}", name, (Touch(hidden=hidden),), control, camera, distance, near_clamp=True)
+        for name, control, camera, distance in (
+            ("bar", "tension", "stereo", 0.35),
+            ("arm", "displacement", "tof", 0.5),
+            ("post", "tension", "stereo", 0.35),
+            ("slab", "displacement", "tof", 0.4),
+        )
+        for hidden in (False, True)
+    ),
 )

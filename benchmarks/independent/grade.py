@@ -93,6 +93,16 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def statuses_of(run_folder: Path) -> dict[int, str]:
+    """Status of each frame of a run."""
+    return {int(f["frame"]): f["status"] for f in _rows(run_folder / "frames.csv")}
+
+
+def contacts_of(run_folder: Path) -> list[int]:
+    """Frame of each contact that a run reports."""
+    return [int(c["frame"]) for c in _rows(run_folder / "contacts.csv") if float(c["force_n"]) > 0]
+
+
 def _vector(row: dict[str, str], *names: str) -> np.ndarray:
     return np.array([float(row[n]) for n in names])
 

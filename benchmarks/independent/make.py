@@ -12,7 +12,20 @@ import numpy as np
 
 from . import bodies
 from .bodies import GRAVITY, Body, listed, write_robot
-from .camera import COLORS, Camera, camera_table, directions, look_at, measure, paint, seen, shoot, write_cloud, write_images
+from .camera import (
+    COLORS,
+    Camera,
+    camera_table,
+    directions,
+    look_at,
+    measure,
+    nudged,
+    paint,
+    seen,
+    shoot,
+    write_cloud,
+    write_images,
+)
 from .cases import AFTER, FREE, TOUCHED, Case
 from .equilibrium import Problem
 from .scene import OBJECT, ROBOT, Shape, Skin, table
@@ -42,6 +55,7 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
     begin = time.perf_counter()
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     body = bodies.diamond(rng, _needed(diamond)) if case.robot == "diamond" else getattr(bodies, case.robot)(rng)
+    body = body.touched_near_clamp() if case.near_clamp else body
     solid = Solid(body.truth, body.young, body.poisson, body.density, GRAVITY, body.fixed)
     skin = Skin(solid)
     problem = Problem(solid, [Cable(t.name, solid.rows(t.path), t.pull) for t in body.tendons])
@@ -66,6 +80,7 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
         "mesh": f"{solid.mesh.nelements} cells, {len(solid.rest)} nodes, {type(solid.element).__name__}",
         "contacts": take.contacts,
         "T_robot_camera": listed(camera.pose),
+        "nudges": [list(nudge) for nudge in case.nudges],
         "initial_tension_n": {t.name: float(v) for t, v in zip(body.tendons, zero)},
         "tension_n": [listed(s.tension) for s in take.states],
         "frames": len(take.states),
@@ -192,7 +207,8 @@ def _film(
             mine = [c["patch"] for c in here if c["contact"] == number]
             spread = mine[0] if mine else one.patch(skin, float((frame - FREE) >= TOUCHED))
             objects += one.objects(spread, state.x, 0.0 if mine else _away(case, frame))
-        shot = shoot(camera, (np.asarray(skin.rows @ state.x), skin.tri), objects, table(body.ground))
+        at = nudged(camera, *case.nudges[frame - FREE], rng) if case.nudges and frame >= FREE else camera
+        shot = shoot(at, (np.asarray(skin.rows @ state.x), skin.tri), objects, table(body.ground - 9.0 * case.bare))
         z = measure(camera, shot, rng)
         picture = paint(shot, np.array(body.color), color, camera, rng) if case.colors else None
         if case.images:

@@ -26,16 +26,16 @@ MANY = 0.7
 """Share of the points that have to be met before their rays alone are asked."""
 
 
-def rows_at(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> Rows:
-    """Return the rows of frame k at a state. Raises DataError where nothing is seen."""
-    return _marker_rows(sensor, k, state) if scan is None else _ray_rows(sensor, scan, state)
+def rows_at(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, *, caught: bool = False) -> Rows:
+    """Return the rows of frame k at a state; `caught`: also of points whose rays miss it, as where most do. Raises DataError where nothing is seen."""
+    return _marker_rows(sensor, k, state) if scan is None else _ray_rows(sensor, scan, state, caught)
 
 
-def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
+def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium, caught: bool) -> Rows:
     surface = Surface(state.positions, sensor.surface.triangles)
     poses, noises, reach = sensor.calibration.poses, sensor.knowledge.noises, REACH * sensor.size
     rows, measured = ray_rows(scan, surface, poses, noises, reach=reach), scan.measured
-    if measured[rows.hits.index].sum() < MANY * measured.sum():
+    if caught or measured[rows.hits.index].sum() < MANY * measured.sum():
         rows = ray_rows(scan, surface, poses, noises, reach=reach, catch=CATCH * sensor.size)
     number = measured[rows.hits.index]
     met = int(number.sum())

@@ -27,6 +27,7 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.false_alarms import with_gains_of_free_frames
 from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
+from femsense.sensing.moved_camera import camera_status
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
 from femsense.sensing.prepare import prepare, scan_of
@@ -144,6 +145,8 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         status = behind_body(sensor, scan, fit)
     if status == OK and fit.rows.of_clouds:
         status = beside_markers(sensor, k, fit)
+    if scan is not None and not len(sensor.places):
+        status = camera_status(sensor, k, scan, fit, free, before, status)
     if status == OK and not len(sensor.places):
         seen = [] if fit.touches else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
         status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *seen]))

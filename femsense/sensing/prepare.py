@@ -28,6 +28,7 @@ from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
+from femsense.sensing.background import background_of
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
 from femsense.sensing.places import near_places, object_touches, objects_near
@@ -143,7 +144,8 @@ def prepare(
         sensor = _better_posed(sensor, learned)
         knowledge, free = sensor.knowledge, _free_frames(sensor)
         learned = _taught(knowledge, free.values())
-    return Prepared(replace(sensor, knowledge=learned), knowledge, free)
+    background = background_of(sensor, min(free)) if free else None
+    return Prepared(replace(sensor, knowledge=learned, background=background), knowledge, free)
 
 
 def _corrected(

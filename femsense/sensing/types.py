@@ -21,6 +21,7 @@ from femsense.model.contact_patch import BodySurface, ContactPatch
 from femsense.model.drive import DrivenRobot
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
+from femsense.pointcloud.local_planes import LocalPlanes
 from femsense.sensing import run_arrays
 
 MEDIAN = 1.0 - 1.483 ** (-2.0 / 3.0)
@@ -206,8 +207,7 @@ class Start:
     """Where a fit may begin: a state, and forces for its touches."""
 
     state: Equilibrium
-    forces: FloatArray
-    """[N], shape (m, 3)."""
+    forces: FloatArray  # [N], shape (m, 3)
     response: Response | None = None  # near the state, where it is known
     firm: bool = False
     """Whether it is so near the answer that outliers are known from the first step on (see `robust_std`)."""
@@ -367,8 +367,7 @@ class Knowledge:
 class Answers:
     """How the body answers to unit forces at the candidates near one state; made anew when the body has moved far from it."""
 
-    state: Equilibrium | None = None
-    """That state; an estimate that was stopped goes on with it, and makes the answers anew."""
+    state: Equilibrium | None = None  # with which an estimate that was stopped goes on
     columns: FloatArray | None = None
     """Moves of the nodes by unit forces along x, y, z at each candidate [m/N], shape (3n, 3c)."""
 
@@ -398,3 +397,4 @@ class Sensor:
     """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""
     scenery: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""
+    background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from arm import T_ROBOT_CAMERA, arm, record
 
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
@@ -17,14 +17,31 @@ from femsense.pointcloud.cloud import PointCloud
 PLACE = np.array([0.085, 0.0, 0.01])
 INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.5, 0, 0.3, 0]])
 NOISE = 3e-4
+_ALONG, _UP = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.1, 0.2, 60), np.linspace(0.0, 0.2, 40)))
+WALLS = np.vstack(
+    [
+        np.column_stack([_ALONG, 0.5 * _UP - 0.1, np.full(len(_UP), -0.15)]),
+        np.column_stack([_ALONG, np.full(len(_UP), -0.15), _UP - 0.1]),
+        np.column_stack([np.full(len(_UP), -0.15), _ALONG - 0.05, _UP - 0.1]),
+    ]
+)
+"""Points of a floor and of two walls [m]."""
 
 
-def touched(folder: Path, force: np.ndarray, *, ball: bool) -> Recording:
-    """Return three free frames and one with a force on the upper face, on an arm of another mesh and law; a red ball pushes where it is shown."""
-    recording, states = record(INPUTS, noise=1e-4, forces={3: (PLACE, force)})
+def touched(
+    folder: Path, force: np.ndarray, *, ball: bool, place: np.ndarray = PLACE, nudge: np.ndarray | None = None, wall: bool = False
+) -> Recording:
+    """Return three free frames and one with a force on the upper face, on an arm of another mesh and law; a red ball pushes where it is shown.
+
+    Arguments:
+        place: where it pushes, at rest [m].
+        nudge: how the camera has moved in that frame: (rotation about the robot's origin [rad], shift [m]), shape (6,).
+        wall: whether two walls stand around the arm.
+    """
+    recording, states = record(INPUTS, noise=1e-4, forces={3: (place, force)})
     true, rng, files = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(11), []
     triangles = surface_triangles(true.body.mesh)
-    node = int(np.argmin(np.linalg.norm(true.body.mesh.nodes - PLACE, axis=1)))
+    node = int(np.argmin(np.linalg.norm(true.body.mesh.nodes - place, axis=1)))
     for k, x in enumerate(states):
         looks = np.einsum("tc,tc->t", triangle_normals(x, triangles), T_ROBOT_CAMERA[:3, 3] - x[triangles].mean(axis=1)) > 0
         corners = x[triangles[looks]]
@@ -36,9 +53,12 @@ def touched(folder: Path, force: np.ndarray, *, ball: bool) -> Recording:
             more = x[node] + [0, 0, 0.006] + 0.006 * out
             more = more[np.einsum("pc,pc->p", out, T_ROBOT_CAMERA[:3, 3] - more) > 0]
             points, shades = np.vstack([points, more]), np.vstack([shades, np.tile([0.9, 0.1, 0.1], (len(more), 1))])
-        ray = points - T_ROBOT_CAMERA[:3, 3]
+        if wall:
+            points, shades = np.vstack([points, WALLS]), np.vstack([shades, np.full((len(WALLS), 3), 0.6)])
+        pose = T_ROBOT_CAMERA if nudge is None or k != 3 else move_pose(T_ROBOT_CAMERA, nudge)
+        ray = points - pose[:3, 3]
         points = points + NOISE * rng.normal(size=(len(points), 1)) * ray / np.linalg.norm(ray, axis=1, keepdims=True)
-        cloud = PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), points), shades)
+        cloud = PointCloud(transform_points(invert_pose(pose), points), shades)
         write_cloud(folder / f"{k:06d}.ply", cloud)
         files.append((folder / f"{k:06d}.ply",))
     return replace(recording, free=np.array([True, True, True, False]), cloud_files=tuple(files), color_files=((None,),) * 4)

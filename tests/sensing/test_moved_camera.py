@@ -1,0 +1,60 @@
+"""A camera that moved, beside contacts that only the shape shows: the background tells one from the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import arm
+from touched_arm import touched
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.pose import moved_poses
+from femsense.sensing.background import look, off_background
+from femsense.sensing.pipeline import estimate
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.types import FrameReport
+
+SHIFT, TURN = np.array([0.0, 0, 0, 0.0, 0.0012, 0.0016]), np.array([0.0, 0.004, 0.008, 0, 0, 0])
+NEAR_CLAMP = np.array([0.02, 0.0, 0.01])
+
+
+def last_frame(folder: Path, force: float = 0.0, **how: object) -> tuple[FrameReport, int]:
+    """Return what the touched frame is said to be, and how many contacts it has; the free ones are ok."""
+    seen = touched(folder, np.array([0.0, 0.0, -force]), ball=False, place=NEAR_CLAMP, **how)  # type: ignore[arg-type]
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [frame.status for frame in run.frames[:3]] == ["ok"] * 3
+    return run.frames[3], len(run.contacts)
+
+
+@pytest.mark.parametrize("nudge", [SHIFT, TURN])
+def test_a_camera_that_moved_is_named_with_how_far(tmp_path, nudge):
+    status = last_frame(tmp_path, nudge=nudge, wall=True)[0].status
+    assert "the camera seems to have moved by" in status
+    assert "the background did" in status
+    if nudge is SHIFT:
+        assert "moved by 2.0 mm and 0.0°" in status
+    else:
+        assert "and 0.5°" in status
+
+
+def test_where_nothing_stands_around_a_camera_that_moved_is_a_possibility(tmp_path):
+    assert "the camera or the robot's base may have moved by" in last_frame(tmp_path, nudge=SHIFT)[0].status
+
+
+def test_a_touch_near_the_clamp_is_no_camera_that_moved(tmp_path):
+    """From the arm alone a camera that turned by 1.2° is about as good: what stands around it did not move."""
+    report, contacts = last_frame(tmp_path, 0.4, wall=True)
+    assert (report.status, contacts) == ("ok", 1)
+
+
+def test_points_off_the_background_move_with_the_pose_as_their_derivative_says(tmp_path):
+    seen = touched(tmp_path, np.zeros(3), ball=False, wall=True)
+    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    assert sensor.background is not None
+    step, glance = 1e-4 * np.array([3.0, -2, 4, 1, 2, -1]), look(sensor, 2)
+    here, by_pose = off_background(sensor, sensor.background, glance, sensor.calibration.poses)
+    there, _ = off_background(sensor, sensor.background, glance, moved_poses(sensor.calibration.poses, step, sensor.pivot))
+    assert np.median(np.abs(here)) < 1.0
+    assert np.quantile(np.abs(there - here - by_pose @ step), 0.9) < 0.05 * np.abs(by_pose @ step).max()
