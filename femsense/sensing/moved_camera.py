@@ -67,11 +67,12 @@ def camera_status(
     moved = moved_cameras(sensor, k, scan, fit, free, before)
     if moved is None:
         return status
+    better = moved.cost < fit.cost + moved.stood - SURE
     if unseen and moved.cost < fit.cost + moved.stood + SURE:
-        than = "better than" if moved.cost < fit.cost + moved.stood - SURE else "about as well as"
+        than = "better than" if better else "about as well as"
         return f"{_in_words(sensor, moved)} the frame {than} the contact{'s' * (unseen > 1)} that only the shape shows"
     explained = left_over(moved.sensor, moved.fit) <= sensor.knowledge.misfit_limit
-    if status != OK and explained and shared_errors(moved.sensor, moved.fit) <= sensor.knowledge.nuisance_limit:
+    if status != OK and better and explained and shared_errors(moved.sensor, moved.fit) <= sensor.knowledge.nuisance_limit:
         return f"{_in_words(sensor, moved)} what is left"
     return status
 

@@ -141,12 +141,12 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     contacts = contacts_of(sensor, k, fit, alone, previous)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     status = status_of(sensor, fit, free)
+    if scan is not None and not len(sensor.places):
+        status = camera_status(sensor, k, scan, fit, free, before, status)
     if status == OK and scan is not None and not scan.segmented:
         status = behind_body(sensor, scan, fit)
     if status == OK and fit.rows.of_clouds:
         status = beside_markers(sensor, k, fit)
-    if scan is not None and not len(sensor.places):
-        status = camera_status(sensor, k, scan, fit, free, before, status)
     if status == OK and not len(sensor.places):
         seen = [] if fit.touches else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
         status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *seen]))
