@@ -63,6 +63,12 @@ class Row:
         ]
         return " | ".join(cells)
 
+    def cells(self) -> str:
+        """Error of force (median, 95th percentile), place, missed (quietly), false frames and coverage, as cells of a table in docs."""
+        errors = f"{_percent(np.median, self.size_error).strip()} % | {_percent(_p95, self.size_error).strip()} %"
+        missed = f"{self.missed}/{self.resolvable} ({self.missed_quietly}) | {self.false}/{self.calm}"
+        return f"{errors} | {_mm(np.median, self.place_m).strip()} mm | {missed} | {_percent(np.mean, self.covered).strip()} %"
+
 
 def heading() -> str:
     """What the columns are."""

@@ -19,7 +19,7 @@ from femsense.qp.problem import Problem
 from femsense.qp.solve import solve
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std
 from femsense.sensing.responses import response_at
-from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, tangents_of, touch_normal
+from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, place_cost, tangents_of, touch_normal, ways_of
 from femsense.sensing.types import Response, Rows, Sensor, Touch
 
 ACROSS = 0.5
@@ -87,7 +87,7 @@ class Linearisation:
         data choose (MacKay 1992), so that what the data do not see shrinks and does not inflate the force. Raises DataError.
         """
         m = len(here.touches)
-        place_std = np.repeat([t.std_m for t in here.touches], 2)
+        place_std = np.concatenate([ways_of(t)[1] for t in here.touches])
         free = np.repeat([t.std_m > 0 and float(np.linalg.norm(f)) > 0 for t, f in zip(here.touches, here.forces)], 2)
         wanted = np.array([e @ (t.expected - t.place) for t, e in zip(here.touches, self.frames)]).ravel()
         normal = self._normal_equations(here, free * place_std, free * wanted, firm)
@@ -208,7 +208,7 @@ def linearise(sensor: Sensor, here: Iterate, near: Response | None = None) -> Li
     response = response_at(sensor, here.state, near)
     n, m = len(here.state.positions), len(here.touches)
     basis = np.array([t.patch.spread(axis, n) for t in here.touches for axis in np.eye(3)])
-    frames = np.array([tangents_of(t.normal) for t in here.touches]).reshape(m, 2, 3)
+    frames = np.array([ways_of(t)[0] for t in here.touches]).reshape(m, 2, 3)
     shifts = [nodal_forces_by_shift(sensor, t, e, f) for t, es, f in zip(here.touches, frames, here.forces) for e in es]
     moves = response.tangent.respond(np.concatenate([basis, np.array(shifts)]))
     answers = here.rows.functional(moves)
@@ -228,7 +228,7 @@ def linearise(sensor: Sensor, here: Iterate, near: Response | None = None) -> Li
 
 def prior_cost(here: Iterate, normals: FloatArray) -> float:
     """Return what forces (about outward normals, (m, 3)) and places of an iterate cost beforehand."""
-    off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
+    off = sum(place_cost(touch) for touch in here.touches)
     roots = _prior_roots(here.touches, normals, here.sizes)
     return off + sum(float(((root @ f) ** 2).sum()) for root, f in zip(roots, here.forces))
 

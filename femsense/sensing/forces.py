@@ -19,7 +19,7 @@ from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import misfit_of, nuisance_columns
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import solve_with
-from femsense.sensing.touches import make_touch, pressed, touch_normal, within_cones
+from femsense.sensing.touches import moved_to, pressed, touch_normal, within_cones
 from femsense.sensing.types import Fit, Response, Sensor, Start, Touch
 
 TRIES = 4
@@ -176,9 +176,7 @@ def _moved(sensor: Sensor, here: Iterate, linear: Linearisation, step: ForceStep
     touches = []
     for touch, frame, way in zip(here.touches, linear.frames, step.shift):
         if way.any():
-            at, radius = touch.place + way @ frame, touch.object_radius_m
-            moved = make_touch(sensor, at, source=touch.source, std_m=touch.std_m, radius=radius, spread=touch.spread_m)
-            touch = replace(moved, expected=touch.expected)
+            touch = moved_to(sensor, touch, touch.place + way @ frame)
         touches.append(touch)
     forces = within_cones(sensor, tuple(touches), here.forces + (step.forces - here.forces), here.state)
     touches = [pressed(sensor, touch, force) for touch, force in zip(touches, forces)]

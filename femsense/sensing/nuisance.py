@@ -172,15 +172,15 @@ def learn(
     """
     if not frames:
         return knowledge
-    first = _Prior.of(knowledge, frames[0][1])
+    first = Prior.of(knowledge, frames[0][1])
     shown = frames
     for _ in range(2):  # the second time with what the first left
         shown = [(weighed(knowledge, rows), sag) for rows, sag in frames]
-        grams = [_gram(knowledge, rows, sag) for rows, sag in shown]
+        grams = [gram_of(knowledge, rows, sag) for rows, sag in shown]
         knowledge = first.posterior(_fit_field(knowledge, grams, first), grams)
         rough = knowledge.rough * max(1.0, _scatter(knowledge, shown))
         knowledge = replace(knowledge, together=_together(knowledge, shown), rough=rough)
-    knowledge = _alike(knowledge, [_gram(knowledge, weighed(knowledge, rows), sag) for rows, sag in frames])
+    knowledge = _alike(knowledge, [gram_of(knowledge, weighed(knowledge, rows), sag) for rows, sag in frames])
     clouds = [(weighed(knowledge, rows), sag) for rows, sag in judged or frames if rows.of_clouds]
     if not clouds:
         return knowledge
@@ -290,7 +290,7 @@ def _scatter(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> flo
     return 1.483 * float(np.median(np.concatenate(left))) if left else 1.0
 
 
-def _gram(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
+def gram_of(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
     """Return all inner products of (common, field, way × field, residual) in whitened rows, shape (c + 2p + 1,) squared."""
     std = robust_std(rows, rows.residual)
     field = rows.of_clouds * _kernel(knowledge, rows.place)  # that of a marker is in its standard deviation
@@ -304,14 +304,14 @@ def _sizes(knowledge: Knowledge) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Prior:
+class Prior:
     """What was known of poses, modulus and pulls before the free frames."""
 
     mean: FloatArray  # (c,)
     root: FloatArray  # (c, j)
 
     @classmethod
-    def of(cls, knowledge: Knowledge, moves: FloatArray) -> _Prior:
+    def of(cls, knowledge: Knowledge, moves: FloatArray) -> Prior:
         c = commons(knowledge)
         wider = np.ones(c)
         wider[: c - len(moves)] = APART if len(moves) > 1 else 1.0
@@ -350,7 +350,7 @@ class _Prior:
         return mean, root, inner, root.T @ (total[:-1, -1] - total[:-1, :-1] @ mean)
 
 
-def _fit_field(knowledge: Knowledge, grams: list[FloatArray], first: _Prior) -> Knowledge:
+def _fit_field(knowledge: Knowledge, grams: list[FloatArray], first: Prior) -> Knowledge:
     """Return the sizes of the shared errors that are likeliest for these frames: from those at hand uphill over the grid."""
 
     def sized(i: int, j: int) -> Knowledge:
@@ -379,7 +379,7 @@ def _beforehand(knowledge: Knowledge) -> float:
 def _alike(knowledge: Knowledge, grams: list[FloatArray]) -> Knowledge:
     """Return what the free frames have alike of the shared errors, and how much of them, about pose, modulus and pulls as they are known."""
     c = commons(knowledge)
-    known = _Prior(knowledge.mean[:c], np.zeros((c, 0)))
+    known = Prior(knowledge.mean[:c], np.zeros((c, 0)))
     best = min((replace(knowledge, alike=share) for share in ALIKE_STEPS), key=lambda one: known.evidence(one, grams))
     told = known.posterior(best, grams)
     root = block_diag(*(_root(part @ part.T) for part in (knowledge.root[:c], told.root[c:])))

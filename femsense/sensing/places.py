@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.scan import Scan
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
@@ -31,6 +32,8 @@ ZONE = 0.15
 """Largest extent of a contact about its nearest point, relative to the body's diagonal."""
 CONE = float(np.sqrt(10.0 / 3.0))
 """Radius of a cone of pressure over its root mean square radius."""
+AHEAD = 1e-4
+"""Step by which the slope of a distance is taken [m]."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -134,17 +137,19 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     best = int(np.argmin(distance))
     normals = np.cross(*(state.positions[closest[:, i]] - state.positions[closest[:, 0]] for i in (1, 2)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    own = best // len(weights)
-    alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (
-        np.linalg.norm(places - places[best], axis=1) < ZONE * sensor.size
-    )
-    weight = alike * np.exp(-(distance - distance[best]) / max(0.5 * min(shape.std_m, FLOOR_STD), TILT))
-    middle = weight @ rest / weight.sum()
-    radius = float(np.sqrt(weight @ ((rest - middle) ** 2).sum(axis=1) / weight.sum()))
+    apart = np.linalg.norm(places - places[best], axis=1)
+    zone = np.inf if shape.kind == "cylinder" else ZONE * sensor.size
+    own = _face_towards(shape, places[best], normals, np.unique(np.flatnonzero(apart < 1e-9) // len(weights)))
+    alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (apart < zone)
+    weight = alike * np.exp(-(distance - distance[best]) / _alike_within(sensor, shape, state, places[best], apart))
+    weight /= weight.sum()
+    middle = weight @ rest
+    _, spread, axes = np.linalg.svd(np.sqrt(weight)[:, None] * (rest - middle), full_matrices=False)
+    radius = float(np.linalg.norm(spread))
     if _on_clamp(sensor, middle):
         return None
     curvature = shape.radius_at(places[best], 0.5 * sensor.surface.edge)
-    return make_touch(
+    touch = make_touch(
         sensor,
         middle,
         source="cloud",
@@ -152,6 +157,28 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         radius=curvature,
         spread=CONE * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
     )
+    return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])))
+
+
+def _face_towards(shape: Shape, place: FloatArray, normals: FloatArray, faces: IntArray) -> int:
+    """Return which of the faces that meet in a place (3,) looks at the object most: on an edge, the other one is beside it."""
+    step = AHEAD * np.eye(3)
+    towards = shape.distance(place - step) - shape.distance(place + step)
+    return int(faces[np.argmax(normals[faces] @ towards)])
+
+
+def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatArray, apart: FloatArray) -> FloatArray:
+    """Return up to which difference [m] gaps are alike that lie so far apart from the smallest one [m], shape (k,).
+
+    What model and camera share between neighbours moves near places alike, and those farther apart than it reaches each on its own: a rod that lies on the
+    body touches where that lets it.
+    """
+    known = sensor.knowledge
+    node = int(np.argmin(((state.positions - best) ** 2).sum(axis=1)))
+    way = float(np.linalg.norm(state.positions[node] - sensor.robot.body.mesh.nodes[node]))
+    shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way)
+    least = max(0.5 * min(shape.std_m, FLOOR_STD), TILT)
+    return np.asarray(np.maximum(least, shared * np.minimum(1.0, apart / known.length)))
 
 
 def _lattice(parts: int) -> FloatArray:

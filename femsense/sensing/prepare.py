@@ -32,6 +32,7 @@ from femsense.sensing.background import background_of
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
 from femsense.sensing.places import near_places, object_touches, objects_near
+from femsense.sensing.pose_beside_field import commons_beside_field
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
 MODULUS_STD = 0.01
@@ -141,7 +142,7 @@ def prepare(
     free = _free_frames(sensor)
     learned = _taught(knowledge, free.values())
     if pulls_are_modelled:
-        sensor = _better_posed(sensor, learned)
+        sensor = _better_posed(sensor, learned, free.values())
         knowledge, free = sensor.knowledge, _free_frames(sensor)
         learned = _taught(knowledge, free.values())
     background = background_of(sensor, min(free)) if free else None
@@ -175,15 +176,16 @@ def _corrected(
     return corrected(recording, correction, calibration.poses), correction.of_rows(recording)[1]
 
 
-def _better_posed(sensor: Sensor, learned: Knowledge) -> Sensor:
+def _better_posed(sensor: Sensor, learned: Knowledge, frames: Collection[FreeFrame]) -> Sensor:
     """Return the sensor with poses and modulus as the free frames show them: rays and states near the true ones."""
     v = 6 * len(sensor.calibration.poses)
     if not learned.mean[: commons(learned)].any():
         return sensor
-    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -learned.mean[:v], sensor.pivot))
-    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + learned.mean[v])))
+    shown = commons_beside_field(sensor.knowledge, learned, _rows_of(frames), v)
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -shown[:v], sensor.pivot))
+    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + shown[v])))
     expected = sensor.knowledge.mean.copy()  # what was known beforehand, as it looks from there
-    expected[:v], expected[v] = -learned.mean[:v], 1.0 / (1.0 + learned.mean[v]) - 1.0
+    expected[:v], expected[v] = -shown[:v], 1.0 / (1.0 + shown[v]) - 1.0
     return replace(
         sensor,
         robot=robot,
@@ -261,8 +263,12 @@ def _scenery(sensor: Sensor) -> FloatArray:
 
 def _taught(knowledge: Knowledge, frames: Collection[FreeFrame]) -> Knowledge:
     """Return what free frames teach (see `learn`)."""
-    shown = [(rows, one.moves) for one in frames for rows in (one.rows, *one.markers)]
-    return learn(knowledge, shown, [(one.means, one.moves) for one in frames])
+    return learn(knowledge, _rows_of(frames), [(one.means, one.moves) for one in frames])
+
+
+def _rows_of(frames: Collection[FreeFrame]) -> list[tuple[Rows, FloatArray]]:
+    """Return the rows of the clouds and markers of free frames, each with the moves of its frame."""
+    return [(rows, one.moves) for one in frames for rows in (one.rows, *one.markers)]
 
 
 def _free_frames(sensor: Sensor) -> dict[int, FreeFrame]:

@@ -21,7 +21,7 @@ from femsense.sensing.nuisance import nuisance_columns, robust_std
 from femsense.sensing.places import given_touches, object_touches, said_free
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import foretold
-from femsense.sensing.touches import make_touch
+from femsense.sensing.touches import make_touch, moved_to
 from femsense.sensing.types import Fit, Rows, SensedFrame, Sensor, Start, Touch
 
 STARTS = 3
@@ -239,7 +239,12 @@ def nothing_new(sensor: Sensor, fit: Fit, found: Sequence[Touch]) -> bool:
 
 
 def _near(sensor: Sensor, touch: Touch, others: Sequence[Touch]) -> bool:
-    return any(float(np.linalg.norm(touch.place - other.expected)) < APART * sensor.size for other in others)
+    return any(float(np.linalg.norm(touch.place - other.expected)) < _reach(sensor, touch) for other in others)
+
+
+def _reach(sensor: Sensor, found: Touch) -> float:
+    """Return within which distance [m] a contact is that of an object: along a rod that lies on the body its place may be anywhere."""
+    return max(APART * sensor.size, 2.0 * found.std_m)
 
 
 def held_on(
@@ -261,23 +266,23 @@ def held_on(
     gap = np.array([[np.linalg.norm(touch.expected - f.place) for f in found] for touch in touches]).reshape(
         len(touches), len(found)
     )
+    reach = [_reach(sensor, f) for f in found]
     for i, touch in enumerate(touches):
         j = int(gap[i].argmin()) if touch.source == "cloud" and len(found) else -1
-        seen = j >= 0 and gap[i, j] < APART * sensor.size and i == int(gap[:, j].argmin())
+        seen = j >= 0 and gap[i, j] < reach[j] and i == int(gap[:, j].argmin())
         if seen:
             result.append(_moved_on(sensor, touch, found[j]) if sure[i] else replace(found[j], std_m=0.0))
         elif sure[i] and not (gone and touch.source == "cloud"):
             result.append(touch)
         kept += [i] * (len(result) - len(kept))
-    new = [f for j, f in enumerate(found) if not len(touches) or gap[:, j].min() >= APART * sensor.size]
+    new = [f for j, f in enumerate(found) if not len(touches) or gap[:, j].min() >= reach[j]]
     return [*result, *new], np.array([*kept, *(-1 for _ in new)], dtype=np.int64)
 
 
 def _moved_on(sensor: Sensor, touch: Touch, found: Touch) -> Touch:
     """Return where an object is found to touch, with what the shape said of the place in the frame before."""
     place = found.place + touch.place - touch.expected
-    moved = make_touch(sensor, place, source="cloud", std_m=found.std_m, radius=found.object_radius_m, spread=found.spread_m)
-    return replace(moved, expected=found.place)
+    return replace(moved_to(sensor, found, place), expected=found.place)
 
 
 def _same(sensor: Sensor, found: Sequence[Touch], fit: Fit) -> bool:

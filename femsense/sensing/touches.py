@@ -89,6 +89,33 @@ def tangents_of(normal: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(normal[None])[2][1:])
 
 
+def ways_of(touch: Touch) -> tuple[FloatArray, FloatArray]:
+    """Return two unit vectors along the surface at rest, shape (2, 3), and how well the place is known along each [m], shape (2,)."""
+    along = touch.line - touch.normal * (touch.line @ touch.normal)
+    size = float(np.linalg.norm(along))
+    if size < 0.1:  # no line, or one that goes into the body where the place has moved to
+        return tangents_of(touch.normal), np.full(2, touch.std_m)
+    stds = np.array([touch.std_m, touch.across_m]) if touch.std_m > 0 else np.zeros(2)
+    return np.stack([along / size, np.cross(touch.normal, along / size)]), stds
+
+
+def place_cost(touch: Touch) -> float:
+    """Return what a place costs beforehand: how far it is from the expected one, squared, in standard deviations."""
+    if touch.std_m == 0:
+        return 0.0
+    way = touch.place - touch.expected
+    if not touch.line.any():
+        return float(way @ way) / touch.std_m**2
+    along = float(way @ touch.line)
+    return along**2 / touch.std_m**2 + max(float(way @ way) - along**2, 0.0) / touch.across_m**2
+
+
+def moved_to(sensor: Sensor, touch: Touch, place: FloatArray) -> Touch:
+    """Return a touch at the point of the surface at rest closest to another place [m], shape (3,); what is expected of it stays."""
+    there = make_touch(sensor, place, source=touch.source, spread=touch.spread_m)
+    return replace(touch, place=there.place, normal=there.normal, patch=there.patch)
+
+
 def nodal_forces(touches: Sequence[Touch], forces: FloatArray, nodes: int) -> FloatArray:
     """Return the forces on so many nodes that forces (m, 3) at some touches stand for [N], shape (nodes, 3)."""
     return np.asarray(sum((t.patch.spread(f, nodes) for t, f in zip(touches, forces)), np.zeros((nodes, 3))))

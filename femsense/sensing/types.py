@@ -183,12 +183,12 @@ class Touch:
     """Where it is expected, on the surface at rest [m], shape (3,)."""
     std_m: float
     """How well that is known along the surface [m]; 0: exactly."""
-    source: str
-    """"cloud", "shape" or "given"."""
-    object_radius_m: float = np.inf
-    """Radius of curvature of what touches [m]; inf: flat or not known."""
-    spread_m: float = 0.0
-    """Radius of the zone where it touches, if that is wider than what the mesh can tell from a point [m]."""
+    source: str  # "cloud", "shape" or "given"
+    object_radius_m: float = np.inf  # of curvature [m]; inf: flat or not known
+    spread_m: float = 0.0  # radius of the zone where it touches, if that is wider than what the mesh can tell from a point [m]
+    line: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """Unit vector at rest along which alone it is known no better than that, as along a rod; zero: all ways alike."""
+    across_m: float = 0.0  # how well it is known across the line [m]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
