@@ -26,7 +26,8 @@ MOST_ROUNDS = 5
 SETTLED = 0.005
 """They are separated where the number of the robot's points changes by less than this share of it."""
 KEPT = 0.9
-"""What explains a frame as the one before shows this share of the points that matched there: else part of the robot was taken for something else."""
+"""What explains a frame as the one before shows this share of the points that matched there: else part of the robot was taken for something else.
+On `slab-gray` any value gives the same (docs/forces.md)."""
 SOME = 500
 """Points that tell which of two states is closer to all of them."""
 
