@@ -23,10 +23,11 @@ from femsense.sensing.run_files import write_run
 
 VALUES: dict[str, tuple[ModuleType, tuple[float, ...]]] = {
     "HERTZ": (touches, (0.0, 1.0, touches.HERTZ, 1.6)),
+    "ALIKE": (touches, (0.0, touches.ALIKE, 0.3)),
     "KEPT": (separation, (0.0, separation.KEPT, 0.98)),
 }
-"""Constants, where they stand, and values to ask with; KEPT matters without colours alone, HERTZ where a round object touches."""
-ASKED = {"HERTZ": "pad-normal", "KEPT": "slab-gray"}
+"""Constants, where they stand, and values to ask with; KEPT matters without colours alone, the others where a round object touches."""
+ASKED = {"HERTZ": "pad-normal", "ALIKE": "pad-normal", "KEPT": "slab-gray"}
 
 
 def main() -> None:
