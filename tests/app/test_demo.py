@@ -91,7 +91,7 @@ def test_columns_are_aligned() -> None:
 
 def test_texts_name_what_matters(run: Run) -> None:
     text = run_text(run)
-    assert "2 of 3" in text and "3 in 2 frames" in text and "0.500 N declared, 0.490 N sensed (-2.0 %)" in text
+    assert "2 of 3" in text and "2 in 2 frames" in text and "0.500 N declared, 0.490 N sensed (-2.0 %)" in text
     assert "no result, frame 0" in text and "1.000 ± 0.100 N in frame 1" in text
     text = loop_text(Loop.model_validate(LOOP))
     assert (
