@@ -102,6 +102,8 @@ def test_initial_inputs_are_found_with_the_pose(tmp_path: Path, declared: bool) 
     )  # what all cables have in common compresses the body: the law tells it from nothing else
     assert np.abs(error - error.mean()).max() < 0.08, error
     assert (std < 0.4).all() and (np.abs(error) < 1.5 * std).all(), std
+    if declared:  # 1.4 without what another law would change
+        assert (np.abs(error) < 1.3 * std).all(), std
     assert "initial inputs by clouds alone" in found.status
 
 
