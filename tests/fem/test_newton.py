@@ -341,21 +341,22 @@ def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_do
 
     whole = factorize(pattern, K.data).bytes
 
-    def lowered(share: float) -> FloatArray:
-        return K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
+    def lowered(share: float, scale: float = 1.0) -> FloatArray:
+        return scale * (K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))))
 
-    def factored(share: float, shift: float = 0.0) -> tuple[Any, newton_state.State]:
+    def factored(share: float, shift: float = 0.0, scale: float = 1.0) -> tuple[Any, newton_state.State]:
         state = newton_state.State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
-        return newton.definite_factor(pattern, lowered(share), state), state
+        return newton.definite_factor(pattern, lowered(share, scale), state), state
 
     for share, shift in ((1.5, 0.0), (1.5, 2.2 * lowest), (30.0, 0.0)):
         factor, state = factored(share, shift)
         assert state.single and factor.bytes == whole / 2 and (share - 1.0) * lowest < state.shift
     factor, state = factored(0.5, 30.0 * lowest)
     assert state.single and factor.bytes == whole / 2 and state.shift == 0.0
-    shares = 1.0 - np.geomspace(1e-9, 1e-7, 20)  # definite, but not with seven digits: rounding says which of them fails there
-    share = next(s for s in shares if factorize_definite(pattern, lowered(s), single=True, tries=0)[0] is None)
-    factor, state = factored(share)
+    share = 1.0 - 1e-8  # definite, but not with seven digits: rounding, which differs with the scale, says where that fails
+    scales = np.linspace(1.0, 2.0, 41)
+    scale = next(s for s in scales if factorize_definite(pattern, lowered(share, s), single=True, tries=0)[0] is None)
+    factor, state = factored(share, scale=scale)
     assert not state.single and factor.bytes == whole and state.shift == 0.0
 
 
