@@ -32,6 +32,8 @@ SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
     "b = sin 3a": lambda a: np.sin(3 * a),
 }
 FAR, OFF = 0.3, 0.1
+BESIDE = 5
+"""Channels that have nothing to do with the two of a curve."""
 
 
 def arm_blocks(folder: Path, columns: tuple[int, ...]) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -50,13 +52,21 @@ def curve_rows(shape: Callable[[FloatArray], FloatArray], count: int, seed: int)
     return np.stack([a, shape(a)], axis=1) + 0.01 * np.random.default_rng(seed).normal(size=(count, 2))
 
 
+def beside_others(rows: FloatArray, seed: int) -> FloatArray:
+    """Return readings with further channels that wander on their own, shape (n, c + 5)."""
+    rng = np.random.default_rng(seed)
+    at, speeds, phases = np.arange(len(rows))[:, None] * 30 / len(rows), rng.uniform(0.5, 2.5, BESIDE), rng.uniform(0, 6, BESIDE)
+    return np.hstack([rows, np.sin(speeds * at + phases) + 0.01 * rng.normal(size=(len(rows), BESIDE))])
+
+
 def counts(learnt: FloatArray, fresh: FloatArray, shape: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
-    """Return the numbers of a row of the table (`tell`), shape (8,). Where a curve is known, what lies on it is no contradiction."""
+    """Return the numbers of a row of the table (`tell`), shape (8,). Where a curve of the first two channels is known, these alone contradict
+    each other, and what lies on it is no contradiction."""
     domain = learn_domain(learnt)
     line = replace(domain, curves=())
     ranged = in_range(domain, fresh)
     own = [len(fresh), (~ranged).sum(), *(outside(d, fresh[ranged]) for d in (line, domain))]
-    wrong = np.concatenate(list(contradictions(domain, fresh)))
+    wrong = np.concatenate(list(contradictions(domain, fresh))[: None if shape is None else 2])
     wrong = wrong if shape is None else wrong[np.abs(wrong[:, 1] - shape(wrong[:, 0])) > OFF]
     return np.array([*own, len(wrong), *(outside(d, wrong) for d in (line, domain)), len(domain.curves)], dtype=float)
 
@@ -101,7 +111,9 @@ def main() -> None:
             tell(f"arm, {name}", np.sum([counts(*pair) for pair in arm_blocks(arguments.data, columns)], axis=0))
         for name, shape in SHAPES.items():
             for count in (60, 1500):
-                tell(f"{name}, {count} rows", counts(curve_rows(shape, count, 1), curve_rows(shape, 700, 2), shape))
+                learnt, fresh = curve_rows(shape, count, 1), curve_rows(shape, 700, 2)
+                tell(f"{name}, {count} rows", counts(learnt, fresh, shape))
+                tell("  beside five others", counts(beside_others(learnt, 3), beside_others(fresh, 3), shape))
 
 
 if __name__ == "__main__":

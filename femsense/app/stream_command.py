@@ -264,7 +264,7 @@ def stream_text(live: LiveStream) -> str:
         lines.append(f"MQTT: 127.0.0.1, port {live.broker.port}")
     lines += [f"topics: {topic(publisher.twin.name, '…')}" for publisher in live.publishers]
     if live.server.access.password and live.server.access.certificate is None:
-        lines.append("the password travels unencrypted: --certificate and --key encrypt")
+        lines.append("the password of the page travels unencrypted: --certificate and --key encrypt")
     return "\n".join([*lines, "Ctrl-C ends it"])
 
 

@@ -342,7 +342,9 @@ def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_do
     whole = factorize(pattern, K.data).bytes
 
     def lowered(share: float, scale: float = 1.0) -> FloatArray:
-        return scale * (K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))))
+        return scale * (
+            K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
+        )
 
     def factored(share: float, shift: float = 0.0, scale: float = 1.0) -> tuple[Any, newton_state.State]:
         state = newton_state.State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)

@@ -11,7 +11,7 @@ from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.arrays import FloatArray
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import invert_pose, moved_poses, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.camera import CameraNoise
@@ -222,6 +222,16 @@ def test_free_frames_remember_friction(tmp_path):
     assert calibration.normal_rms_m == pytest.approx(2e-4, abs=1e-4)
     known = make_sensor(robot, recording, calibration).knowledge
     assert abs(known.mean[6]) < 0.05 and known.bias_m < 3e-4
+
+
+def test_a_declared_pose_is_not_taken_for_exact_where_clouds_tell_it(tmp_path):
+    recording, robot = pulled_and_let_go(tmp_path), apply_effects(arm(), FRICTION)
+    fitted = calibrate(robot, recording)
+    off = moved_poses(fitted.poses, np.array([0.0, 4e-3, 0.0, 0.0, 0.0, 5e-4]), np.zeros(3))
+    nobody = np.zeros_like(fitted.pose_covariance)
+    declared = replace(fitted, poses=off, T_robot_camera=off[0], pose_covariance=nobody, joint_covariance=nobody)
+    known = make_sensor(robot, recording, declared).knowledge
+    assert known.mean[:6].any() and known.bias_m < 3e-4
 
 
 def test_what_clouds_leave_does_not_judge_frames_with_markers_alone(tmp_path):

@@ -1,6 +1,8 @@
 """Channels that depend on the others by a curve: a smooth map that blocks in time have judged which it was not trained on.
 
-What the other channels make of channel i is f_i(z) of the normalised readings, with z_i left out; a reading is off the curve where
+What the other channels make of channel i is f_i(z) of the normalised readings, with z_i left out. It is a function of all of them, or of the one
+that tells most of it, where that errs less: beside channels that have nothing to do with it, many readings are needed to learn one of all.
+A reading is off the curve where
 |z_i − f_i(z)| > h_i, h_i from the largest error that was left on held-out blocks. Where the channels go together by a straight line,
 the inverse covariance knows that better, and there is no curve.
 """
@@ -27,7 +29,7 @@ outside; with 1.0 up to six more in ten thousand are (`benchmarks/xr_domain.py -
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Curve:
-    """What the other channels make of one channel, in normalised readings."""
+    """What all other channels, or one of them, make of one channel, in normalised readings."""
 
     channel: int
     network: Network
@@ -53,20 +55,33 @@ def learn_curves(z: FloatArray, lines: FloatArray) -> tuple[Curve, ...]:
     """
     rows = z[thinned_rows(len(z), MOST_ROWS)]
     found = []
-    for i in np.flatnonzero(np.ptp(z, axis=0) > 0).tolist():
-        half = HELD_MARGIN * _largest_error(rows, i)
-        if half < NARROWER * lines[i]:
-            found.append(Curve(i, _train(rows, i), half))
+    moving = np.flatnonzero(np.ptp(z, axis=0) > 0).tolist()
+    for i in moving:
+        others = [j for j in moving if j != i]
+        if not others:
+            break
+        alone = max(others, key=lambda j: depends(rows[:, j], rows[:, i]))
+        halves = {of: HELD_MARGIN * _largest_error(rows, i, of) for of in (tuple(others), (alone,))}
+        best = min(halves, key=lambda of: halves[of])
+        if halves[best] < NARROWER * lines[i]:
+            found.append(Curve(i, _train(rows, i, best), halves[best]))
     return tuple(found)
 
 
-def _largest_error(z: FloatArray, channel: int) -> float:
-    """Return the largest error of a channel's curve on blocks that were held out in turn."""
-    errors = [_train(z[~held], channel)(z[held])[:, 0] - z[held, channel] for held in folds(len(z))]
+def depends(x: FloatArray, y: FloatArray) -> float:
+    """Return how far y is a function of x, both of shape (n,): 1 where it is one, about 0 where it has nothing to do with it (Chatterjee 2021)."""
+    ranks = np.argsort(np.argsort(y[np.argsort(x, kind="stable")], kind="stable"), kind="stable")
+    n = len(x)
+    return float(1.0 - 3.0 * np.abs(np.diff(ranks)).sum() / (n**2 - 1.0))
+
+
+def _largest_error(z: FloatArray, channel: int, of: tuple[int, ...]) -> float:
+    """Return the largest error of a channel's curve over others on blocks that were held out in turn."""
+    errors = [_train(z[~held], channel, of)(z[held])[:, 0] - z[held, channel] for held in folds(len(z))]
     return float(np.abs(np.concatenate(errors)).max())
 
 
-def _train(z: FloatArray, channel: int) -> Network:
-    others = z.copy()
-    others[:, channel] = 0.0  # an input that never changes has no weight
+def _train(z: FloatArray, channel: int, of: tuple[int, ...]) -> Network:
+    others = np.zeros_like(z)  # an input that never changes has no weight
+    others[:, of] = z[:, of]
     return train_radial(others, z[:, [channel]], penalty=PENALTY, length=LENGTH, noise=NOISE)

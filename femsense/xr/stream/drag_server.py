@@ -223,7 +223,9 @@ class DragServer:
         """
         begun = time.perf_counter()
         with self._lock:
-            turn, grabbed, self._grabbed, current = self.gate.turn, self._grabbed, False, self._shown()
+            turn, grabbed, self._grabbed = self.gate.turn, self._grabbed, False
+            moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
+            current = {**self.gate.last, **self._current(time.monotonic())} if moves else self._shown()
             last = self._motion
             reached = None if last is None or last.status == REACHED else last.reached_m.get(handle)
             since = self._settled()

@@ -131,6 +131,19 @@ def test_readings_off_the_curve_on_which_channels_go_together_are_outside(tmp_pa
     assert load_model(path).check(off) == () and load_model(path).check([0.2, 9.0, 1.02])
 
 
+def test_a_curve_over_one_channel_is_found_among_many() -> None:
+    """Two channels that go together by a curve, and five that have nothing to do with them."""
+    rng = np.random.default_rng(4)
+    a, others = rng.uniform(0.0, 1.0, 1200), rng.uniform(0.0, 1.0, (1200, 5))
+    tied = (2.0 * a - 1.0) ** 2 + 7e-3 * rng.normal(size=1200)
+    rows = np.column_stack([others[:, :3], a, others[:, 3:], tied])
+    domain = learn_domain(rows[:900])
+    assert [curve.channel for curve in domain.curves] == [6]
+    held, off = rows[900:], rows[900:].copy()
+    off[:, 6] += np.where(off[:, 6] < 0.5, 0.3, -0.3)
+    assert domain.inside(held).mean() > 0.95 and domain.inside(off).mean() < 0.05
+
+
 def test_a_straight_line_needs_no_curve() -> None:
     rows = on_a_curve(600, seed=1)
     rows[:, 1] = 2.0 * rows[:, 0] + 0.01 * np.random.default_rng(3).normal(size=600)

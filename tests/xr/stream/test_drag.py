@@ -293,6 +293,22 @@ def test_after_a_lapse_commands_go_on_from_the_last_one_though_a_run_plays_on(al
     assert out.farthest() <= 1.0 + 1e-9
 
 
+def test_a_robot_that_stands_at_its_target_stays_there_after_a_lapse_though_a_run_plays_on(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
+    out = Commands(hub, server)
+    wanted = target_of(server.robot, dict(zip(server.robot.body.cable_names, (0.6, 0.0))))
+    for _ in range(20):
+        hold(hub, out, wanted)
+        if np.ptp(out.sent[-20:], axis=0).max() < 1e-6 and reach_of(hub)["status"] == "reached":
+            break
+    stood, count = np.array(out.sent[-1]), len(out.sent)
+    assert reach_of(hub)["status"] == "reached"
+    time.sleep(0.5)
+    out.play(0.0, 1.4)
+    hold(hub, out, wanted)
+    assert np.abs(np.array(out.sent[count:]) - stood).max() < 1e-3
+
+
 def test_commands_begin_where_the_robot_itself_says_that_it_is(alone: tuple[Hub, DragServer]) -> None:
     hub, server = alone
     names, out = server.robot.body.cable_names, Commands(hub, server)
