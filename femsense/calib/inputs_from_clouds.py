@@ -160,7 +160,8 @@ class _Fit:
 
     def covariance(self, end: _End) -> FloatArray:
         """Return the covariance of poses and inputs, shape (p + a, p + a): of points, of what was known before, and of the law."""
-        by_law = np.outer(*[self._moved_by_law(end)] * 2)
+        moved = self._moved_by_law(end)
+        by_law = np.outer(moved, moved)
         if end.weighed is not None:
             return np.asarray(np.linalg.inv(end.weighed.clouds + self.prior) + by_law)
         inverse, scores = np.linalg.inv(end.sums.normal + self.prior), self.scores(end)

@@ -44,7 +44,6 @@ def test_where_nothing_stands_around_a_camera_that_moved_is_a_possibility(tmp_pa
 
 
 def test_a_touch_near_the_clamp_is_no_camera_that_moved(tmp_path):
-    """From the arm alone a camera that turned by 1.2° is about as good: what stands around it did not move."""
     report, contacts = last_frame(tmp_path, 0.4, wall=True)
     assert (report.status, contacts) == ("ok", 1)
 

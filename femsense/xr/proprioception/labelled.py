@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -100,8 +101,18 @@ def labelled(
             found=(len(names), len(points)),
             expected=x.shape[1:] + y.shape[1:2],
         )
+    _say_what_is_left_out(good, x, names)
     part = freeze(np.zeros(good.sum()), np.int64)
     return Labelled(freeze(t[good]), freeze(x[good]), freeze(y[good]), names, points, part, frame)
+
+
+def _say_what_is_left_out(good: npt.NDArray[np.bool_], x: FloatArray, channels: Sequence[str]) -> None:
+    """Warn of rows that are left out, with the channels that have no number there; the others lack a marker."""
+    if good.all():
+        return
+    empty = {name: int(count) for name, count in zip(channels, (~np.isfinite(x)).sum(axis=0)) if count}
+    by = "; ".join(f"{name} has no number in {count}" for name, count in empty.items()) or "a marker is hidden there"
+    warnings.warn(f"{int((~good).sum())} of {len(good)} rows are left out: {by}", stacklevel=3)
 
 
 def joined(parts: Sequence[Labelled]) -> Labelled:

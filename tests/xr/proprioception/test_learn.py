@@ -267,7 +267,12 @@ def test_files_are_read_and_rows_with_hidden_markers_are_left_out(tmp_path: Path
     assert (back.channels, back.marker_names) == (CHANNELS, data.marker_names)
     lines = markers.read_text().splitlines()
     markers.write_text("\n".join(lines[:5] + lines[6:]))
-    assert len(read_labelled(sensors, markers)) == 19
+    with pytest.warns(UserWarning, match="1 of 20 rows are left out: a marker is hidden there"):
+        assert len(read_labelled(sensors, markers)) == 19
+    first, *rows = sensors.read_text().splitlines()
+    sensors.write_text("\n".join([first, rows[0].rpartition(",")[0] + ",", *rows[1:]]))
+    with pytest.warns(UserWarning, match=f"2 of 20 rows are left out: {CHANNELS[-1]} has no number in 1"):
+        assert len(read_labelled(sensors, markers)) == 18
 
 
 def test_a_camera_s_markers_come_into_the_robot_s_frame_and_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
