@@ -56,7 +56,11 @@ class Access:
             context.load_cert_chain(self.certificate, self.key)
         except (OSError, ssl.SSLError) as error:
             raise InputError(
-                "not a certificate with its key", where=self.certificate, found=error, expected="PEM files"
+                "not a certificate with its key",
+                where=self.certificate,
+                found=error,
+                expected="PEM files",
+                hint="name the file of its key: --key" if self.key is None else None,
             ) from None
         return context
 

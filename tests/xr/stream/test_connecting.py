@@ -10,6 +10,7 @@ import pytest
 from certificates import self_signed
 from streams import PAGE, twin, within
 
+from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.connecting import NO_BROKER, NO_STREAM, NO_TLS, REFUSED
@@ -94,3 +95,9 @@ def test_a_server_that_is_no_stream_is_told_from_one() -> None:
     assert "its own names" in why_not(Answer(403), tls=False, password=False)
     assert why_not(Answer(503), tls=False, password=False) == "too many viewers"
     assert why_not(socket.gaierror(), tls=False, password=False) == "no machine of that name is known"
+
+
+def test_a_certificate_without_its_key_asks_for_it(tmp_path: Path) -> None:
+    certificate, _ = self_signed(tmp_path)
+    with pytest.raises(InputError, match="--key"):
+        Access(password="secret", certificate=certificate).tls()
