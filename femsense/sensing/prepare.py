@@ -38,7 +38,7 @@ from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sen
 MODULUS_STD = 0.01
 """Where lengths of cables are given, the shape says little of the modulus: beyond this, errors of the model pass for it (relative)."""
 DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
-"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis. Free frames tell it to a tenth of that."""
+"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/forces.md has the trial)."""
 CANDIDATES = 120
 """Places at which hidden contacts are searched (METHODS section 3)."""
 

@@ -2,9 +2,8 @@
 
 What the other channels make of channel i is f_i(z) of the normalised readings, with z_i left out. It is a function of all of them, or of the one
 that tells most of it, where that errs less: beside channels that have nothing to do with it, many readings are needed to learn one of all.
-A reading is off the curve where
-|z_i − f_i(z)| > h_i, h_i from the largest error that was left on held-out blocks. Where the channels go together by a straight line,
-the inverse covariance knows that better, and there is no curve.
+A reading is off the curve where |z_i − f_i(z)| > h_i, h_i from the largest error that was left on held-out blocks. Where the channels go
+together by a straight line, the inverse covariance knows that better, and there is no curve.
 """
 
 from __future__ import annotations
