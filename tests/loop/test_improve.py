@@ -165,7 +165,7 @@ def test_a_search_that_begins_again_keeps_what_was_tried_and_takes_other_weights
     weights = Noise({"white": 5e-3}, "", assumed=1e-4)
     course.begin_again(data, weights)
     assert not course.over and not course.found and course.noise is weights and course.holds_error
-    assert not course.refits[0].is_named and "asked again" in course.refits[0].verdict
+    assert not course.outweighed[0].is_named and "asked again" in course.outweighed[0].verdict
 
 
 def test_a_model_that_lacks_nothing_is_told_so():

@@ -82,7 +82,7 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
         names: effects that are tried.
     """
     candidate = _candidate(names, search.n_effective)
-    record = RefitRecord(MESH.name, QUADRATIC, step=1)
+    record = RefitRecord(MESH.name, QUADRATIC, step=len(search.history))
     worth = beyond(search.final.fit, candidate.cost + data.thresholds.evidence)
     try:
         without = _on(data, data.robot_as_declared, search, worth=worth)

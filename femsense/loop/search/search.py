@@ -50,8 +50,8 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
             fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
     if len(history) > 1 and "clouds" in data.measured:
         before = calibrated_pose(data, data.robot_as_declared, noise, before)  # before and after on the same rows
-    found = Search(before, history, course.base, fitted, noise, course.n_effective, course.first, course.table, refits, swap)
-    return data, found
+    tables = course.first, course.table, refits
+    return data, Search(before, history, course.base, fitted, noise, course.n_effective, *tables, swap, course.outweighed)
 
 
 def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None:

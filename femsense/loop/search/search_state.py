@@ -14,7 +14,7 @@ from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.screening import Candidate
 
 OUTWEIGHED = "found by weights that much is left beside it: asked again with weights that hold the error of the model"
-"""The verdict on what was named before."""
+"""The verdict on what was named, or passed, before."""
 
 
 @dataclass(eq=False, slots=True)
@@ -39,7 +39,9 @@ class SearchProgress:
     quadratic: bool
     """Whether it goes on quadratic elements though linear ones are declared."""
     refits: list[RefitRecord]
-    """What became of candidates that were refitted."""
+    """What became of candidates that were refitted, by the weights of now."""
+    outweighed: list[RefitRecord] = field(default_factory=list)
+    """What became of them by earlier weights: evidence that is compared with none of now."""
     noise: Noise | None = None
     n_effective: float = 0.0
     fields: Fields | None = None
@@ -58,7 +60,8 @@ class SearchProgress:
     def begin_again(self, data: Data, noise: Noise) -> None:
         """Seek effects again on top of the first model, by weights that hold what the last one leaves."""
         kept = [*self.history[: self.given - 1], (self.history[self.given - 1][0], self.base)]
-        self.refits = [replace(r, verdict=OUTWEIGHED) if r.is_named else r for r in self.refits]
+        self.outweighed = [replace(r, verdict=OUTWEIGHED) if r.is_named or r.passes else r for r in self.refits]
+        self.refits = []
         self.data = self.earlier = data
         self.history, self.fitted, self.fields, self.noise = kept, self.base, None, noise
         self.over, self.holds_error = False, True
@@ -89,8 +92,11 @@ class Search:
     last: list[Candidate]
     """The last one."""
     refits: list[RefitRecord]
+    """As of `SearchProgress`."""
     in_place: OffsetAlternative | None
     """What might be in the place of the input offsets."""
+    outweighed: list[RefitRecord] = field(default_factory=list)
+    """As of `SearchProgress`."""
 
 
 Progress = Callable[[str], None]

@@ -91,6 +91,7 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
         course.names,
         course.quadratic,
         refits,
+        search.outweighed,
         noise=noise,
         n_effective=n_effective,
         first=first,

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from arm import arm, record, sweeps
 
 from femsense.fem.mesh import to_linear
+from femsense.loop.data.dataset import prepare
+from femsense.loop.fit.fitted_model import fit_model, with_nuisance
+from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
+from femsense.loop.search.element_order import need_quadratic, with_quadratic
+from femsense.loop.search.search_state import Search
 from femsense.model.remeshing import robot_on_mesh
 
 
@@ -33,3 +41,17 @@ def test_linear_elements_stay_where_the_data_do_not_miss_quadratic_ones() -> Non
     assert found.verdict == "none" and not found.effects
     row = next(c for c in found.candidates if c.name == "discretisation")
     assert row.refits[0].verdict.startswith("too little evidence")
+
+
+def test_what_is_asked_beside_the_whole_model_is_compared_with_nothing_that_was_asked_before_it() -> None:
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
+    linear = robot_on_mesh(arm((2, 1, 1)), to_linear(arm((2, 1, 1)).body.mesh))
+    data = prepare(with_quadratic(linear), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    noise = Noise({"white": 1e-3}, "")
+    fitted = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    history = [("", fitted), ("cable_gain", fitted), ("creep", fitted)]
+    search = Search(fitted, history, fitted, fitted, noise, 100.0, [], [], [], None)
+    _, (record_of_mesh, *_) = need_quadratic(replace(data, declared=linear), search, ["discretisation"])
+    assert record_of_mesh.step == 3  # the first effect was tried on model 1, the second on model 2

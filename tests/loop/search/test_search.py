@@ -11,8 +11,12 @@ from arm import arm, record, sweeps
 from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.fitted_model import fit_model, mean_square, with_nuisance
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.search import nothing_explains
-from femsense.loop.search.search_state import SearchProgress
+from femsense.loop.search.search_state import Search, SearchProgress
+from femsense.loop.thresholds import DEFAULTS
+from femsense.loop.verdict.confounding import confounded
+from femsense.loop.verdict.summary import tried_effects
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +52,19 @@ def test_what_is_left_at_the_size_of_what_repeats_is_not_asked_again(off):
 def test_weights_that_hold_the_error_are_not_asked_for_twice(off):
     data, fitted = off
     assert not nothing_explains(replace(course(data, fitted, Noise({"white": 1e-4}, "")), holds_error=True))
+
+
+def test_evidence_by_weights_that_were_given_up_is_compared_with_none_by_those_of_now(off):
+    data, fitted = off
+    weights = Noise({"white": 1e-4}, "", assumed=1e-4)
+    asked = course(data, fitted, weights)
+    asked.refits = [RefitRecord("payload", {}, NAMED, step=1, dbic=300.0), RefitRecord("density", {}, PASSES, step=1, dbic=240.0)]
+    asked.begin_again(data, weights)
+    asked.refits += [
+        RefitRecord("payload", {}, NAMED, step=1, dbic=90.0),
+        RefitRecord("density", {}, "too little", step=1, dbic=5.0),
+    ]
+    search = Search(fitted, asked.history, fitted, fitted, weights, 100.0, [], [], asked.refits, None, asked.outweighed)
+    assert not confounded(search, ["payload"], DEFAULTS)  # by the weights of now, 85 lie between the two
+    every = tried_effects([], [], [*search.outweighed, *search.refits], DEFAULTS)
+    assert {c.name: (c.verdict, len(c.refits)) for c in every} == {"payload": (NAMED, 2), "density": ("too little", 2)}
