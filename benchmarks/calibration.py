@@ -1,7 +1,7 @@
 """Calibration from anything, against its truth: markers with and without names, clouds alone, one and two cameras,
 wrong labels, a real tentacle.
 
-    python benchmarks/calibration.py [PART …] [--seeds N]
+    python benchmarks/calibration.py [PART …] [--seeds N] [--first SEED]
 
 Parts: bound, nowhere, clouds, labels, single, tentacle, rate; all where none is named.
 Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/calibration.md.
@@ -43,7 +43,7 @@ from femsense.model.observation import Hypothesis, evaluate_scene, make_scene  #
 from femsense.model.recording import with_marker_table  # noqa: E402
 from femsense.pointcloud.rays import Surface  # noqa: E402
 from femsense.pointcloud.segmentation import color_mask  # noqa: E402
-from femsense.rig.camera import Shape, camera_of, cloud_of, look_at, render  # noqa: E402
+from femsense.rig.camera import Shape, camera_of, cloud_of, look, look_at, render  # noqa: E402
 from femsense.rig.scene import floor_shape  # noqa: E402
 from femsense.rig.script import NoiseTable, ViewTable  # noqa: E402
 
@@ -203,11 +203,15 @@ def block(size: tuple[float, ...], middle: tuple[float, ...], color: tuple[float
     return Shape(np.array(box.vertices) + middle, np.array(box.faces), np.array(color))
 
 
-def clouds(seeds: int) -> None:
+HIDDEN = 1 / 3
+"""Scenes in which more of what the camera would see of the body is hidden are counted by themselves."""
+
+
+def clouds(seeds: int, first: int = 0) -> None:
     print("\n## Clouds alone, from nowhere: two free frames, a table, a box and the holder in sight\n")
     print(
-        "| colour tells the robot | scenes | right | refused | wrong | turn, median, largest [°] | shift, median, "
-        "largest [mm] |\n|---|---|---|---|---|---|---|"
+        "| colour tells the robot | scenes | right | refused | of these, a third and more is hidden | wrong | "
+        "turn, median, largest [°] | shift, median, largest [mm] |\n|---|---|---|---|---|---|---|---|"
     )
     inputs = np.array([[2.0, 0, 0, 0], [0, 0, 2.0, 0]])
     recording, states = record(inputs)
@@ -216,12 +220,13 @@ def clouds(seeds: int) -> None:
     model = [Surface(solve_frame(driven, k).positions, body_surface(robot.body.mesh).triangles) for k in range(2)]
     for colored in (True, False):
         kinds, turns, shifts = Counter(), [], []
-        for seed in range(seeds):
-            T, views = _scene(true, states, model, seed, colored=colored)
+        for seed in range(first, first + seeds):
+            T, views, hidden = _scene(true, states, model, seed, colored=colored)
             try:
                 found = find_cloud_pose(views).T_robot_camera
-            except DataError:
-                kinds["refused"] += 1
+            except DataError as error:
+                print(f"  seed {seed}, {hidden:.0%} hidden: {str(error)[:60]}", flush=True)
+                kinds += Counter(refused=1, hidden=int(hidden > HIDDEN))
                 continue
             turn, shift = difference(found, T, model[0])
             kinds["right" if turn < 0.2 and shift < 0.01 else "wrong"] += 1
@@ -229,8 +234,8 @@ def clouds(seeds: int) -> None:
         texts = [f"{np.median(v):.1f}, {np.max(v):.1f}" if v else "–" for v in (turns, shifts)]
         print(
             (
-                f"| {'yes' if colored else 'no'} | {seeds} | {kinds['right']} | {kinds['refused']} | {kinds['wrong']} | "
-                f"{' | '.join(texts)} |"
+                f"| {'yes' if colored else 'no'} | {seeds} | {kinds['right']} | {kinds['refused']} | {kinds['hidden']} | "
+                f"{kinds['wrong']} | {' | '.join(texts)} |"
             ),
             flush=True,
         )
@@ -238,7 +243,8 @@ def clouds(seeds: int) -> None:
 
 def _scene(
     true: Robot, states: list[FloatArray], model: list[Surface], seed: int, *, colored: bool
-) -> tuple[FloatArray, list[View]]:
+) -> tuple[FloatArray, list[View], float]:
+    """Return the true pose of a camera, what it sees in each frame, and which share of the body other things hide from it."""
     rng = np.random.default_rng(seed)
     side = rng.normal(size=3)
     side[2] = abs(side[2]) + 0.2
@@ -247,13 +253,15 @@ def _scene(
     camera = camera_of(ViewTable(eye_m=[0, 0, 1], target_m=[0, 0, 0]))
     things = [floor_shape(-0.06, np.array([0.7, 0.6, 0.5])), block((0.08, 0.06, 0.05), (0.12, 0.1, -0.035), (0.8, 0.2, 0.2))]
     things.append(block((0.04, 0.06, 0.06), (-0.021, 0.0, 0.0), (0.5, 0.5, 0.5)))
-    views = []
+    views, bare = [], []
     for state, surface in zip(states, model):
         body = Shape(state, surface_triangles(true.body.mesh), BLUE)
         cloud = cloud_of(render(camera, T, [body, *things], noise=NoiseTable(), rng=rng), camera)
         mine = color_mask(cloud.colors, BLUE) if colored else np.ones(len(cloud.points), dtype=bool)
         views.append(View(cloud.points, mine, surface, colored))
-    return T, views
+        pixels = [int((look(camera, T, shapes).shape == 0).sum()) for shapes in ([body, *things], [body])]
+        bare.append(pixels[0] / max(pixels[1], 1))
+    return T, views, 1.0 - float(np.mean(bare))
 
 
 # Labels
@@ -464,12 +472,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", nargs="*", choices=[[], *PARTS], help="what to measure; all where nothing is named")
     parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--first", type=int, default=0, help="the first seed of `clouds`")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for part in options.part or list(PARTS):
             began = time.process_time()
-            PARTS[part](options.seeds)
+            PARTS[part](options.seeds, *([options.first] if part == "clouds" else []))
             print(f"\n({part}: {time.process_time() - began:.0f} s of processor time)")
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from femsense.calib.distance_map import DistanceMap, follow
 from femsense.calib.scan import REACH
 from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
@@ -33,17 +33,16 @@ SEEDS = 150
 """Places of the grid at most."""
 SAMPLES = 80
 """Points of the visible side by which a pose is judged."""
-FOLLOWED, FOLLOW_STEPS = 4000, 8
-"""Poses of the grid that follow closest points on the map of distances, and their steps: a right one is up to 10° off, which costs
-a slender body as much as a wrong one. Without this, 7 of 20 colourless scenes of benchmarks/calibration.py lost the right pose here."""
 CLOSER = 300
-"""Poses that closest points refine further."""
+"""Poses that closest points refine."""
 FINAL = 16
 """Poses that are refined with finer points."""
 FINE, FINE_STEPS = 1200, 25
 """Samples and steps of that."""
 RAYS = 10000
 """Rays of a view that judge at most."""
+MOST_CELLS = 4e6
+"""Cells of the map of distances: 16 MB; a wider scene gets larger ones."""
 UNKNOWN = 0.5
 """What a part of the visible side counts that something hides: between measured, 0, and not measured, 1."""
 LEAST = 0.25
@@ -188,37 +187,50 @@ def _rotations() -> FloatArray:
 
 def _on_the_grid(scene: FloatArray, samples: Samples, size: float) -> list[FloatArray]:
     """Return T_camera_robot of the best poses of the grid, each (4, 4)."""
-    near = DistanceMap(scene, 0.02 * size, CAP * size)
+    near = _DistanceMap(scene, 0.02 * size, CAP * size)
     seeds = scene[_spread(scene, 0.15 * size)]
-    scored: list[tuple[float, FloatArray, IntArray]] = []
+    scored: list[tuple[float, FloatArray]] = []
     for R in _rotations():
         turned, facing = samples.places @ R.T, samples.normals @ R.T
         bare = samples.seen[int(np.argmax(samples.eyes @ R.T @ -seeds.mean(axis=0)))]
         looking = bare & (np.einsum("pc,c->p", facing, seeds.mean(axis=0)) < -0.2 * np.linalg.norm(seeds.mean(axis=0)))
-        side = np.flatnonzero(looking)[:SAMPLES]
+        side = turned[looking][:SAMPLES]
         if len(side) < 10:
             continue
-        side = np.resize(side, SAMPLES)
-        middle = turned[side].mean(axis=0)
-        middle = turned[side[np.argmin(((turned[side] - middle) ** 2).sum(axis=1))]]  # a visible point comes to lie on a seed
+        middle = side[np.argmin(((side - side.mean(axis=0)) ** 2).sum(axis=1))]  # a visible point comes to lie on a seed
         shifts = seeds - middle
-        score = near(turned[side][None] + shifts[:, None]).mean(axis=1)
+        score = near(side[None] + shifts[:, None]).mean(axis=1)
         for j in np.argsort(score)[:6]:
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = R, shifts[j]
-            scored.append((float(score[j]), T, side))
-    scored = sorted(scored, key=lambda s: s[0])[:FOLLOWED]
-    if not scored:
-        return []
-    places = samples.places[np.array([side for _, _, side in scored])]
-    poses, left = follow(near, places, np.array([T for _, T, _ in scored]), steps=FOLLOW_STEPS)
-    return list(poses[np.argsort(left)[:CLOSER]])
+            scored.append((float(score[j]), T))
+    return [T for _, T in sorted(scored, key=lambda s: s[0])[:CLOSER]]
 
 
 def _spread(points: FloatArray, spacing: float) -> IntArray:
     """Return one point of each cube of an edge [m], SEEDS of them at most."""
     _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
     return first if len(first) <= SEEDS else np.random.default_rng(0).choice(first, SEEDS, replace=False)
+
+
+class _DistanceMap:
+    """Distances to the nearest measured point on a grid, cut off."""
+
+    def __init__(self, points: FloatArray, cell: float, cap: float) -> None:
+        self.low = points.min(axis=0) - cap
+        volume = float(np.prod(points.max(axis=0) + cap - self.low))
+        self.cell, self.cap = (cell := max(cell, (volume / MOST_CELLS) ** (1 / 3))), cap
+        shape = np.ceil((points.max(axis=0) + cap - self.low) / cell).astype(int) + 1
+        empty = np.ones(shape, dtype=bool)
+        empty[tuple(((points - self.low) / cell).astype(int).T)] = False
+        self.map = np.minimum(distance_transform_edt(empty) * cell, cap).astype(np.float32)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Return distances [m], shape (…,), of points (…, 3)."""
+        at = np.floor((points - self.low) / self.cell).astype(np.int64)
+        inside = ((at >= 0) & (at < self.map.shape)).all(axis=-1)
+        at = np.where(inside[..., None], at, 0)
+        return np.asarray(np.where(inside, self.map[at[..., 0], at[..., 1], at[..., 2]], self.cap))
 
 
 def _closest_points(scene: FloatArray, samples: Samples, starts: Sequence[FloatArray], size: float) -> list[FloatArray]:
