@@ -5,19 +5,22 @@ with paired differences to all of them.
     python benchmarks/ablation.py table                           # the table of what is there
     python benchmarks/ablation.py run --only swap,apart --cases 200
 
-A switch is a value of `Thresholds` or `Effort`. Rules of the verdict alone share one search.
+A switch is a value of `Thresholds` or `Effort`, or of a constant of a module of the loop. Rules of the verdict alone share one search.
 One line of the file is one case under one switch.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import multiprocessing
 import os
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -43,10 +46,29 @@ class Switch:
     name: str
     thresholds: dict[str, float] = field(default_factory=dict)
     effort: dict[str, int] = field(default_factory=dict)
+    constants: dict[str, Any] = field(default_factory=dict)
+    """"module.NAME" of femsense.loop → its value."""
 
     def options(self) -> ImproveOptions:
         """Return what the loop is asked with."""
         return ImproveOptions(thresholds=Thresholds(**self.thresholds), effort=Effort(**self.effort))  # type: ignore[arg-type]
+
+    @contextmanager
+    def in_force(self) -> Iterator[None]:
+        """Give its constants their values, in all modules of the loop that have them."""
+        was = list[tuple[Any, str, Any]]()
+        for path, value in self.constants.items():
+            home, name = path.rsplit(".", 1)
+            known = getattr(importlib.import_module(f"femsense.loop.{home}"), name)
+            holders = [m for key, m in sys.modules.items() if key.startswith("femsense.loop") and vars(m).get(name) is known]
+            was += [(module, name, known) for module in holders]
+            for module in holders:
+                setattr(module, name, value)
+        try:
+            yield
+        finally:
+            for module, name, known in was:
+                setattr(module, name, known)
 
 
 BASE = Switch("all rules")
@@ -61,6 +83,22 @@ SEARCH = (
     Switch("mesh_turns", {"mesh_turns": 0.0}),
     Switch("mesh_varies", {"mesh_varies": 0.0, "mesh_varies_held": 0.0}),
     Switch("mesh error", {"mesh_share": 1e-6, "mesh_varies": 0.0, "mesh_varies_held": 0.0, "mesh_turns": 0.0}),
+    Switch("evidence", {"evidence": 5.0}),
+    Switch("testable", {"testable": 0.0}),
+    Switch("hinted", {"hinted": INF}),
+    Switch("mesh_share", {"mesh_share": 1e-6}),
+    Switch("mesh_varies_held", {"mesh_varies_held": 0.25}),
+    Switch("outliers", {"outlying": INF}),
+    Switch("states", {"states": 0}),
+    Switch("effects", {}, {"effects": 6}),
+    Switch("refits", {}, {"refits": 12}),
+    Switch("alternatives", {}, {"alternatives": 0}),
+    Switch("sizes", {}, {"work": 10**9}, {"data.dataset.MAX_ROWS": 10**6, "fit.discretisation_error.MOST_WORK": 10**9}),
+    Switch("rows for the noise", {}, {}, {"fit.noise_components.MAX_REML_ROWS": 1000}),
+    Switch("noise near the last", {}, {}, {"fit.noise_components.NEAR_STD": 10.0}),
+    Switch("rough fits", {}, {}, {"fit.fitted_model.ROUGHLY": 8}),
+    Switch("declared pose", {}, {}, {"fit.joint_fit.BESIDE_MARKERS": np.array([0.1] * 3 + [0.01] * 3)}),
+    Switch("two sweeps disagree", {}, {}, {"fit.cross_validation.LEAST_SWEEPS": 2}),
 )
 """Rules of the search, each with a search of its own."""
 VERDICT = (
@@ -71,6 +109,8 @@ VERDICT = (
     Switch("noisy", {"noisy": 1.0}),
     Switch("alike", {"alike": INF}),
     Switch("significant", {"significant": 2.0}),
+    Switch("structure", {"structure": 0.0}),
+    Switch("not_worse", {"not_worse": INF}),
 )
 """Rules of the verdict, on what one search found."""
 
@@ -102,7 +142,8 @@ def run_job(job: Job) -> list[dict[str, Any]]:
     for switch in job.switches:
         began = time.process_time()
         try:
-            data, search = search_recordings(problem.declared, problem.recordings, options=switch.options())
+            with switch.in_force():
+                data, search = search_recordings(problem.declared, problem.recordings, options=switch.options())
         except FemsenseError as error:
             failed = [switch, *(job.concluded if switch is job.switches[0] else ())]
             records += [{**about, "switch": s.name, "failed": f"improve: {error}"} for s in failed]

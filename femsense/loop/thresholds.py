@@ -58,7 +58,8 @@ class Thresholds:
     structure: float = 0.01
     """Probability, over all tests together, of calling mere noise structure."""
     lacks: float = 2.0
-    """A model that is handed back may leave so many times the mean square that calibration of all nuisances leaves; inf: not asked."""
+    """A model that is handed back may leave so many times the mean square that calibration of all nuisances leaves, and one on quadratic elements so many
+    times that on the declared linear ones; inf: not asked."""
     resolved: float = 0.01
     """Share of the body's reach to which cameras and places are believed: noise that nothing tells is no more, and a place may lie so far outside."""
     not_worse: float = 1.02

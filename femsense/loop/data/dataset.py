@@ -15,6 +15,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.surface_rows import (
     SMOOTH,
+    SURFACE_POINTS,
     cloud_frames,
     diagonal_of,
     has_clouds,
@@ -35,8 +36,6 @@ from femsense.model.robot import Robot
 
 MAX_ROWS = 3000
 """Marker rows a recording at most, and rows of clouds; more are thinned out by whole frames."""
-ROWS_A_CLOUD = 60
-"""Points of the surface that a camera sees in one frame, about."""
 FEWEST_CLOUDS = 4
 """Where there are markers, fewer frames with clouds than this are not looked at."""
 MESH = next(effect for effect in EFFECTS if effect.remeshes)
@@ -165,7 +164,7 @@ def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]
     if not len(marked) and not len(cloudy):
         raise DataError(_nothing(recording, measured))
     rows = int(np.isin(recording.marker_frame, marked).sum())
-    return marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))], _evenly(recording, cloudy, MAX_ROWS // ROWS_A_CLOUD)
+    return marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))], _evenly(recording, cloudy, 2 * MAX_ROWS // SURFACE_POINTS)
 
 
 def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:

@@ -27,10 +27,6 @@ from femsense.loop.search.search_state import Search, no_equilibrium
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
-PLAINLY = 0.5
-"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated: a tenth in the arms of
-`benchmarks/distinct_states.py --elements`, which were computed on the declared elements."""
-
 
 def seeks_with_quadratic(robot: Robot, names: Sequence[str]) -> bool:
     """Return whether effects are sought with quadratic elements where a robot declares linear ones."""
@@ -43,8 +39,9 @@ def with_quadratic(robot: Robot) -> Robot:
 
 
 def linear_suffice(data: Data) -> RefitRecord | None:
-    """Return what became of quadratic elements where linear ones leave plainly less in some of the states, both calibrated; None where they do not, and of
-    clouds, whose rows depend on the mesh.
+    """Return what became of quadratic elements where these leave so many times the mean square of linear ones that they lack much (`lacks`), both calibrated
+    in some of the states; None where they do not, and of clouds, whose rows depend on the mesh. In the arms of `benchmarks/distinct_states.py --elements`,
+    which were computed on linear ones, it is ten times.
 
     Arguments:
         data: on the declared mesh.
@@ -56,7 +53,7 @@ def linear_suffice(data: Data) -> RefitRecord | None:
     except FemsenseError:
         return None
     left = f"in some of the states they leave {1e3 * quadratic:.2f} mm, linear ones {1e3 * linear:.2f} mm, both calibrated"
-    return RefitRecord(MESH.name, QUADRATIC, left, step=1) if linear**2 < PLAINLY * quadratic**2 else None
+    return RefitRecord(MESH.name, QUADRATIC, left, step=1) if quadratic**2 > data.thresholds.lacks * linear**2 else None
 
 
 def both_calibrated(data: Data) -> tuple[float, float]:
