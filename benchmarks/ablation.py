@@ -34,9 +34,22 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.improve import ImproveOptions, search_recordings
 from femsense.loop.result.tables import table_of
 from femsense.loop.thresholds import Effort, Thresholds
+from femsense.loop.verdict.returned_model import HeldOutComparison
 from femsense.loop.verdict.verdict import conclude
 
 INF = float("inf")
+
+
+class OneCriterion(HeldOutComparison):
+    """No worse in millimetres, or better by the noise and no worse beyond the mesh."""
+
+    def holds(self, decides: Thresholds) -> bool:
+        least = decides.evidence if self.only_calibrated else 0.0
+        return self.error <= decides.not_worse or (self.gain > least and self.beyond_mesh <= decides.not_worse)
+
+
+def nothing(*given: Any) -> None:
+    """A rule that finds nothing."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +60,7 @@ class Switch:
     thresholds: dict[str, float] = field(default_factory=dict)
     effort: dict[str, int] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
-    """"module.NAME" of femsense.loop → its value."""
+    """"module.NAME" of femsense.loop → its value, or what is in a rule's place."""
 
     def options(self) -> ImproveOptions:
         """Return what the loop is asked with."""
@@ -99,6 +112,7 @@ SEARCH = (
     Switch("rough fits", {}, {}, {"fit.fitted_model.ROUGHLY": 8}),
     Switch("declared pose", {}, {}, {"fit.joint_fit.BESIDE_MARKERS": np.array([0.1] * 3 + [0.01] * 3)}),
     Switch("two sweeps disagree", {}, {}, {"fit.cross_validation.LEAST_SWEEPS": 2}),
+    Switch("needless", {}, {}, {"search.swaps._if_needless": nothing}),
 )
 """Rules of the search, each with a search of its own."""
 VERDICT = (
@@ -111,6 +125,7 @@ VERDICT = (
     Switch("significant", {"significant": 2.0}),
     Switch("structure", {"structure": 0.0}),
     Switch("not_worse", {"not_worse": INF}),
+    Switch("held-out exceptions", {}, {}, {"verdict.returned_model.HeldOutComparison": OneCriterion}),
 )
 """Rules of the verdict, on what one search found."""
 
@@ -159,7 +174,8 @@ def run_job(job: Job) -> list[dict[str, Any]]:
 def _concluded(about: dict[str, Any], switch: Switch, ask: Callable[[], Any], spent: float) -> dict[str, Any]:
     began = time.process_time()
     try:
-        loop = ask()
+        with switch.in_force():
+            loop = ask()
     except FemsenseError as error:
         return {**about, "switch": switch.name, "failed": f"conclude: {error}"}
     return {
