@@ -66,6 +66,7 @@ class LiveStream:
     closers: list[Callable[[], None]] = field(default_factory=list)
     watched: list[Watched] = field(default_factory=list)
     """Connections to elsewhere, and where readings come from."""
+    sources: list[Readings] = field(default_factory=list)
     brokers: dict[str, MqttSink] = field(default_factory=dict)
     """Elsewhere, that it is sent to, by address."""
     begun: float = field(default_factory=time.monotonic)
@@ -86,7 +87,8 @@ class LiveStream:
         poses = {publisher.twin.name: publisher.sent for publisher in self.publishers}
         clients = None if self.broker is None else self.broker.clients
         brokers = {where: sink.was_connected for where, sink in self.brokers.items()}
-        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers)
+        passed = sum(readings.passed for readings in self.sources)
+        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
@@ -163,8 +165,8 @@ def stream_sensors(
     live = _serve(options, twin.name, stop)
     shown = without_password(source)
     say_of_file(readings, source, say)
-    live.watched.append(readings_from(shown, lambda: readings.trouble))
-    _play(live, twin, frames_of_sensors(readings, model), options, readings=f"readings of {shown}")
+    publisher = _play(live, twin, frames_of_sensors(readings, model), options, readings=f"readings of {shown}")
+    _watch(live, readings, shown, lambda: readings.trouble or publisher.trouble)
     return live
 
 
@@ -217,7 +219,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
         )
     readings, shown = readings_of(source, model.channels, live.stop), without_password(source)
     say_of_file(readings, source, say)
-    live.watched.append(readings_from(shown, lambda: readings.trouble))
+    _watch(live, readings, shown, lambda: readings.trouble)
 
     def run() -> None:
         for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
@@ -307,7 +309,13 @@ def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> Liv
     return live
 
 
-def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, readings: str = "") -> None:
+def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:
+    """Have it said where readings are missing, and what was passed over among them."""
+    live.sources.append(readings)
+    live.watched.append(readings_from(shown, why, lambda: readings.refused))
+
+
+def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, readings: str = "") -> Publisher:
     """Send frames from a thread of their own; those of `readings` at once as they come, others at their own times."""
     publishing = PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror, waits_for=readings or FIRST_POSE)
     publisher = Publisher(live.hub, twin, publishing)
@@ -332,3 +340,4 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread.start()
     if readings:
         Thread(target=watch, daemon=True, name=f"femsense-watch-{twin.name}").start()
+    return publisher

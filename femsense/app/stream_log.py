@@ -15,6 +15,8 @@ class Watched:
     until: str
     why: Callable[[], str]
     """Why it is missing; empty where it is there."""
+    beside: Callable[[], str] = lambda: ""
+    """What is to be said once although it is there; empty: nothing."""
 
     @property
     def trouble(self) -> str:
@@ -28,9 +30,13 @@ def connection(where: str, why: Callable[[], str]) -> Watched:
     return Watched(f"no connection to {where}", f"connected to {where}", "trying again", why)
 
 
-def readings_from(source: str, why: Callable[[], str]) -> Watched:
-    """Return what watches a source of readings."""
-    return Watched(f"no readings of {source}", f"readings of {source} come", "waiting", why)
+def readings_from(source: str, why: Callable[[], str], refused: Callable[[], str] = lambda: "") -> Watched:
+    """Return what watches a source of readings; `refused` says what was passed over."""
+
+    def beside() -> str:
+        return f"some of {source} is passed over: {said}" if (said := refused()) else ""
+
+    return Watched(f"no readings of {source}", f"readings of {source} come", "waiting", why, beside)
 
 
 class StreamLog:
@@ -40,6 +46,7 @@ class StreamLog:
         """Watch; as long as nothing was missing, nothing is said."""
         self._watched = watched
         self._known: dict[Watched, str] = {}
+        self._said: set[Watched] = set()
 
     def news(self) -> list[str]:
         """Return what has changed since the last call."""
@@ -49,6 +56,9 @@ class StreamLog:
             if trouble != self._known.get(one, ""):
                 told.append(trouble or one.back)
             self._known[one] = trouble
+            if one not in self._said and not trouble and (beside := one.beside()):
+                told.append(beside)
+                self._said.add(one)
         return told
 
 
@@ -65,6 +75,8 @@ class Streamed:
     """Of the embedded broker; None: there was none."""
     brokers: Mapping[str, bool] = field(default_factory=dict)
     """Elsewhere, and whether it was ever connected."""
+    passed: int = 0
+    """Messages or lines that were no readings."""
 
     @property
     def text(self) -> str:
@@ -74,7 +86,8 @@ class Streamed:
         places += [] if self.clients is None else [_count(self.clients, "client of the broker", "clients of the broker")]
         places += [f"the broker {where}" for where, reached in self.brokers.items() if reached]
         silent = "".join(f"; the broker {where} was never reached" for where, reached in self.brokers.items() if not reached)
-        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}{silent}"
+        passed = f"; {_count(self.passed, 'line')} passed over: no readings" if self.passed else ""
+        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}{silent}{passed}"
 
 
 def _count(number: int, one: str, many: str = "") -> str:

@@ -22,6 +22,17 @@ def test_each_connection_and_source_is_said_for_itself_when_it_goes_and_when_it_
     assert log.news() == ["readings of a.csv come"]
 
 
+def test_what_is_passed_over_among_readings_is_said_once() -> None:
+    why, refused = [""], [""]
+    log = StreamLog([readings_from("a.csv", lambda: why[0], lambda: refused[0])])
+    assert log.news() == []
+    why[0], refused[0] = "no reading, first 'x'", "no reading, first 'x'"
+    assert log.news() == ["no readings of a.csv (no reading, first 'x'), waiting"]
+    why[0] = ""
+    assert log.news() == ["readings of a.csv come", "some of a.csv is passed over: no reading, first 'x'"]
+    assert log.news() == []
+
+
 @pytest.mark.parametrize(
     ("streamed", "text"),
     [
@@ -33,6 +44,10 @@ def test_each_connection_and_source_is_said_for_itself_when_it_goes_and_when_it_
         (
             Streamed({"a": 3}, 1.0, 0, None, {"box:1": False}),
             "streamed 3 poses of a in 1.0 s, to no viewers; the broker box:1 was never reached",
+        ),
+        (
+            Streamed({"a": 2}, 1.0, 0, passed=3),
+            "streamed 2 poses of a in 1.0 s, to no viewers; 3 lines passed over: no readings",
         ),
         (Streamed({"a": 0}, 3.0, 2, 0), "streamed no poses of a in 3.0 s, to 2 viewers and no clients of the broker"),
     ],

@@ -75,13 +75,30 @@ class Domain:
     curves: tuple[Curve, ...] = ()
     """Of the normalised readings, for channels that depend on the others by a curve."""
 
-    def check(self, row: FloatArray, channels: tuple[str, ...]) -> tuple[Outside, ...]:
-        """Return the channels of a row, shape (c,), that are outside, the farthest first."""
-        missing = [Outside(name, "missing", float(x), 0.0, 0.0, np.inf) for name, x in zip(channels, row) if not np.isfinite(x)]
+    def check(self, row: FloatArray, channels: tuple[str, ...], needed: BoolArray | None = None) -> tuple[Outside, ...]:
+        """Return the channels of a row, shape (c,), that are outside, the farthest first.
+
+        Of channels that are not `needed`, shape (c,), and have no finite number nothing is said; the others are judged without them.
+        """
+        lost = ~np.isfinite(row) & (True if needed is None else needed)
+        missing = [Outside(channels[i], "missing", float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost)]
         if missing:
             return tuple(missing)
         found = self._range(row, channels) or self._joint(row, channels)
         return tuple(sorted(found, key=lambda item: -item.far))
+
+    def filled(self, row: FloatArray) -> FloatArray:
+        """Return a row, shape (c,), with what the other channels expect by a straight line where it has no finite number.
+
+        z_m = −P_mm⁻¹ P_mk z_k: with it the deviations of the others are those of a regression without the missing ones.
+        """
+        m = ~np.isfinite(row)
+        if not m.any():
+            return row
+        z = np.where(m, 0.0, self._normalised(row))
+        P = self.precision
+        z[m] = -np.linalg.solve(P[np.ix_(m, m)], P[np.ix_(m, ~m)] @ z[~m])
+        return np.asarray(np.where(m, self.centre + z / self.scale, row))
 
     def inside(self, rows: FloatArray) -> BoolArray:
         """Return which rows, shape (n, c), are inside, shape (n,)."""
@@ -122,10 +139,12 @@ class Domain:
 
     def _joint(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
         """Return the channels that are off their line or their curve; of both, the farther."""
-        z = self._normalised(row[None])
+        known = np.isfinite(row)
+        z = self._normalised(self.filled(row)[None])
         std = 1.0 / np.sqrt(np.diag(self.precision))
-        lines = zip(range(len(row)), self._deviation(z)[0] * std, JOINT_MARGIN * self.limit * std)
-        curves = [(curve.channel, float(curve.deviation(z)[0]), curve.half) for curve in self.curves]
+        lines = zip(range(len(row)), np.where(known, self._deviation(z)[0], 0.0) * std, JOINT_MARGIN * self.limit * std)
+        told = [curve for curve in self.curves if known[curve.channel] and known[curve.network.uses].all()]
+        curves = [(curve.channel, float(curve.deviation(z)[0]), curve.half) for curve in told]
         found: dict[int, Outside] = {}
         for i, off, half in (*lines, *curves):
             far = 0.5 * (abs(off) / half - 1.0)

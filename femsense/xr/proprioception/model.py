@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, as_numbers
+from femsense.core.arrays import BoolArray, FloatArray, as_numbers
 from femsense.core.errors import InputError
 from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
 from femsense.xr.proprioception.domain import Domain, Outside
@@ -50,8 +50,8 @@ class ProprioceptiveModel:
         """Return the markers [m], shape (m, 3) for one row of readings, shape (c,), or (n, m, 3) for several, shape (n, c).
 
         Arguments:
-            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before. Where one is no finite
-                number, the markers are nan.
+            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before. Where one that is needed
+                is no finite number, the markers are nan.
             time_s: when several rows were read [s], shape (n,); needed where the model has a memory.
 
         Raises:
@@ -67,7 +67,7 @@ class ProprioceptiveModel:
         Raises InputError as `markers`, where a reading is no finite number, and where there is no chain.
         """
         x, _ = self._rows(row)
-        if not np.isfinite(x).all():
+        if not np.isfinite(x[0, self.needed]).all():
             unread = ", ".join(item.channel for item in self.check(x[0]))
             raise InputError(
                 "no bones without all readings", where="row", found=unread, expected="a finite number for each channel"
@@ -83,7 +83,13 @@ class ProprioceptiveModel:
     def check(self, row: npt.ArrayLike) -> tuple[Outside, ...]:
         """Return the channels of a row, shape (c,), that read what was never learnt, the farthest first;
         empty where all is well."""
-        return self.domain.check(self._rows(row)[0][0], self.channels)
+        return self.domain.check(self._rows(row)[0][0], self.channels, self.needed)
+
+    @property
+    def needed(self) -> BoolArray:
+        """The channels without which there are no markers or bones, shape (c,); others never changed, or made things worse."""
+        uses = self.network.uses if self.bones is None else self.network.uses | self.bones.uses
+        return np.asarray(uses.reshape(-1, len(self.channels)).any(axis=0))
 
     @property
     def bone_names(self) -> tuple[str, ...]:
@@ -115,6 +121,7 @@ class ProprioceptiveModel:
         return np.atleast_2d(np.where(np.isfinite(x), x, np.nan)), x.ndim == 1
 
     def _inputs(self, x: FloatArray, steady: bool, time_s: npt.ArrayLike | None) -> FloatArray:
+        x = np.where(self.needed | np.isfinite(x), x, self.domain.centre)
         if steady or not self.memory_s:
             return np.tile(x, (1, 1 + len(self.memory_s)))
         if time_s is None:
@@ -139,17 +146,19 @@ class LiveModel:
 
     def __init__(self, model: ProprioceptiveModel) -> None:
         self.model = model
+        self._needed = model.needed
         self._memory: FloatArray | None = None
         self._time_s = 0.0
 
     def step(self, row: npt.ArrayLike, time_s: float) -> LivePose:
         """Return markers and bones of a row, shape (c,), read at `time_s` [s].
 
-        Where a reading is no finite number, the pose is nan and `outside` says which: keep showing the last good one.
+        Where a reading that is needed is no finite number, the pose is nan and `outside` says which: keep showing the last good one.
         """
         model = self.model
         x = model._rows(row)[0][0]
-        outside = model.domain.check(x, model.channels)
+        outside = model.domain.check(x, model.channels, self._needed)
+        x = np.where(self._needed, x, model.domain.filled(x))
         if not np.isfinite(x).all():
             return LivePose(np.full((len(model.marker_names), 3), np.nan), None, outside)
         taus = np.asarray(model.memory_s)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 
 KINDS = ("linear", "sigmoid", "relu", "radial")
 
@@ -51,6 +51,12 @@ class Network:
             return np.asarray(np.exp(-0.5 * squared_distances(z, self.B)))
         a = z @ self.B.T + self.b
         return np.maximum(a, 0.0) if self.kind == "relu" else sigmoid(a)
+
+    @property
+    def uses(self) -> BoolArray:
+        """Which inputs what comes out depends on, shape (d,): those that never changed have no scale, those left out no weight."""
+        hidden = np.ones(len(self.scale), dtype=bool) if self.kind == "radial" else (self.B != 0).any(axis=0)
+        return np.asarray((self.scale != 0) & ((self.C != 0).any(axis=0) | (hidden & bool(self.A.any()))))
 
     def followed_by(self, M: FloatArray, shift: FloatArray) -> Network:
         """Return the network whose outputs are M y + shift, M of shape (o, o)."""

@@ -133,7 +133,7 @@ class DragServer:
         self._handle = ""
         self._settled_since: float | None = None
         self._fresh, self._stop, self._lock = Event(), Event(), Lock()
-        self._seq = 0
+        self._seq = self._commands = 0
         hub.listen(self._hear)
         self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
         for thread in self._threads:
@@ -294,11 +294,12 @@ class DragServer:
     def _command(self, inputs: Mapping[str, float], *, armed: bool) -> None:
         units = {one.name: one.unit for one in self.gate.inputs}
         document = {
-            "header": header(self._seq, time.time(), "robot"),
+            "header": header(self._commands, time.time(), "robot"),
             "armed": armed,
             "expires_s": self.options.gate.hold_s,
             "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in inputs.items()],
         }
+        self._commands += 1
         self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
 
     def _current(self, now: float) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -27,6 +28,8 @@ class GrowingFile:
         self._columns: list[str] = []
         self.away = ""
         """Why there are no rows, as far as the file itself is the reason."""
+        self.age_s = 0.0
+        """How long ago the row that was yielded last was written at least [s]: of what stood there already the file's own time says it."""
         if file.is_dir() or not file.absolute().parent.is_dir():
             raise InputError(
                 "no such source",
@@ -54,6 +57,7 @@ class GrowingFile:
             for line in lines:
                 yield dict(zip(self._columns, next(csv.reader([line]), [])))
             if not lines:
+                self.age_s = 0.0  # what comes from now on is written while we watch
                 stop.wait(POLL_S)
                 if self._began_anew():
                     self._close()
@@ -74,6 +78,7 @@ class GrowingFile:
             self.away = f"channels are missing: {', '.join(self._missing)}" if self._columns else "it is empty yet"
             return False
         self._stream, self.away = stream, ""
+        self.age_s = max(0.0, time.time() - os.fstat(stream.fileno()).st_mtime)
         return True
 
     @property

@@ -158,6 +158,8 @@ class TwinFrame:
     """Measured points and their distance from the surface [m], shape (n, 4)."""
     field: npt.NDArray[np.uint8] | None = None
     """Of the twin's field, share of the largest value at each vertex of the mesh, 0 … 255, shape (v,)."""
+    read_at: float = float("nan")
+    """When that was read which its bones show [s, monotonic clock]; -inf: never; nan: just now."""
 
 
 def topic(robot: str, kind: str) -> str:
@@ -299,9 +301,9 @@ def in_unity(bones: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def status_bytes(state: str, detail: str = "", since_s: float = float("nan")) -> bytes:
-    """Return a status: "live", "stale" (no poses come), "ended" (by us) or "lost" (said by the broker in our place).
+    """Return a status: "live", "stale" (no new poses), "ended" (by us) or "lost" (said by the broker in our place).
 
-    `since_s`: when the last pose went out [s since 1970]; left out where none did.
+    `since_s`: when that was read which the last pose shows [s since 1970]; left out where nothing was.
     """
     return _json(_known({"state": state, "detail": detail, "since_s": since_s}))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import isnan
 from threading import Event, Lock
 
 from femsense.xr.stream.hub import Hub, Message
@@ -77,9 +78,14 @@ class Publisher:
         self.hub, self.twin = hub, twin
         self.options = options or PublishOptions()
         self.sent = 0
+        """How many poses went out."""
         self._has_cloud = False
         self._lock = Lock()
-        self._came, self._sent_at, self._state = time.monotonic(), float("nan"), "waiting"
+        self._seq = 0
+        self._came = self._shown = float("-inf")  # when what came last, and what was sent last, was read
+        self._since = float("nan")
+        self._blind = ""  # why the frame before had no pose
+        self._said = ("waiting", self.options.waits_for)
         self._pose_limit = RateLimit(self.options.rate_hz)
         self._cloud_limit, self._field_limit = RateLimit(self.options.cloud_rate_hz), RateLimit(self.options.cloud_rate_hz)
         self.announce(twin)
@@ -91,28 +97,48 @@ class Publisher:
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
         model = Message(topic(twin.name, MODEL), model_bytes(twin, url))
         with self._lock:
-            waits = self.options.waits_for if self._state == "waiting" else ""
-            self.hub.publish([Message(glb, twin.glb), model, self._status(self._state, waits)])
+            self.hub.publish([Message(glb, twin.glb), model, self._status(*self._said)])
 
     def publish(self, frame: TwinFrame, *, now: float | None = None) -> bool:
-        """Send a frame unless the rate forbids it; return whether it was sent."""
+        """Send a frame unless the rate forbids it; return whether it was sent.
+
+        A frame that shows what was read no later than that of the frame before has no pose: only what else is known goes out.
+        """
         moment = time.monotonic() if now is None else now
         with self._lock:
-            self._came = moment
+            read_at = moment if isnan(frame.read_at) else frame.read_at
+            self._came = max(self._came, read_at)
             if not self._pose_limit.allows(moment):
                 return False
-            self._sent_at = time.time()
-            again = [self._status("live")] if self._state in ("waiting", "stale") else []
-            self.hub.publish([*again, *self._messages(frame, moment)])
-            self.sent += 1
+            is_new = read_at > self._shown
+            self._blind = "" if is_new else frame.status
+            if is_new:
+                self._shown, self._since = read_at, time.time() - (moment - read_at)
+                self.sent += 1
+            self.hub.publish([*self._judged(moment), *self._messages(frame, moment, is_new=is_new)])
+            self._seq += 1
         return True
 
     def watch(self, *, now: float | None = None) -> None:
-        """Say that it is stale where no frame has come for `STALE_S`; the next frame says that it is live."""
+        """Say that it is stale where nothing was read for `STALE_S`; the next pose says that it is live."""
         moment = time.monotonic() if now is None else now
         with self._lock:
-            if self._state == "live" and moment - self._came > STALE_S:
-                self.hub.publish([self._status("stale")])
+            if told := self._judged(moment):
+                self.hub.publish(told)
+
+    @property
+    def trouble(self) -> str:
+        """Why no pose is made of what is read; empty where one is, or nothing is read."""
+        with self._lock:
+            return self._blind if self._said[0] in ("waiting", "stale") else ""
+
+    def _judged(self, moment: float) -> list[Message]:
+        """Return the status at a moment of our clock [s] where it is another one than before."""
+        if self._shown == float("-inf"):
+            told = ("waiting", self._blind or self.options.waits_for)
+        else:
+            told = ("stale", self._blind) if moment - self._came > STALE_S else ("live", "")
+        return [] if self._said[0] == "ended" or told == self._said else [self._status(*told)]
 
     def end(self, detail: str = "") -> None:
         """Say that nothing more comes."""
@@ -120,20 +146,18 @@ class Publisher:
             self.hub.publish([self._status("ended", detail)])
 
     def _status(self, state: str, detail: str = "") -> Message:
-        self._state = state
-        since = self._sent_at if state == "stale" else float("nan")
+        self._said = (state, detail)
+        since = self._since if state == "stale" else float("nan")
         return Message(topic(self.twin.name, STATUS), status_bytes(state, detail, since))
 
-    def _messages(self, frame: TwinFrame, moment: float) -> list[Message]:
-        """Return what is sent of a frame at a moment of our clock [s]."""
-        seq, name, t = self.sent, self.twin.name, frame.time_s
-        messages = [
-            Message(topic(name, POSE), pose_bytes(seq, t, frame.bones)),
-            Message(topic(name, FORCE), force_bytes(seq, frame, self.twin.frame)),
-        ]
+    def _messages(self, frame: TwinFrame, moment: float, *, is_new: bool) -> list[Message]:
+        """Return what is sent of a frame at a moment of our clock [s]; its pose only if it is new."""
+        seq, name, t = self._seq, self.twin.name, frame.time_s
+        messages = [Message(topic(name, POSE), pose_bytes(seq, t, frame.bones))] if is_new else []
+        messages.append(Message(topic(name, FORCE), force_bytes(seq, frame, self.twin.frame)))
         if frame.inputs:
             messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs, self.twin.frame)))
-        if self.options.json_mirror:
+        if self.options.json_mirror and is_new:
             messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
         if self._has_cloud and frame.cloud is None:
             messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, [])))  # what was seen before is not seen now

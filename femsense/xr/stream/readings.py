@@ -11,23 +11,19 @@ from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
 from femsense.xr.stream.growing_file import GrowingFile
 from femsense.xr.stream.mqtt import MqttSource, broker_address
+from femsense.xr.stream.serial_line import LONGEST_LINE, WAIT_S, SerialLine
 
-if TYPE_CHECKING:
-    from serial import Serial
-
-LONGEST_LINE = 65_536
 SHOWN = 60
 """Characters of a line that is no reading."""
-WAIT_S = 0.1
 QUIET_S = 3.0
 """After which readings have stopped, as it is said to people."""
 
@@ -38,21 +34,38 @@ Reading = tuple[float, FloatArray]
 class Readings(Iterator[Reading]):
     """Readings as they come, and what is the matter where none do."""
 
-    def __init__(self, items: Iterator[Any], read: Callable[[Any], Reading | None], away: Callable[[], str] = lambda: "") -> None:
-        """Read items; `away` says why the source is not there, or nothing."""
-        self._items, self._read, self._away = items, read, away
-        self._begun, self._came = time.monotonic(), float("nan")
-        self._passed: Any = None
+    def __init__(
+        self,
+        items: Iterator[Any],
+        read: Callable[[Any], Reading | None],
+        *,
+        away: Callable[[], str] = lambda: "",
+        age_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """Read items; `away` says why the source is not there, or nothing, and `age_s` how old the item before was when it came [s]."""
+        self._items, self._read, self._away, self._age_s = items, read, away, age_s
+        self._begun = time.monotonic()
+        self._first: Any = None
+        self.came = float("nan")
+        """When the newest reading was made, as far as its source says, else when it came [s, monotonic clock]; nan: none came."""
+        self.passed = 0
+        """How many items were no readings."""
 
     def __next__(self) -> Reading:
         for item in self._items:
             found = self._read(item)
             if found is not None:
-                self._came = time.monotonic()
+                now = time.monotonic()
+                self.came = now - self._age_s()
                 when, values = found
-                return (when if np.isfinite(when) else self._came - self._begun), values
-            self._passed = item if self._passed is None else self._passed
+                return (when if np.isfinite(when) else now - self._begun), values
+            self._pass_over(item)
         raise StopIteration
+
+    def _pass_over(self, item: Any) -> None:
+        if not _is_blank(item):
+            self.passed += 1
+            self._first = item if self._first is None else self._first
 
     @property
     def away(self) -> str:
@@ -64,11 +77,14 @@ class Readings(Iterator[Reading]):
         """Why no readings come; empty while they do and the source is there."""
         if why := self.away:
             return why
-        if np.isfinite(self._came):
-            return "they stopped" if time.monotonic() - self._came > QUIET_S else ""
-        if self._passed is None:
-            return "nothing has come yet"
-        return f"what comes is no reading of its channels, first {_shown(self._passed)}"
+        if np.isfinite(self.came):
+            return "they stopped" if time.monotonic() - self.came > QUIET_S else ""
+        return self.refused or "nothing has come yet"
+
+    @property
+    def refused(self) -> str:
+        """What was passed over, with the first of it; empty where all were readings."""
+        return f"what comes is no reading of its channels, first {_shown(self._first)}" if self.passed else ""
 
     def close(self) -> None:
         """Let go of the source."""
@@ -90,7 +106,8 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
         the readings. A time that a source does not say counts from when the source was opened.
 
     Raises:
-        InputError: no such source, one that cannot be opened, a CSV file without a channel.
+        InputError: no such source, an address that is taken, a CSV file without a channel. A file or a port that is not there
+            yet is waited for.
         MissingDependency: the package for it is not installed.
     """
     parts = urlsplit(source)
@@ -100,12 +117,12 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
     if parts.scheme in ("mqtt", "mqtts"):
         waiting: queue.Queue[bytes] = queue.Queue(1)
         broker = _topic(source, waiting)
-        return Readings(_newest(broker, waiting, stop), read, lambda: broker.trouble and f"no connection, {broker.trouble}")
+        return Readings(_newest(broker, waiting, stop), read, away=lambda: broker.trouble and f"no connection, {broker.trouble}")
     if parts.scheme == "serial":
-        line = _serial(source)
-        return Readings(_lines(line, stop), read, lambda: "" if line.is_open else "unplugged")
+        line = SerialLine(source)
+        return Readings(line.lines(stop), read, away=lambda: line.away)
     file = GrowingFile(Path(source), channels)
-    return Readings(file.rows(stop), lambda row: _of_object(row, channels), lambda: file.away)
+    return Readings(file.rows(stop), lambda row: _of_object(row, channels), away=lambda: file.away, age_s=lambda: file.age_s)
 
 
 def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
@@ -117,8 +134,9 @@ def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
         with suppress(ValueError, RecursionError):
             return _of_object(json.loads(text), channels)
         return None
-    values = [_number(part) for part in text.replace(";", ",").split(",")]
-    if not np.isfinite(values).any():
+    cells = [_cell(part) for part in text.replace(";", ",").split(",")]
+    values = [value for value in cells if value is not None]
+    if len(values) < len(cells) or not np.isfinite(values).any():
         return None
     if len(values) == len(channels) + 1:
         return (values[0], np.array(values[1:])) if np.isfinite(values[0]) else None
@@ -127,6 +145,8 @@ def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
 
 def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
     if not isinstance(told, dict) or not any(name in told for name in channels):
+        return None
+    if any(isinstance(told.get(name), list | dict | bool) for name in channels):
         return None
     when, values = _number(told.get("time_s")), np.array([_number(told.get(name)) for name in channels])
     if not np.isfinite(values).any():
@@ -147,6 +167,20 @@ def _number(value: Any) -> float:
     except (TypeError, ValueError, OverflowError):
         return float("nan")
     return number if np.isfinite(number) else float("nan")
+
+
+def _cell(text: str) -> float | None:
+    """Return what stands between commas: a number, nan where nothing does or none that is finite, None where it is something else."""
+    try:
+        value = float(text) if text.strip() else float("nan")
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else float("nan")
+
+
+def _is_blank(item: Any) -> bool:
+    """Return whether nothing stands in a line, or in a row of a file."""
+    return not (item.strip() if isinstance(item, bytes) else any(cell.strip() for cell in item.values()))
 
 
 # Sources
@@ -197,36 +231,3 @@ def _newest(source: MqttSource, waiting: queue.Queue[bytes], stop: Event) -> Ite
         while not stop.is_set():
             with suppress(queue.Empty):
                 yield waiting.get(timeout=WAIT_S)
-
-
-def _serial(source: str) -> Serial:
-    try:
-        import serial
-    except ImportError:
-        raise MissingDependency("a serial line needs the package pyserial\n  try:      pip install 'femsense[xr]'") from None
-    port, _, more = source.removeprefix("serial:").partition("?")
-    baud = parse_qs(more).get("baud", ["115200"])[0]
-    try:
-        line: Serial = serial.serial_for_url(port, baudrate=int(baud), timeout=WAIT_S)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            "the serial line cannot be opened", where=source, found=error, expected="serial:PORT?baud=115200"
-        ) from None
-    return line
-
-
-def _lines(line: Serial, stop: Event) -> Iterator[bytes]:
-    """Yield the lines of a serial port; one that was unplugged is opened again."""
-    held = b""
-    with closing(line):
-        while not stop.is_set():
-            try:
-                if not line.is_open:
-                    line.open()
-                held += line.read(max(1, min(line.in_waiting, LONGEST_LINE)))
-            except OSError:  # of the system, and of pyserial
-                held = b""
-                line.close()
-                stop.wait(WAIT_S)
-            *whole, held = held[-LONGEST_LINE:].split(b"\n")
-            yield from whole

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.skeleton import skeleton_at
 from femsense.xr.skinning import INFLUENCES, Skin
 from femsense.xr.stream.payloads import Input, Twin, TwinFrame, bone_rows
-from femsense.xr.stream.readings import Reading
+from femsense.xr.stream.publisher import STALE_S
+from femsense.xr.stream.readings import Readings
 
 AROUND, BETWEEN = 20, 6
 """Vertices around the tube, and rings between neighbouring bones."""
@@ -33,29 +35,34 @@ def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
     return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs, frame=model.frame)
 
 
-def frames_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[TwinFrame]:
-    """Yield a frame for each reading (see `readings_of`); where a reading is no number,
-    the last good pose is kept."""
+def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[TwinFrame]:
+    """Yield a frame for each row of readings (see `readings_of`).
+
+    Where a reading that the model needs is no number, the last good pose is kept, with the time at which that was read.
+    """
     live, straight = model.live(), np.linalg.inv(model.rest_bones.T_robot_bone)
     straight[:, :3, 3] = 0.0
     bones = bone_rows(skeleton_at(model.rest_bones.positions).T_robot_bone)
+    read_at = float("-inf")
     for time_s, row in readings:
         pose = live.step(row, time_s)
         if pose.bones is not None:
+            read_at = readings.came
             bones = bone_rows(pose.bones.T_robot_bone @ straight)  # bones that have the robot's axes at rest
         said = "; ".join(item.text for item in pose.outside[:2])
-        yield TwinFrame(time_s, bones, contacts=None, inputs=tuple(float(v) for v in row), status=said or "ok")
+        inputs = tuple(float(v) for v in row)
+        yield TwinFrame(time_s, bones, contacts=None, inputs=inputs, status=said or "ok", read_at=read_at)
 
 
-def markers_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray]]]:
+def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray]]]:
     """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading (see `readings_of`).
 
-    Readings outside of what the model was taught are left out: their markers are guesses.
+    Readings outside of what the model was taught are left out: their markers are guesses. So are those that are old when they come.
     """
     live = model.live()
     for time_s, row in readings:
         pose = live.step(row, time_s)
-        if not pose.outside:
+        if not pose.outside and time.monotonic() - readings.came <= STALE_S:
             yield time_s, dict(zip(model.marker_names, pose.markers))
 
 

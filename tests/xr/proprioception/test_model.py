@@ -69,6 +69,43 @@ def test_another_runtime_computes_the_same(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(bones, model.bones(inputs), atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("end_to_end", [False, True])
+def test_a_channel_that_no_map_takes_may_have_no_number(kind: str, end_to_end: bool, tmp_path: Path) -> None:
+    model = some_model(kind, memory=(0.5,), end_to_end=end_to_end)
+    green = np.tile([True, False, True], 2)
+    networks = [replace(n, scale=n.scale * green) if n is not None else None for n in (model.network, model.bones)]
+    without = replace(model, network=networks[0], bones=networks[1])
+    without = load_model(save_model(without, tmp_path / "m.onnx"))
+    row, lost = np.array([0.3, -0.2, 1.1]), np.array([0.3, np.nan, 1.1])
+    assert without.needed.tolist() == [True, False, True] and model.needed.all()
+    np.testing.assert_array_equal(without.markers(lost), without.markers(row))
+    np.testing.assert_array_equal(without.armature(lost).T_robot_bone, without.armature(row).T_robot_bone)
+    assert without.check(lost) == () and without.live().step(lost, 0.0).outside == ()
+    np.testing.assert_array_equal(without.live().step(lost, 0.0).markers, without.markers(row))
+    assert [item.channel for item in without.check([9.0, np.nan, 1.1])] == ["red"]
+    assert (
+        np.isnan(without.markers([np.nan, 0.0, 1.0])).all() and without.check([np.nan, np.nan, 1.0])[0].text == "red: no number"
+    )
+    half = replace(model, network=networks[0]) if end_to_end else model
+    assert half.needed.all()  # the other map takes it
+
+
+def test_others_are_judged_without_a_channel_that_has_no_number() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(2, 2000))
+    rows = np.stack([a, b, a + b + 0.01 * rng.normal(size=2000)], axis=1)
+    domain, needed = learn_domain(rows), np.array([True, False, True])
+    row = np.array([1.0, np.nan, 1.5])
+    both = (rows - domain.centre) * domain.scale
+    z = (domain.filled(row) - domain.centre) * domain.scale
+    kept = np.linalg.solve(np.cov(both[:, [0, 2]].T), z[[0, 2]])  # of those two alone
+    np.testing.assert_allclose((domain.precision @ z)[[0, 2]], kept, rtol=0.05)
+    assert abs((domain.precision @ z)[1]) < 1e-9
+    assert domain.check(row, CHANNELS, needed) == ()
+    assert domain.check(np.array([1.0, -1.5, 1.5]), CHANNELS, needed)[0].kind == "joint"
+
+
 def test_a_stream_gives_what_the_whole_series_gives() -> None:
     model = some_model("sigmoid", memory=(0.05, 2.0))
     rng = np.random.default_rng(2)

@@ -104,6 +104,45 @@ def test_a_source_that_stops_is_stale_until_it_goes_on() -> None:
     assert status()["state"] == "ended"
 
 
+def test_what_is_old_when_it_comes_is_stale_from_the_first_and_as_old_as_it_is() -> None:
+    hub, late = Hub(), Kept()
+    publisher = Publisher(hub, twin())
+    publisher.publish(dataclasses.replace(moment(0.0), read_at=900.0), now=1000.0)
+    hub.attach(late)
+    told = json.loads(hub.newest()["femsense/arm/status"].payload)
+    assert (told["state"], told["detail"]) == ("stale", "") and 99.0 < time.time() - told["since_s"] < 110.0
+    assert late.topics()[:4] == ["glb", "model", "status", "pose"]
+    publisher.publish(dataclasses.replace(moment(1.0), read_at=1001.0), now=1001.0)
+    assert json.loads(hub.newest()["femsense/arm/status"].payload)["state"] == "live"
+
+
+def test_frames_without_a_new_pose_do_not_keep_it_live_and_their_reason_is_said() -> None:
+    hub, late = Hub(), Kept()
+    publisher = Publisher(hub, twin())
+
+    def blind(at: float, read_at: float) -> None:
+        publisher.publish(dataclasses.replace(moment(at), read_at=read_at, status="red: no number"), now=at)
+
+    def status() -> tuple[str, str]:
+        told = json.loads(hub.newest()["femsense/arm/status"].payload)
+        return told["state"], told["detail"]
+
+    blind(9.0, float("-inf"))
+    assert status() == ("waiting", "red: no number") and "femsense/arm/pose" not in hub.newest()
+    publisher.publish(dataclasses.replace(moment(10.0), read_at=10.0), now=10.0)
+    assert status() == ("live", "") and publisher.trouble == ""
+    hub.attach(late)
+    late.batches.clear()
+    blind(10.3, 10.0)
+    blind(10.5, 10.0)
+    assert late.topics() == ["force", "inputs", "status", "force", "inputs"] and publisher.sent == 1
+    assert status() == ("stale", "red: no number") and publisher.trouble == "red: no number"
+    numbers = [json.loads(m.payload)["header"]["seq"] for batch in late.batches for m in batch if m.topic.endswith("/force")]
+    assert numbers == [2, 3]  # each document has its own
+    publisher.publish(dataclasses.replace(moment(11.0), read_at=11.0), now=11.0)
+    assert status() == ("live", "") and publisher.trouble == ""
+
+
 def test_a_field_goes_out_ten_times_a_second_at_most() -> None:
     hub, sink = Hub(), Kept()
     coloured = dataclasses.replace(twin(), field=FieldKind("stress", "Pa", largest=2500.0))

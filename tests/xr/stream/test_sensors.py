@@ -24,7 +24,7 @@ from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import linear_network
 from femsense.xr.skinning import skin_vertices
 from femsense.xr.stream.readings import Reading, read_line, readings_of
-from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
+from femsense.xr.stream.sensor_source import frames_of_sensors, markers_of_sensors, sensor_twin
 
 CHANNELS = ("bend", "sway")
 REST = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
@@ -72,6 +72,12 @@ def take(source: str, count: int, send: object) -> list[Reading]:
         (b'{"bend": "x", "sway": 2, "time_s": 2.5}', (2.5, [np.nan, 2])),
         (b'{"bend": 1e400, "sway": 2, "time_s": 2.5}', (2.5, [np.nan, 2])),
         (b"1;2", (None, [1, 2])),
+        (b"2.5,1,", (2.5, [1, np.nan])),
+        (b"nan,2", (None, [np.nan, 2])),
+        (b"2.5,1,x", None),
+        (b"[1, 2, 3, 4]", None),
+        (b'{"bend": [1, 2], "sway": 2}', None),
+        (b'{"bend": true, "sway": 2}', None),
         (b'{"bend": null, "sway": NaN}', None),
         (b"1e400,nan", None),
         (b"", None),
@@ -202,6 +208,48 @@ def test_a_serial_line_that_was_unplugged_comes_back(tmp_path: Path) -> None:
     stop.set()
 
 
+def test_a_serial_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    pytest.importorskip("serial")
+    pty = pytest.importorskip("pty")
+    port, stop = tmp_path / "port", Event()
+    readings, found = readings_of(f"serial:{port}", CHANNELS, stop), []
+    assert readings.away == readings.trouble == "there is no such port yet"
+    Thread(target=lambda: found.append(next(readings)), daemon=True).start()
+    time.sleep(0.2)
+    ours, theirs = pty.openpty()
+    port.symlink_to(os.ttyname(theirs))
+    assert within(5.0, lambda: readings.away == "")
+    os.write(ours, b"1,2\n")
+    assert within(5.0, lambda: bool(found)) and found[0][1].tolist() == [1, 2]
+    stop.set()
+
+
+def test_a_row_that_stood_in_a_file_is_as_old_as_the_file_and_one_that_is_added_is_new(tmp_path: Path) -> None:
+    file, stop = tmp_path / "sensors.csv", Event()
+    file.write_text("time_s,bend,sway\n0,1,2\n", encoding="utf-8")
+    os.utime(file, (time.time() - 100.0,) * 2)
+    readings = readings_of(str(file), CHANNELS, stop)
+    next(readings)
+    assert 100.0 <= time.monotonic() - readings.came < 110.0 and readings.trouble == "they stopped"
+    adding = Thread(target=lambda: (time.sleep(0.2), file.open("a", encoding="utf-8").write("1,3,4\n")))
+    adding.start()
+    assert next(readings)[1].tolist() == [3, 4] and time.monotonic() - readings.came < 5.0
+    assert readings.trouble == ""
+    adding.join()
+
+
+def test_markers_of_a_row_that_is_old_say_nothing(model: ProprioceptiveModel, tmp_path: Path) -> None:
+    file, stop, found = tmp_path / "sensors.csv", Event(), []
+    file.write_text("time_s,bend,sway\n0,0.1,0.2\n", encoding="utf-8")
+    os.utime(file, (time.time() - 100.0,) * 2)
+    Thread(target=lambda: found.extend(markers_of_sensors(readings_of(str(file), CHANNELS, stop), model)), daemon=True).start()
+    time.sleep(0.3)
+    with file.open("a", encoding="utf-8") as stream:
+        stream.write("1,0.3,0.4\n")
+    assert within(5.0, lambda: bool(found)) and [at for at, _ in found] == [1.0]
+    stop.set()
+
+
 def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
     file, newer = tmp_path / "sensors.csv", tmp_path / "newer.csv"
     file.write_text("time_s,bend,sway\n0,1,2\n", encoding="utf-8")
@@ -227,7 +275,7 @@ def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
         "udp://127.0.0.1:99999",
         "udp://127.0.0.1",
         "mqtt://host",
-        "serial:/dev/no-such-port",
+        "serial:/dev/no-such-port?baud=fast",
         "ftp://x",
     ],
 )
@@ -262,6 +310,7 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     np.testing.assert_allclose(ends[:2] / ends[2], [0.4, -0.2], atol=1e-3)  # on the line that the markers are on
     assert bent.contacts is None and bent.status == "ok" and "bend = 9" in odd.status and "no number" in blind.status
     np.testing.assert_array_equal(blind.bones, odd.bones)
+    assert still.read_at < bent.read_at < odd.read_at == blind.read_at  # what is blind shows what was read before
 
 
 def test_bones_of_a_lying_body_have_the_axes_of_the_robot_at_rest(tmp_path: Path) -> None:
@@ -307,3 +356,15 @@ def test_a_line_that_is_no_reading_is_shown_until_one_is() -> None:
             sender.sendto(line, ("127.0.0.1", port))
             assert within(3.0, lambda said=said: readings.trouble == said)
     assert within(3.0, lambda: bool(found)) and found[0][1].tolist() == [1.0, 2.0]
+    assert readings.passed == 1 and "first '1,2,3,4,5,6,7,8,9'" in readings.refused
+
+
+def test_what_is_no_reading_among_readings_is_counted(tmp_path: Path) -> None:
+    file, stop = tmp_path / "sensors.csv", Event()
+    file.write_text("time_s,bend,sway\n0,1,2\n", encoding="utf-8")
+    readings = readings_of(str(file), CHANNELS, stop)
+    assert next(readings)[0] == 0.0
+    with file.open("a", encoding="utf-8") as stream:
+        stream.write("1,x,y\n\n2,nan,\n3,3,4\n")  # a blank line is none
+    assert next(readings)[0] == 3.0
+    assert readings.passed == 2 and "'bend': 'x'" in readings.refused
