@@ -198,7 +198,7 @@ console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.e
       robot.take('pose', pose);
       await new Promise((done) => setTimeout(done, 100));
     }
-    return robot.state(performance.now(), true)[1];
+    return robot.state(performance.now(), '')[1];
   }, JSON.parse(given[1])),
   late: await page.evaluate(() => {                            // what waited while the page was busy comes all at once
     const pace = new (femsense.shown.robots.get('bar-2').pace.constructor)();

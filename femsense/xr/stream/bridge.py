@@ -17,6 +17,7 @@ from femsense.xr.stream.connecting import NO_ANSWER, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import MqttSource, broker_address
 from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
+from femsense.xr.stream.quiet import stream_log
 from femsense.xr.stream.websocket import pack, require_websockets, unpack
 
 if TYPE_CHECKING:
@@ -144,9 +145,8 @@ class _Viewer:
 
         address = f"{'wss' if self._secure else 'ws'}://{self._at}/ws"
         more: dict[str, Any] = {"ssl": self._tls} if self._secure else {}
-        with connect(
-            address, additional_headers=self._headers, compression=None, max_size=LARGEST_MESH, open_timeout=5, proxy=None, **more
-        ) as connection:
+        more |= {"compression": None, "max_size": LARGEST_MESH, "open_timeout": 5, "proxy": None, "logger": stream_log()}
+        with connect(address, additional_headers=self._headers, **more) as connection:
             self._connection, self.trouble = connection, ""
             for frame in connection:
                 if isinstance(frame, bytes):

@@ -44,6 +44,7 @@ from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
 """Of an input for which the robot declares no limit."""
+BEGINS = "; nobody says which inputs the robot has: the first command begins at those that are shown"
 FAR = 2.0
 """A wish farther from the body than this many times its size is no wish."""
 
@@ -260,11 +261,12 @@ class DragServer:
         missed = self.feedback.missed_m
         measured = "" if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
         known = {} if np.isnan(missed) else {"measured_error_m": missed}
+        begins = "" if self._is_known(time.monotonic()) else BEGINS
         return json.dumps(
             {
                 "header": header(self._seq, time.time(), "robot"),
                 "status": motion.status,
-                "text": motion.text + measured,
+                "text": motion.text + measured + begins,
                 "error_m": motion.error_m,
                 **known,
                 "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
@@ -309,6 +311,11 @@ class DragServer:
         """
         told = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
         return told if self.gate.last else {**self._shown(), **told}
+
+    def _is_known(self, now: float) -> bool:
+        """Return whether it is known where commands begin at a time [s]: the robot says it, or is where commands left it."""
+        fresh = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
+        return bool(self.gate.last) or len(fresh) == len(self.gate.inputs) or not self.options.gate.allowed
 
     def _shown(self) -> dict[str, float]:
         """Return the inputs of what viewers see."""

@@ -20,6 +20,7 @@ from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
+from femsense.xr.stream.quiet import keep_quiet
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -235,6 +236,7 @@ class EmbeddedBroker:
         self._access, self._hub = access or Access(), hub
         self._access.tls()  # says at once what is wrong with a certificate
         self._loop = asyncio.new_event_loop()
+        keep_quiet(self._loop)
         self._broker: Any = None
         self._waiting: dict[str, Message] = {}
         self._arrived: set[str] = set()

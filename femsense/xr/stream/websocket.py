@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import logging
 import socket
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,6 +22,7 @@ from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import GLB, RECEIVED, split_topic, topic
+from femsense.xr.stream.quiet import keep_quiet, stream_log
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -33,6 +33,8 @@ SMALLEST_BUFFER = 1 << 16
 """Of a socket that sends [bytes]: what waits there is old when it arrives."""
 LARGEST_FRAME, MOST_FRAMES = 4096, 240
 """Of what a viewer sends: bytes a frame, and frames a second."""
+ASKED_BY_PAGE = ("/ws", "/stream.json")
+"""What a page asks for again and again: it says itself that its password is refused, without a window of the browser each time."""
 PASSWORD_NEEDED = b"""<!doctype html><meta name="viewport" content="width=device-width"><title>femsense</title>
 <p>A password is needed: load the page again and type that of the stream, with any user name.</p>
 """
@@ -133,6 +135,7 @@ class WebSocketServer:
         self._fresh: dict[str, Message] = {}
         self._lock = Lock()
         self._loop = asyncio.new_event_loop()
+        keep_quiet(self._loop)
         self._finish: asyncio.Event | None = None
         self._failed: BaseException | None = None
         ready = Event()
@@ -187,9 +190,6 @@ class WebSocketServer:
     async def _serve(self, tls: object, ready: Event) -> None:
         from websockets.asyncio.server import serve
 
-        quiet = logging.getLogger("femsense.stream")
-        quiet.addHandler(logging.NullHandler())
-        quiet.propagate = False
         self._finish = asyncio.Event()
         try:
             server: Server = await serve(
@@ -206,7 +206,7 @@ class WebSocketServer:
                 ping_timeout=self.options.ping_s,
                 close_timeout=1.0,
                 server_header=None,
-                logger=quiet,
+                logger=stream_log(),
             )
         except OSError as error:
             self._failed = error
@@ -274,7 +274,9 @@ class WebSocketServer:
             return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
         if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
             await asyncio.sleep(0.3)  # who guesses waits
-            more = {"WWW-Authenticate": 'Basic realm="femsense"', "Content-Type": TYPES[".html"]}
+            more = {"Content-Type": TYPES[".html"]}
+            if path not in ASKED_BY_PAGE:
+                more["WWW-Authenticate"] = 'Basic realm="femsense"'
             return _response(HTTPStatus.UNAUTHORIZED, PASSWORD_NEEDED, more)
         if path == "/ws":
             full = len(self._viewers) >= self.options.most_viewers

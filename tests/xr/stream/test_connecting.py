@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+import logging
 import socket
+import ssl
+import struct
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 from certificates import self_signed
@@ -101,3 +108,64 @@ def test_a_certificate_without_its_key_asks_for_it(tmp_path: Path) -> None:
     certificate, _ = self_signed(tmp_path)
     with pytest.raises(InputError, match="--key"):
         Access(password="secret", certificate=certificate).tls()
+
+
+@pytest.mark.parametrize("said", [b"", b"\x10", b"GET / HTTP/1.0\r\n\r\n", b"\x10\x10\x00\x04MQTT\x04\x02\x00\x3c\x00\x00"])
+@pytest.mark.parametrize("where", ["tls", "tls-broker"])
+def test_clients_that_break_off_raise_no_alarm(
+    there: dict[str, object], where: str, said: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    context = ssl.create_default_context(cafile=str(there["certificate"]))
+    for wrapped in (False, True):
+        for _ in range(5):
+            client = socket.create_connection(("127.0.0.1", int(str(there[where]))))
+            if wrapped:
+                client = context.wrap_socket(client, server_hostname="127.0.0.1")
+            if said:
+                client.sendall(said)
+            time.sleep(0.02)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it is reset, not closed
+            client.close()
+    time.sleep(0.3)
+    assert alarms(caplog) == []
+
+
+def test_a_server_that_hangs_up_raises_no_alarm(caplog: pytest.LogCaptureFixture) -> None:
+    answers = itertools.cycle([b"", b"HTTP/1.1 101", b"HTTP/1.1 502 Bad Gateway\r\n\r\ngone", b"\x16\x03"])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        stop = Event()
+
+        def hang_up() -> None:
+            server.settimeout(0.1)
+            while not stop.is_set():
+                with suppress(TimeoutError):
+                    client, _ = server.accept()
+                    client.recv(4096)
+                    client.sendall(next(answers))
+                    client.close()
+
+        thread = Thread(target=hang_up)
+        thread.start()
+        bridge = Bridge(Hub(), f"http://127.0.0.1:{server.getsockname()[1]}")
+        time.sleep(2.5)
+        assert bridge.trouble
+        bridge.close()
+        stop.set()
+        thread.join()
+    assert alarms(caplog) == []
+
+
+def test_what_a_connection_to_elsewhere_says_goes_to_the_log_of_streams(
+    there: dict[str, object], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    caplog.set_level(logging.DEBUG, "femsense.stream")
+    bridge = Bridge(Hub(), f"http://127.0.0.1:{there['plain']}")
+    assert within(5.0, lambda: bridge.trouble == "")
+    bridge.close()
+    assert not [record.name for record in caplog.records if record.name.startswith("websockets")]
+
+
+def alarms(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What is printed where nobody asks for a log: not what goes to the stream's own, which is quiet."""
+    return [f"{record.name}: {record.getMessage()}" for record in caplog.records if record.name != "femsense.stream"]

@@ -339,6 +339,26 @@ def test_each_command_has_a_number_of_its_own_and_none_is_left_out(alone: tuple[
     assert out.numbers == list(range(len(out.numbers)))
 
 
+def test_before_the_first_command_it_is_said_where_it_begins_unless_the_robot_says_where_it_is(
+    alone: tuple[Hub, DragServer],
+) -> None:
+    hub, server = alone
+    names, out = server.robot.body.cable_names, Commands(hub, server)
+    far, warned = target_of(server.robot, dict(zip(names, (1.5, 0.6)))), "the first command begins at those that are shown"
+    drag(hub, far, armed=False)
+    assert within(20.0, lambda: warned in reach_of(hub).get("text", ""))
+    inputs = [{"name": name, "unit": "N", "value": 0.1} for name in names]
+    for count, known in ((1, False), (2, True)):  # all of them must be known
+        said = json.dumps({"inputs": inputs[:count]}).encode()
+        hub.received(Message("femsense/bar/measured", said), "the robot")
+        server.answer("tip", (float(far[0]), float(far[1]), float(far[2])))
+        assert (warned in reach_of(hub)["text"]) is not known
+    time.sleep(0.6)  # that is too old now
+    hold(hub, out, far)
+    server.answer("tip", (float(far[0]), float(far[1]), float(far[2])))
+    assert warned not in reach_of(hub)["text"]
+
+
 def test_who_comes_back_after_a_lapse_begins_anew(alone: tuple[Hub, DragServer]) -> None:
     hub, server = alone
     far = target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6))))

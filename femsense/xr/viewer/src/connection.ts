@@ -2,16 +2,18 @@
 
 import { unpack, type Message } from "./messages";
 
+export const NO_CONNECTION = "no connection";
 const AGAIN_MS = [200, 500, 1000, 2000];
 
 export class Connection {
   private socket: WebSocket | null = null;
   private attempt = 0;
+  private away = NO_CONNECTION; // what is said where there is none
 
   constructor(
     private readonly url: string,
     private readonly take: (messages: Message[]) => void,
-    private readonly change: (open: boolean) => void,
+    private readonly change: (away: string) => void,
   ) {
     this.open();
   }
@@ -25,17 +27,27 @@ export class Connection {
     socket.binaryType = "arraybuffer";
     socket.addEventListener("open", () => {
       this.attempt = 0;
-      this.change(true);
+      this.change("");
     });
     socket.addEventListener("message", (event) => {
       if (event.data instanceof ArrayBuffer) this.take(unpack(event.data));
     });
     socket.addEventListener("close", () => {
-      this.change(false);
+      this.change(this.away);
+      void whyAway().then((why) => {
+        this.away = why;
+        if (this.socket?.readyState !== WebSocket.OPEN) this.change(why);
+      });
       setTimeout(() => this.open(), AGAIN_MS[Math.min(this.attempt++, AGAIN_MS.length - 1)]);
     });
     this.socket = socket;
   }
+}
+
+/** Returns why there is no connection: a socket that is refused does not say it. */
+async function whyAway(): Promise<string> {
+  const answer = await fetch("stream.json", { cache: "no-store" }).catch(() => null);
+  return answer?.status === 401 ? "password refused: load the page again" : NO_CONNECTION;
 }
 
 /** The address of the stream beside this page. */

@@ -2,7 +2,7 @@
 
 import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
-import { Connection, streamUrl } from "./connection";
+import { Connection, NO_CONNECTION, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
 import { amount, clockText, frameAt, isDoubtful, type Frame } from "./data";
 import { Dragging } from "./dragging";
@@ -37,14 +37,14 @@ class Streams {
   private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
   private readonly dragging: Dragging;
   private chosen: Robot | null = null;
-  private open = false;
+  private away = NO_CONNECTION; // why there is none; empty where there is one
   private paused = false;
   private at = 0; // time that is shown while paused [s]
   private drawn = 0;
   private framed = 0;
 
   constructor(private readonly stage: Stage) {
-    this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
+    this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (away) => this.connected(away));
     this.dragging = new Dragging(stage, (robot, wish) => this.connection.send(pack(robot, "drag", wish)));
     element("dock").hidden = false;
     element("about").textContent = "waiting for a robot …";
@@ -69,7 +69,7 @@ class Streams {
 
   /** As long as there is no robot, says why: `view --stream` knows what keeps it from the stream. */
   private async ask(): Promise<void> {
-    if (this.robots.size || !this.open) return;
+    if (this.robots.size || this.away) return;
     const told: unknown = await fetch("stream.json").then((answer) => answer.json(), () => null);
     const trouble = (told as { trouble?: unknown } | null)?.trouble;
     if (!this.robots.size) element("about").textContent = typeof trouble === "string" && trouble ? trouble : "waiting for a robot …";
@@ -118,9 +118,7 @@ class Streams {
     if (!robot) return;
     document.title = `${robot.model.name} – femsense live`;
     element("name").textContent = robot.model.name;
-    const { handles, commands } = robot.model;
-    element("drag").hidden = handles.length === 0;
-    this.dragging.attend(robot.body ? { id: robot.id, body: robot.body, handles, commands } : null);
+    this.dragging.attend(robot.body ? { id: robot.id, body: robot.body, ...robot.model } : null);
     this.tabs();
   }
 
@@ -139,15 +137,15 @@ class Streams {
     );
   }
 
-  private connected(open: boolean): void {
-    this.open = open;
-    if (!open) this.dragging.letGo();
+  private connected(away: string): void {
+    this.away = away;
+    if (away) this.dragging.letGo();
     this.stage.touch();
   }
 
   private step(): void {
     const now = performance.now();
-    for (const robot of this.robots.values()) robot.step(now, this.paused ? this.at : null, this.open, this.stage);
+    for (const robot of this.robots.values()) robot.step(now, this.paused ? this.at : null, this.away, this.stage);
     this.dragging.step();
     if (now - this.drawn < 100) return;
     this.drawn = now;
@@ -167,8 +165,11 @@ class Streams {
   private read(now: number): void {
     const robot = this.chosen;
     const badge = element("badge");
-    const [state, words] = robot ? robot.state(now, this.open) : [this.open ? "waiting" : "lost", this.open ? "no robot yet" : "no connection"];
+    const [state, words] = robot ? robot.state(now, this.away) : [this.away ? "lost" : "waiting", this.away || "no robot yet"];
     document.documentElement.dataset.stream = state;
+    const answers = state !== "ended" && !!robot?.model.handles.length;
+    if (!answers && this.dragging.on) element("drag").click();
+    element("drag").hidden = !answers;
     const said = this.paused ? `paused · ${words}` : words;
     badge.dataset.state = this.paused && state === "live" ? "paused" : state;
     if (badge.textContent !== said) badge.textContent = said;
@@ -317,7 +318,7 @@ class Robot {
   }
 
   /** Shows the newest moment, or that of a time while paused; grey as soon as the stream is not live, paused or not. */
-  step(now: number, at: number | null, open: boolean, stage: Stage): void {
+  step(now: number, at: number | null, away: string, stage: Stage): void {
     const body = this.body;
     if (!body) return;
     const wanted = at === null ? this.newest : (this.history[frameAt(this.history, at)] ?? null);
@@ -325,7 +326,7 @@ class Robot {
       this.put(wanted);
       stage.touch();
     }
-    const stale = this.state(now, open)[0] !== "live";
+    const stale = this.state(now, away)[0] !== "live";
     if (stale !== body.isStale) {
       body.setStale(stale);
       stage.touch();
@@ -334,13 +335,13 @@ class Robot {
   }
 
   /** Returns whether it is live, and that in words. */
-  state(now: number, open: boolean): [string, string] {
+  state(now: number, away: string): [string, string] {
     const { state, detail, since_s } = this.told;
     const silent = state === "stale"; // the sender says so: who comes late cannot know how old its first pose is
     const told = silent && since_s !== null ? Date.now() / 1000 - since_s : 0;
     const age = Math.max((now - this.arrived) / 1000, told);
-    if (state === "ended") return ["ended", "ended"]; // so it said before it closed the connection
-    if (!open) return ["lost", "no connection"];
+    if (state === "ended" && (!away || away === NO_CONNECTION)) return ["ended", "ended"]; // so it said before it closed the connection
+    if (away) return ["lost", away];
     if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
     if (state === "waiting" || !Number.isFinite(age)) return ["waiting", `waiting for ${(state === "waiting" && detail) || "the first pose"}`];
     if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
