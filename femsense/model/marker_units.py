@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -12,6 +15,8 @@ UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet",
 """Numbers so many times too large are in this unit."""
 APART, NEAR = 2.0, 0.2
 """Markers that are so many times as far apart as on the robot are in another unit: no silicone stretches so far, and none coils up so tightly."""
+SMALLEST, LARGEST = 0.02, 2.0
+"""A robot's markers span between these [m]: those of the robots in meshes/ span 0.06 to 0.25 m, in centimetres that would read 6 to 25."""
 FEWEST = 3
 """Fewer markers in a frame tell nothing of their distances."""
 
@@ -40,13 +45,42 @@ def check_marker_distances(robot: Robot, recording: Recording) -> None:
         own = _size(rest[r.marker_index[rows]]) if rows.sum() >= FEWEST else 0.0
         if own > 0.0:
             ratios.append(_size(r.marker_xyz[rows]) / own)
-    scale = float(np.median(ratios)) if ratios else 1.0
-    if NEAR < scale < APART:
-        return
-    raise DataError(
-        f"the markers do not fit the robot: by their distances they are {scale:.4g} times too large: {unit_hint(max(scale, 1e-12))} "
-        f"The files hold metres"
-    )
+    _check_scale(float(np.median(ratios)) if ratios else 1.0, "the robot", unit_hint)
+
+
+def check_marker_sizes(measured: FloatArray, known: FloatArray) -> None:
+    """Refuse markers [m], shape (n, m, 3), that are far from as large as those that a model makes of the same rows, shape (n, m, 3).
+
+    Raises DataError, as `check_marker_distances`.
+    """
+    own = np.array([_size(points) for points in known])
+    ratios = [_size(points) / size for points, size in zip(measured, own) if size > 0.0 and len(points) >= FEWEST]
+    _check_scale(float(np.median(ratios)) if ratios else 1.0, "the model", _unit_question)
+
+
+def doubt_of_size(points: FloatArray) -> str:
+    """Return, as a question, in which units markers may be, shape (n, m, 3), that are farther apart than those of a robot; empty where they are not.
+
+    Used where nothing says how large the robot is.
+    """
+    low, high = np.quantile(points.reshape(-1, 3), [0.01, 0.99], axis=0)
+    across = float(np.linalg.norm(high - low))
+    if not across > LARGEST:
+        return ""
+    meant = [f"in {UNITS[times]} ({across / times:.2g} m)" for times in (1e3, 1e2) if SMALLEST < across / times < LARGEST]
+    return f"the markers span {across:.4g} m: are they {' or '.join(meant) or 'in another unit'}? The file holds metres"
+
+
+def _check_scale(scale: float, than: str, hint: Callable[[float], str]) -> None:
+    if not NEAR < scale < APART:
+        raise DataError(
+            f"the markers do not fit {than}: by their distances they are {scale:.4g} times too large: {hint(max(scale, 1e-12))} "
+            f"The files hold metres"
+        )
+
+
+def _unit_question(scale: float) -> str:
+    return unit_hint(scale).replace("is the robot's mesh.unit right?", "are they of the same robot?")
 
 
 def _size(points: np.ndarray) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
+from femsense.model.marker_units import check_marker_sizes
 from femsense.xr.proprioception.corrections import Frames, corrected, explain, is_better, rigid_motion, shift_of, shifts_of
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
@@ -117,7 +118,10 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
 
 
 def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
-    """Return the inputs of a model's networks for labelled data. Raises InputError, DataError where channels, markers or frames differ."""
+    """Return the inputs of a model's networks for labelled data.
+
+    Raises InputError, DataError where channels, markers, frames or units differ.
+    """
     same = (data.channels, data.marker_names) == (model.channels, model.marker_names)
     if not same:
         raise DataError(
@@ -127,7 +131,9 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
     check_frame(model.frame, data.frame)
     if len(data) < FEWEST:
         raise DataError(f"{len(data)} rows have readings and all markers; at least {FEWEST} are needed")
-    return data.inputs(model.memory_s)
+    inputs = data.inputs(model.memory_s)
+    check_marker_sizes(data.markers, model.network(inputs).reshape(data.markers.shape))
+    return inputs
 
 
 def _frames(model: ProprioceptiveModel, data: Labelled) -> Frames:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, InputError
+from femsense.model.marker_units import doubt_of_size
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.domain import learn_domain
@@ -173,6 +175,8 @@ def saturated_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[
 
 
 def _check(data: Labelled, options: LearnOptions) -> None:
+    if doubt := doubt_of_size(data.markers):
+        warnings.warn(doubt, stacklevel=3)
     if not options.kinds or not set(options.kinds) <= set(KINDS):
         raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(KINDS))
     if len(data) < FEWEST_ROWS:
