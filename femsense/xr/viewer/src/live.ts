@@ -93,8 +93,7 @@ class Streams {
   /** In a headset points can be dragged without the button, and the twin can be laid over the real robot. */
   private presenting(on: boolean): void {
     const robot = this.chosen;
-    const drag = element("drag");
-    if (robot?.model.handles.length && on !== this.dragging.on) drag.click();
+    if (robot?.model.handles.length && on !== this.dragging.on) element("drag").click();
     if (!on || !robot?.body) return;
     const { markers, handles, cameras } = robot.model;
     this.stage.headset.alignment = alignWith(this.stage, robot.body, landmarksOf(robot.body, markers.length ? markers : handles, cameras));
@@ -118,6 +117,7 @@ class Streams {
     if (!robot) return;
     document.title = `${robot.model.name} – femsense live`;
     element("name").textContent = robot.model.name;
+    if (robot.model.handles.length) element("drag").hidden = false;
     this.dragging.attend(robot.body ? { id: robot.id, body: robot.body, ...robot.model } : null);
     this.tabs();
   }
