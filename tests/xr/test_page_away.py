@@ -23,24 +23,25 @@ ENDED = """
 const page = await opened.newPage({ viewport: { width: 390, height: 844 } });
 const told = () => new Promise((done) => process.stdin.once('data', done));
 const look = async () => console.log(JSON.stringify(await page.evaluate(() => ({
-  badge: document.querySelector('#badge').textContent.split(',')[0],
+  ended: document.documentElement.dataset.stream === 'ended',
   button: document.querySelector('#drag').checkVisibility(), box: document.querySelector('#dragging').checkVisibility() }))));
 const stream = (state) => page.waitForFunction((s) => document.documentElement.dataset.stream === s, state, { timeout: 60000 });
 await page.goto(given[0]);
 await page.waitForFunction(() => femsense.shown.robots.get('bar')?.shown, null, { timeout: 60000 });
 await stream('live');
+const offered = (on) => page.waitForFunction((on) => document.querySelector('#drag').checkVisibility() === on, on, { timeout: 60000 });
 await page.click('#drag');
 await look();
 await page.click('#robots button:nth-child(2)');   // a robot without points
-await page.waitForTimeout(300);
+await offered(false);
 await look();
 await page.click('#robots button:nth-child(1)');
-await page.waitForTimeout(300);
+await offered(true);
 await page.click('#drag');
 await look();
 await told();
 await stream('ended');
-await page.waitForTimeout(300);
+await offered(false);
 await look();
 await opened.close();
 """
@@ -52,13 +53,13 @@ def test_a_robot_without_points_and_a_stream_that_has_ended_offer_none_to_drag(
     source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True, commands=True)
     browser = start_browser(request.config, ENDED, source.server.url)
     try:
-        assert said(browser) == {"badge": "live", "button": True, "box": True}
-        assert said(browser) == {"badge": "live", "button": False, "box": False}
-        assert said(browser) == {"badge": "live", "button": True, "box": True}
+        assert said(browser) == {"ended": False, "button": True, "box": True}
+        assert said(browser) == {"ended": False, "button": False, "box": False}
+        assert said(browser) == {"ended": False, "button": True, "box": True}
         for publisher in source.publishers:
             publisher.end()
         go_on(browser)
-        assert said(browser) == {"badge": "ended", "button": False, "box": False}
+        assert said(browser) == {"ended": True, "button": False, "box": False}
     finally:
         source.close()
         browser.kill()
