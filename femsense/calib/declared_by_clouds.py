@@ -8,19 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import EXPLAINED, SUSPICIOUS
 from femsense.calib.cloud_pose_search import LEAST, search_cloud_poses, settle_cloud_pose
 from femsense.calib.clouds_alone import free_states, seen_by, started_at
-from femsense.calib.declared_poses import said
-from femsense.calib.from_clouds import free_clouds, measured_noises, refine_poses
+from femsense.calib.declared_poses import DECLARED_STD, said
+from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot, refine_poses
 from femsense.calib.inputs import calibrated_inputs
 from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.residual_field import CELL
 from femsense.calib.scan import REACH, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
+from femsense.core.pose import invert_pose, transform_points
 from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
@@ -28,9 +30,11 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 
-HINT = 2.0
-"""A warning where a fitted pose leaves half and less: the arm of the tests leaves 3.6 times as much under a pose that is turned by 3°, and 1.5
-times with the right pose and a modulus 1.7 times too large."""
+KNOWN = 4.48
+"""The clouds know that a declared pose is off where it is so many deviations from the fitted one: six coordinates that err by chance
+stay below that in 99.7 of 100 cases (chi-squared)."""
+ALLOWED = 2.0
+"""… and it is said where turn or shift are so many of `DECLARED_STD`: `estimate` takes a declared pose to be off by that, and free frames tell it."""
 FRAMES = 4
 """Free frames that tell."""
 MODULUS = 3.0
@@ -49,9 +53,9 @@ class _Body:
 
 
 def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibration, views: Sequence[int]) -> None:
-    """Refuse a declared pose where one that is fitted to the clouds leaves a quarter of what it leaves, in the mean of parts of the body;
-    warn where half is left and the inputs are known (unknown ones take up what a wrong modulus leaves, and a pose then half of the rest).
-    Where another modulus does as much, nobody knows which of both it is: a warning names both.
+    """Warn where the clouds know that a declared pose is off: where it is beyond the deviations of one that is fitted to them, which hold
+    what the model lacks, and farther than `estimate` allows it. Refuse it where the fitted one leaves a quarter of what it leaves, in the
+    mean of parts of the body. Where another modulus does as much, nobody knows which of both it is: a warning names both.
 
     Arguments:
         robot, recording: as loaded.
@@ -63,20 +67,21 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
     """
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     spread = float(np.sqrt(((robot.body.mesh.nodes - robot.body.mesh.nodes.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    hint = EXPLAINED if recording.actuation_zero == "unknown" else HINT
     for view in views:
         fitted = _fitted(robot, recording, found, view)
         body = [] if fitted is None else _body(robot, recording, fitted, view, size)
         if fitted is None or not body:
             continue
         before, left = _left(robot, recording, found, view, body), _left(robot, recording, fitted, view, body)
-        if before < max(SUSPICIOUS * spread, hint * left):
+        off, apart = _deviations(fitted, view, found.poses[view], pose_pivot(robot))
+        if off < ALLOWED or apart < KNOWN:
             continue
         middle = robot.body.mesh.nodes.mean(axis=0)
         text = said(recording, view, found.poses[view], fitted.poses[view], middle, before, left)
+        text += f". That is {apart:.2g} times what the clouds leave open"
         factor, softer = _with_modulus(robot, recording, found, view, body)
         by_modulus = softer < 0.5 * before
-        if before > EXPLAINED * left and not by_modulus:
+        if before > max(EXPLAINED * left, SUSPICIOUS * spread) and not by_modulus:
             raise DataError(text)
         if by_modulus:
             text += f". With it, a modulus {factor:.2g} times as large leaves {1e3 * softer:.3g} mm: one of both is off"
@@ -88,6 +93,17 @@ def views_to_check(recording: Recording, seen: IntArray) -> list[int]:
     free = free_clouds(recording)
     told = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and v not in seen]
     return [v for v in told if any(recording.cloud_files[k][v] is not None for k in free)]
+
+
+def _deviations(fitted: Calibration, view: int, declared: FloatArray, pivot: FloatArray) -> tuple[float, float]:
+    """Return how far a declared pose lies from the fitted one [1]: its turn or shift in those that `estimate` allows it, and all in
+    deviations of the fitted one (Mahalanobis)."""
+    apart = declared @ invert_pose(fitted.poses[view])
+    step = np.append(Rotation.from_matrix(apart[:3, :3]).as_rotvec(), transform_points(apart, pivot[None])[0] - pivot)
+    own, whole = slice(6 * view, 6 * view + 6), (step / DECLARED_STD).reshape(2, 3)
+    return float(np.linalg.norm(whole, axis=1).max()), float(
+        np.sqrt(step @ np.linalg.solve(fitted.joint_covariance[own, own], step))
+    )
 
 
 def _fitted(robot: Robot, recording: Recording, found: Calibration, view: int) -> Calibration | None:

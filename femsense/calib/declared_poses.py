@@ -15,6 +15,8 @@ from femsense.model.recording import Recording
 
 TRIED = 1.5
 """A pose is fitted where it could take a third of the residual away, inputs as they are."""
+DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
+"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/forces.md has the trial)."""
 Fitted = tuple[float, Sequence[FloatArray]]
 """What is left [m], and the poses."""
 

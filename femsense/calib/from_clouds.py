@@ -107,7 +107,8 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
     weight, center = np.eye(len(which)), np.zeros(len(which))
     measured = prior.any() and not set(moving) <= set(guessed)
     for _ in range(2 if measured else 1):  # the second time with what the clouds are worth beside the markers
-        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, weight, center)
+        used = weight, center
+        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, *used)
         normal, right, rms = sums.normal, sums.right, sums.rms
         if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
             return calibration
@@ -116,8 +117,10 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
         clouds = what_clouds_know(normal, field_scores(equations.rows(poses), robot.body.mesh.nodes))
         clouds *= worth_of_clouds(clouds, prior, apart) if measured else 1.0
         weight = clouds @ np.linalg.inv(normal)
+    ended = replace(calibration, poses=tuple(poses))
+    moved = _moved_by_law(robot, recording, ended, equations, prior, used[0], used[1] - gone)
     covariance = np.zeros((6 * len(poses),) * 2)
-    covariance[np.ix_(which, which)] = np.linalg.inv(clouds + prior)
+    covariance[np.ix_(which, which)] = np.linalg.inv(clouds + prior) + np.outer(moved, moved)
     return replace(
         calibration,
         T_robot_camera=freeze(poses[0]),
@@ -126,6 +129,31 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
         joint_covariance=freeze(covariance),
         normal_rms_m=rms,
     )
+
+
+def with_other_law(robot: Robot) -> Robot | None:
+    """Return the robot under the neo-Hookean law; None where it declares a law by an effect."""
+    body = robot.body
+    if body.material.law != "corotational":
+        return None
+    return replace(robot, body=replace(body, material=replace(body.material, law="neo_hookean")))
+
+
+def _moved_by_law(
+    robot: Robot,
+    recording: Recording,
+    ended: Calibration,
+    equations: _Equations,
+    prior: FloatArray,
+    weight: FloatArray,
+    center: FloatArray,
+) -> FloatArray:
+    """Return where a fit under the other law ends that begins where a fit ended, shape (p,); 0 where the robot declares its law."""
+    other = with_other_law(robot)
+    frames = [] if other is None else _free_frames(other, recording, ended.poses, ended)
+    if not frames:
+        return np.zeros(len(prior))
+    return _nearer(replace(equations, frames=frames), list(ended.poses), prior, weight, center)[1]
 
 
 def what_clouds_know(normal: FloatArray, scores: FloatArray) -> FloatArray:

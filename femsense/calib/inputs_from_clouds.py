@@ -13,7 +13,15 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums, what_clouds_know, worth_of_clouds
+from femsense.calib.from_clouds import (
+    RaySums,
+    measured_noises,
+    pose_pivot,
+    ray_sums,
+    what_clouds_know,
+    with_other_law,
+    worth_of_clouds,
+)
 from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.residual_field import field_scores
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
@@ -175,10 +183,9 @@ class _Fit:
     def _moved_by_law(self, end: _End) -> FloatArray:
         """Return where a fit under the neo-Hookean law ends, from here, shape (p + a,). What all cables have in common
         compresses the body, and laws that agree for small strains differ there. 0 where the robot declares a law by an effect."""
-        body = self.robot.body
-        if body.material.law != "corotational":
+        other = with_other_law(self.robot)
+        if other is None:
             return np.zeros(len(self.prior))
-        other = replace(self.robot, body=replace(body, material=replace(body.material, law="neo_hookean")))
         there = replace(self, robot=other, start=end.initial).joint(end.poses, 1, end.weighed, end.gone)
         return np.asarray(there.gone - end.gone)
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.condensed_scan import condensed
+from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, Scan, parted, read_scan
@@ -37,8 +38,6 @@ from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sen
 
 MODULUS_STD = 0.01
 """Where lengths of cables are given, the shape says little of the modulus: beyond this, errors of the model pass for it (relative)."""
-DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
-"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/forces.md has the trial)."""
 CANDIDATES = 120
 """Places at which hidden contacts are searched (METHODS section 3)."""
 
