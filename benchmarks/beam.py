@@ -47,6 +47,7 @@ from femsense.model.camera_frame import in_robot_frame
 from femsense.model.effects import FORMS, Entry
 from femsense.model.observation import Hypothesis
 from femsense.model.remeshing import robot_on_mesh
+from femsense.report.text import known_part
 
 EDGE = [[0.1, 0.0, 0.015]]
 """The middle of the loaded edge at rest [m]."""
@@ -517,7 +518,9 @@ def print_commands(folder: Path) -> None:
     """Print what a user gets by commands alone: a modulus from the sag, then the weights untold."""
     robot = load_robot(folder / "robot_gravity")
     better = improve(robot, [load_recording(folder / "recordings" / "gravity_a")]).robot
-    print("| weight | said | without what noise adds | force | its deviations | status |\n|---|---|---|---|---|---|")
+    print(
+        "| weight | said | of it | without what deviations add | force | its deviations | status |\n|---|---|---|---|---|---|---|"
+    )
     for name, weight in (("load52_a", 0.51012), ("load101_a", 1.00062)):
         recording = load_recording(folder / "recordings" / name)
         none = np.zeros((0, 3))
@@ -527,7 +530,10 @@ def print_commands(folder: Path) -> None:
         size = f"{first.force_n:.3f} ± {first.std_n:.3f} N"
         unbiased = float(np.sqrt(max(first.force_n**2 - float((first.force_std_n_xyz**2).sum()), 0.0)))
         force, std = (np.round(v, 3).tolist() for v in (first.force_n_xyz, first.force_std_n_xyz))
-        print(f"| {weight:.3f} N | {size} | {unbiased:.3f} N | {force} | {std} | {run.frames[0].status} |", flush=True)
+        print(
+            f"| {weight:.3f} N | {size} | {known_part(first)} | {unbiased:.3f} N | {force} | {std} | {run.frames[0].status} |",
+            flush=True,
+        )
 
 
 def main() -> None:

@@ -130,6 +130,8 @@ def run_text(run: Run) -> str:
                 ),
             ]
         )
+        if part := known_part(strongest):
+            rows.append(["of it", part])
     if facts["unexplained"]:
         worst = max(facts["unexplained"], key=lambda frame: frame["rms_after_m"])
         rows.append(
@@ -158,6 +160,22 @@ def run_text(run: Run) -> str:
     if len(facts["failed"]) > LISTED:
         rows.append(["not ok", f"in {len(facts['failed']) - LISTED} frames more: see frames.csv"])
     return f"run of {run.robot.name}\n{columns(rows)}"
+
+
+def known_part(contact: ContactForce) -> str:
+    """Return in words what of a force is known where one component alone makes most of what is not; nothing where that tells itself
+    from zero. What is not known of a component makes the size too large (a force along a beam hardly moves a marker)."""
+    force, std = contact.force_n_xyz, contact.force_std_n_xyz
+    worst = int(np.argmax(np.nan_to_num(std)))
+    if not std[worst] ** 2 > 0.5 * float((std**2).sum()) or abs(force[worst]) > 2.0 * std[worst]:
+        return ""
+    others = np.delete(np.arange(3), worst)
+    size = float(np.linalg.norm(force[others]))
+    own = float(np.linalg.norm(force[others] * std[others])) / max(size, 1e-300)
+    return (
+        f"{size:.3f} ± {own:.3f} N across {'xyz'[worst]}; along it {force[worst]:.3f} ± {std[worst]:.3f} N, which does not tell itself "
+        f"from nothing"
+    )
 
 
 def _strongest(run: Run) -> ContactForce | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from results import NAN, make_calibration
 
 from femsense.report.loop.document import Loop
 from femsense.report.loop.text import loop_text
-from femsense.report.text import calibration_text
+from femsense.report.text import calibration_text, known_part
+from femsense.sensing.types import ContactForce
 
 
 @pytest.mark.parametrize(("noise_m", "said"), [(3e-4, True), (1.2e-2, False), (NAN, False)])
@@ -28,3 +30,27 @@ def test_what_was_fitted_along_and_is_handed_back_is_said_with_its_values() -> N
     text = loop_text(Loop.model_validate({"verdict": "effects", "fitted_along": along}))
     title, values = text.split("cable_offset (fitted along, part of the improved robot, not named)")
     assert "verdict: effects" in title and "0.21" in values and "0.08" in values
+
+
+def contact(force: list[float], std: list[float]) -> ContactForce:
+    size = float(np.linalg.norm(force))
+    place = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    return ContactForce(0, 0.0, 0, *place, np.array(force), size, 0.1, "given", force_std_n_xyz=np.array(std))
+
+
+def test_a_component_that_is_not_known_is_told_apart_from_what_is() -> None:
+    """A weight on a beam: along it markers hardly tell a force, and the size is too large by that."""
+    text = known_part(contact([-0.23, 0.036, -0.548], [0.21, 0.019, 0.034]))
+    assert text.startswith("0.549 ± 0.034 N across x; along it -0.230 ± 0.210 N")
+
+
+@pytest.mark.parametrize(
+    ("force", "std"),
+    [
+        ([-0.5, 0.036, -0.548], [0.21, 0.019, 0.034]),  # it tells itself from nothing
+        ([-0.1, 0.1, -0.548], [0.1, 0.09, 0.09]),  # all are known alike
+        ([-0.1, 0.1, -0.548], [NAN, NAN, NAN]),  # of a file that does not tell
+    ],
+)
+def test_other_forces_are_told_whole(force: list[float], std: list[float]) -> None:
+    assert known_part(contact(force, std)) == ""
