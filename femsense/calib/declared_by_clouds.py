@@ -74,14 +74,15 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
             continue
         before, left = _left(robot, recording, found, view, body), _left(robot, recording, fitted, view, body)
         off, apart = _deviations(fitted, view, found.poses[view], pose_pivot(robot))
-        if off < ALLOWED or apart < KNOWN:
+        plain = before > max(EXPLAINED * left, SUSPICIOUS * spread)
+        if off < ALLOWED or (apart < KNOWN and not plain):
             continue
         middle = robot.body.mesh.nodes.mean(axis=0)
         text = said(recording, view, found.poses[view], fitted.poses[view], middle, before, left)
         text += f". That is {apart:.2g} times what the clouds leave open"
         factor, softer = _with_modulus(robot, recording, found, view, body)
         by_modulus = softer < 0.5 * before
-        if before > max(EXPLAINED * left, SUSPICIOUS * spread) and not by_modulus:
+        if plain and not by_modulus:
             raise DataError(text)
         if by_modulus:
             text += f". With it, a modulus {factor:.2g} times as large leaves {1e3 * softer:.3g} mm: one of both is off"
