@@ -46,7 +46,7 @@ def main() -> int:
         ask.error(f"no such case: {', '.join(sorted(unknown))}")
     rows = []
     for case in CASES:
-        if case.name not in given.case if given.case else case.calm or case.near_clamp:
+        if case.name not in given.case if given.case else case.calm or case.near_clamp or case.nudges:
             continue
         folder = given.out / case.name
         if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():

@@ -29,6 +29,15 @@ def kind_of(status: str, contacts: int) -> str:
     return KINDS[2] if "moved by" in status else KINDS[3]
 
 
+def print_nudges(heading: str, nudged: dict[tuple[float, float], Counter[str]]) -> None:
+    """Print what frames were said to be after each nudge."""
+    print(f"| {heading} | frames | {' | '.join(KINDS)} |\n|---|---|{'---|' * len(KINDS)}")
+    for (shift, turn), counts in nudged.items():
+        size = f"{1e3 * shift:.1f} mm" if shift else f"{np.degrees(turn):.1f}°" if turn else "nothing"
+        print(f"| {size} | {counts.total()} | {' | '.join(str(counts[kind]) for kind in KINDS)} |")
+    print()
+
+
 def main() -> None:
     """Make and run the cases, and print both tables."""
     ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -37,7 +46,7 @@ def main() -> None:
     ask.add_argument("--robots", nargs="*", default=["bar", "arm", "post", "slab"])
     ask.add_argument("--bare", action="store_true")
     given = ask.parse_args()
-    nudged: dict[tuple[float, float], Counter[str]] = {nudge: Counter() for nudge in DIFFERENT_NUDGES}
+    nudged, beside = ({nudge: Counter[str]() for nudge in DIFFERENT_NUDGES} for _ in range(2))
     touched: dict[str, Counter[str]] = {}
     for case in CASES:
         if case.robot not in given.robots or not (case.nudges or case.near_clamp):
@@ -51,18 +60,18 @@ def main() -> None:
         contacts, status = Counter(contacts_of(folder / "run")), statuses_of(folder / "run")
         for k in range(FREE, truth["frames"]):
             kind = kind_of(status[k], contacts[k])
-            if case.nudges:
+            if case.nudges and not case.touches:
                 nudged[case.nudges[k - FREE]][kind] += 1
                 continue
             here = [c for c in truth["contacts"] if c["frame"] == k]
-            if here:
+            if case.nudges and here:
+                beside[case.nudges[k - FREE]][kind] += 1
+            elif here:
                 sure = "resolved" if here[0]["bound_rel"] < RESOLVED else "lighter"
                 touched.setdefault(f"{case.name}, {sure}", Counter())[kind] += 1
-    print(f"| the camera moved by | frames | {' | '.join(KINDS)} |\n|---|---|{'---|' * len(KINDS)}")
-    for (shift, turn), counts in nudged.items():
-        size = f"{1e3 * shift:.1f} mm" if shift else f"{np.degrees(turn):.1f}°" if turn else "nothing"
-        print(f"| {size} | {counts.total()} | {' | '.join(str(counts[kind]) for kind in KINDS)} |")
-    print(f"\n| a touch near the clamp | frames | {' | '.join(KINDS)} |\n|---|---|{'---|' * len(KINDS)}")
+    print_nudges("the camera moved by", nudged)
+    print_nudges("beside a touch that is seen, it moved by", beside)
+    print(f"| a touch near the clamp | frames | {' | '.join(KINDS)} |\n|---|---|{'---|' * len(KINDS)}")
     for name, counts in touched.items():
         print(
             f"| `{name.split(',')[0]}`,{name.split(',')[1]} | {counts.total()} | {' | '.join(str(counts[kind]) for kind in KINDS)} |"

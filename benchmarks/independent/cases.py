@@ -63,6 +63,7 @@ _TURNS = tuple(math.radians(angle) for angle in (0.2, 0.5, 1.0, 2.0))
 _SHIFTS = (0.0005, 0.001, 0.002, 0.003, 0.005)
 DIFFERENT_NUDGES = ((0.0, 0.0), *((shift, 0.0) for shift in _SHIFTS), *((0.0, turn) for turn in _TURNS))
 NUDGES = 2 * DIFFERENT_NUDGES
+SOME_NUDGES = (*DIFFERENT_NUDGES, (0.0, 0.0), (0.0, 0.0))
 
 CASES = (
     Case("bar-normal", "bar", (Touch(),)),
@@ -80,6 +81,8 @@ CASES = (
     Case("pad-plate", "pad", (Touch("plate"),), camera="tof", images=True, declared_noise=True),
     Case("pad-slide", "pad", (Touch(tangent=0.3, slide_m=0.012),), camera="stereo", distance_m=0.5, hard=True),
     Case("slab-gray", "slab", (Touch(scale=1.5),), camera="tof", distance_m=0.45, images=True, colors=False),
+    Case("bar-gray", "bar", (Touch(),), colors=False),
+    Case("arm-gray", "arm", (Touch(),), "displacement", colors=False),
     Case("slab-rod", "slab", (Touch("rod"),), "displacement", "tof", 0.3, declared_noise=True),
     Case("post-two", "post", (Touch(scale=0.6), Touch(first=4)), "displacement", "stereo", 0.3),
     Case("post-plate", "post", (Touch("plate", scale=1.4),), "tension", "stereo", 0.4, images=True, colors=False),
@@ -93,6 +96,15 @@ CASES = (
     Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=120),
     *(
         Case(f"{name}-nudged", name, (), control, camera, distance, calm=len(NUDGES), nudges=NUDGES)
+        for name, control, camera, distance in (
+            ("bar", "tension", "stereo", 0.35),
+            ("arm", "displacement", "tof", 0.5),
+            ("post", "tension", "stereo", 0.35),
+            ("slab", "displacement", "tof", 0.4),
+        )
+    ),
+    *(
+        Case(f"{name}-touched-nudged", name, (Touch(),), control, camera, distance, nudges=SOME_NUDGES)
         for name, control, camera, distance in (
             ("bar", "tension", "stereo", 0.35),
             ("arm", "displacement", "tof", 0.5),

@@ -18,6 +18,8 @@ MATCH_M = 0.030
 """A reported contact farther than this from a true one is another contact."""
 RESOLVED = 0.2
 """Forces are graded where the bound is below this share: five times the resolution."""
+WRONG = 0.3
+"""A force that is off by more than this share is a wrong one."""
 
 
 @dataclass(eq=False)
@@ -37,6 +39,8 @@ class Row:
     missed: int = 0
     missed_quietly: int = 0
     """Of these, in a frame whose status is ok."""
+    wrong_quietly: int = 0
+    """Off by more than WRONG and two standard deviations, in a frame whose status is ok."""
     extra: int = 0
     """Reported beside the true ones in touched frames."""
     false: int = 0
@@ -159,6 +163,7 @@ def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str)
         row.over_bound.append(abs(error) / size / one["bound_rel"])
         if answer.get("std_n"):
             row.covered.append(abs(error) <= 1.96 * float(answer["std_n"]))
+            row.wrong_quietly += abs(error) > WRONG * size and not row.covered[-1] and status == "ok"
 
 
 def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:

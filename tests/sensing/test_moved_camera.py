@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import arm
-from touched_arm import touched
+from touched_arm import PLACE, touched
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.pose import moved_poses
@@ -22,7 +22,8 @@ NEAR_CLAMP = np.array([0.02, 0.0, 0.01])
 
 def last_frame(folder: Path, force: float = 0.0, **how: object) -> tuple[FrameReport, int]:
     """Return what the touched frame is said to be, and how many contacts it has; the free ones are ok."""
-    seen = touched(folder, np.array([0.0, 0.0, -force]), ball=False, place=NEAR_CLAMP, **how)  # type: ignore[arg-type]
+    how = {"ball": False, "place": NEAR_CLAMP, **how}
+    seen = touched(folder, np.array([0.0, 0.0, -force]), **how)  # type: ignore[arg-type]
     run = estimate(arm(), seen, calibrate(arm(), seen))
     assert [frame.status for frame in run.frames[:3]] == ["ok"] * 3
     return run.frames[3], len(run.contacts)
@@ -45,6 +46,18 @@ def test_where_nothing_stands_around_a_camera_that_moved_is_a_possibility(tmp_pa
 
 def test_a_touch_near_the_clamp_is_no_camera_that_moved(tmp_path):
     report, contacts = last_frame(tmp_path, 0.4, wall=True)
+    assert (report.status, contacts) == ("ok", 1)
+
+
+@pytest.mark.parametrize("nudge", [0.3 * SHIFT, SHIFT, 0.3 * TURN, TURN])
+def test_a_camera_that_moved_while_something_touches_that_is_seen_is_named(tmp_path, nudge):
+    report, _ = last_frame(tmp_path, 0.15, ball=True, place=PLACE, nudge=nudge, wall=True)
+    assert "the camera seems to have moved by" in report.status
+
+
+@pytest.mark.parametrize("wall", [False, True])
+def test_a_touch_that_is_seen_is_no_camera_that_moved(tmp_path, wall):
+    report, contacts = last_frame(tmp_path, 0.15, ball=True, place=PLACE, wall=wall)
     assert (report.status, contacts) == ("ok", 1)
 
 
