@@ -48,8 +48,8 @@ def _truth(demo: Demo | None) -> Html | None:
         ["Error of force, median", *(words.joined(words.number(r.force_error_n), "N") for r in both)],
         ["Error of force, median, of its size", *(words.percent(r.force_error_share, 1) for r in both)],
         ["Error of place, median", *(words.length(r.place_error_m) for r in both)],
-        ["True contacts found", *(_found(r) for r in both)],
-        ["Contacts that are none", *(_count(r.contacts_false) for r in both)],
+        ["True contacts in frames found", *(_found(r) for r in both)],
+        ["Contacts in frames that are none", *(_count(r.contacts_false) for r in both)],
     ]
     shown = [row for row in rows if set(row[1:]) != {words.NOTHING}]
     return table(

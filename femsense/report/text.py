@@ -84,6 +84,7 @@ def run_document(run: Run) -> dict[str, Any]:
         "frames": len(run.frames),
         "frames_ok": len(good),
         "contacts": count_of(run),
+        "contacts_in_frames": len(felt),
         "frames_with_contact": len({contact.frame for contact in felt}),
         "largest_force_n": None if strongest is None else strongest.force_n,
         "rms_before_m": _median([frame.rms_before_m for frame in touched]),

@@ -36,8 +36,9 @@ class Comparison:
     pairs: tuple[tuple[TrueContact, ContactForce], ...]
     """True contacts with those that were found in their place."""
     contacts_true: int
+    """Contacts in frames: one that lasts over six frames counts six times."""
     contacts_false: int
-    """Contacts that are none."""
+    """Contacts in frames that are none."""
 
     @property
     def contacts_found(self) -> int:
@@ -60,7 +61,7 @@ class Comparison:
         return np.asarray(self.force_errors_n / np.array([float(np.linalg.norm(true.force_n_xyz)) for true, _ in self.pairs]))
 
     def __repr__(self) -> str:
-        found = f"Comparison({self.contacts_found} of {self.contacts_true} contacts found, {self.contacts_false} that are none"
+        found = f"Comparison({self.contacts_found} of {self.contacts_true} contacts in frames found, {self.contacts_false} that are none"
         if not self.pairs:
             return found + ")"
         force, share, place = (float(np.median(x)) for x in (self.force_errors_n, self.force_shares, self.place_errors_m))

@@ -836,6 +836,18 @@ def test_a_run_in_which_every_frame_failed(tmp_path: Path) -> None:
     assert "none: no cloud 2 0–1" in page.text and not page.all("img")
 
 
+def test_rows_that_noise_may_make_are_not_listed_as_contacts_but_counted(tmp_path: Path) -> None:
+    write_run_folder(tmp_path, frames=3)
+    rows = "".join(
+        f"{k},{0.1 * k},0,0,0,0,0,0,1,0,0,{size},{size},0.1,given,0,,,,,,,\n" for k, size in enumerate((0.0, 0.2, 1.5))
+    )
+    (tmp_path / "contacts.csv").write_text(f"{CONTACT_HEADER}\n{rows}", encoding="utf-8")
+    text = report(tmp_path).text
+    assert "1.50 ± 0.10" in text and "0.20 ± 0.10" not in text
+    assert "Of less than 3 standard deviations, and so none: 2 rows more of contacts.csv." in text
+    assert text.count("1 contact in 3 frames") == 1
+
+
 def test_a_long_run_stays_small(tmp_path: Path) -> None:
     page = report(write_run_folder(tmp_path, frames=5000))
     assert "5000 frames" in page.text

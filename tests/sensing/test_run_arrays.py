@@ -81,7 +81,7 @@ def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
     found = fs.compare(sensed, truth)
     assert (found.contacts_found, found.contacts_true, found.contacts_false) == (1, 2, 1)
     np.testing.assert_allclose([found.force_errors_n[0], found.force_shares[0], found.place_errors_m[0]], [0.1, 0.1, 0.002])
-    assert repr(found) == "Comparison(1 of 2 contacts found, 1 that are none; median errors 0.1 N (10.0 %), 2 mm)"
+    assert repr(found) == "Comparison(1 of 2 contacts in frames found, 1 that are none; median errors 0.1 N (10.0 %), 2 mm)"
     assert "0 of 0 contacts" in repr(fs.compare(sensed, ()))
     with pytest.raises(InputError, match="no truth beside the recording"):
         fs.compare(sensed, tmp_path)

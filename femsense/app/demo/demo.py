@@ -122,8 +122,8 @@ def demo_text(document: Mapping[str, Any]) -> str:
         ("error of place (median)", "place_error_m", 1e3, "mm"),
     ):
         rows.append([title, _figure(a[key], scale, unit), _figure(b[key], scale, unit)])
-    rows.append(["true contacts found", *(f"{run['contacts_found']} of {run['contacts_true']}" for run in (a, b))])
-    rows.append(["contacts that are none", *(str(run["contacts_false"]) for run in (a, b))])
+    rows.append(["true contacts in frames", *(f"{run['contacts_found']} of {run['contacts_true']}" for run in (a, b))])
+    rows.append(["false ones in frames", *(str(run["contacts_false"]) for run in (a, b))])
     for title, key in (("residual of the markers", "train_rms_m"), ("  on held-out sweeps", "validation_rms_m")):
         rows.append([title, *(_figure((loop.get(when) or {}).get(key), 1e3, "mm") for when in ("before", "after"))])
     rows.append(["time a frame", *(_figure(run["ms_per_frame"], 1.0, "ms") for run in (a, b))])

@@ -30,6 +30,7 @@ from femsense.report.drawing import (
 from femsense.report.page import Html, panels, paragraph, table, together
 from femsense.report.run.document import KnownLoad
 from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
+from femsense.sensing.run_arrays import NOISE
 from femsense.sensing.run_files import read_states
 
 ROWS = 150
@@ -183,9 +184,10 @@ def _signed(value: float | None) -> str:
 
 
 def contacts_table(contacts: ContactTable | None) -> Html | None:
-    """Return the contacts one by one."""
-    if contacts is None or not len(contacts):
+    """Return the contacts one by one; forces that noise may make are counted below."""
+    if contacts is None or not contacts.sensed.any():
         return None
+    felt = np.flatnonzero(contacts.sensed)
     factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
     rows = [
         [
@@ -197,10 +199,12 @@ def contacts_table(contacts: ContactTable | None) -> Html | None:
             _vector(1e3 * contacts.place_m[i], 1),
             contacts.source[i] or words.NOTHING,
         ]
-        for i in range(min(len(contacts), ROWS))
+        for i in felt[:ROWS]
     ]
     headers = ("Frame", "Time [s]", "Contact", f"Force [{unit}]", f"Components x, y, z [{unit}]", "Place x, y, z [mm]", "Source")
-    caption = "Force on the body and its place on the deformed body, robot frame." + first_of(len(contacts), ROWS, "contacts.csv")
+    caption = "Force on the body and its place on the deformed body, robot frame." + first_of(len(felt), ROWS, "contacts.csv")
+    if len(felt) < len(contacts):
+        caption += f" Of less than {NOISE:g} standard deviations, and so none: {words.counted(len(contacts) - len(felt), 'row')} more of contacts.csv."
     return table(headers, rows, caption=caption, numeric=(1, 2, 3, 4, 5))
 
 
