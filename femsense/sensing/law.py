@@ -1,4 +1,5 @@
-"""How far forces are off because the material's law is not known: what another law would have them be in the same state."""
+"""How far forces are off because the model is: by what it needs to move under gravity and cables as the body does, and by what another law would have
+them be in the same state."""
 
 from __future__ import annotations
 
@@ -11,7 +12,19 @@ from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.sensing.types import Fit, Sensor
+from femsense.sensing.nuisance import commons
+from femsense.sensing.types import Fit, Knowledge, Sensor
+
+
+def response_std(knowledge: Knowledge, cameras: int) -> float:
+    """Return how far the model's answer to a force may be off beside its answer to gravity and cables, relative [1].
+
+    Gravity and cables pull as declared, but the model needs another modulus or other pulls to move as the body does (mesh, law, ties): what it
+    needs of them, it needs of a contact. The root mean square of the pulls that the free frames ask for, and that of the modulus beside it.
+    """
+    asked = np.arange(6 * cameras, commons(knowledge))
+    square = knowledge.mean[asked] ** 2 + (knowledge.root[asked] ** 2).sum(axis=1)
+    return float(np.sqrt(square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
 
 
 def law_std(sensor: Sensor, fit: Fit, free: Equilibrium) -> FloatArray:

@@ -63,8 +63,15 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium, caught: bool) -> R
         operator=move,
         number=None if scan.count is None else number,
         scatter=scatter,
+        facing=facing_of(nodes[rows.hits.nodes]),
         missed_number=None if scan.count is None else measured[missed],
     )
+
+
+def facing_of(corners: FloatArray) -> FloatArray:
+    """Return the unit normals of triangles (r, 3, 3), shape (r, 3)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def seen_through(sensor: Sensor, scan: Scan, state: Equilibrium) -> float:

@@ -22,6 +22,8 @@ CENTRES = 24
 """Centres of the field of shared errors: as many degrees of freedom as its error may have along the body."""
 HUBER = 2.5
 """Whitened residuals beyond this count linearly."""
+ASIDE = 2.0
+"""Opposite faces count as so many times twice the length of shared errors apart: across an edge nearly nothing is shared."""
 CELL = 0.5
 """Points within this share of the length of shared errors may err together."""
 OUTLIER = 5.0
@@ -50,7 +52,8 @@ LIKELY_GAIN = 13.5
 
 def first_knowledge(
     noises: tuple[CameraNoise, ...],
-    surface_nodes: FloatArray,
+    places: FloatArray,
+    facing: FloatArray,
     size: float,
     modulus_std: float,
     pose_covariance: FloatArray,
@@ -61,13 +64,16 @@ def first_knowledge(
 
     Arguments:
         noises: of each camera.
-        surface_nodes: nodes of the surface at rest [m], shape (s, 3).
+        places: of the surface at rest [m], shape (s, 3).
+        facing: outward unit normals there, shape (s, 3).
         size: diagonal of the body [m].
         modulus_std: relative.
         pose_covariance: of all cameras' (rotation, shift), shape (6 v, 6 v).
         drives: cables and chambers.
     """
-    centres = surface_nodes[spread_points(surface_nodes, CENTRES)]
+    length = 0.7 * _spacing(places[spread_points(places, CENTRES)], size)
+    chosen = spread_points(np.hstack([places, ASIDE * length * facing]), CENTRES)
+    centres = places[chosen]
     v = len(pose_covariance)
     root = np.diag(np.concatenate([np.zeros(v), [modulus_std], np.full(drives, DRIVE_STD)]))
     root[:v, :v] = _root(pose_covariance)
@@ -75,7 +81,8 @@ def first_knowledge(
     return Knowledge(
         noises=noises,
         centres=freeze(centres),
-        length=0.7 * _spacing(centres, size),
+        facing=freeze(facing[chosen]),
+        length=length,
         bias_m=FIRST_BIAS,
         model_share=FIRST_SHARE,
         mean=freeze(np.zeros(len(root) + len(fields))),
@@ -117,7 +124,7 @@ def commons(knowledge: Knowledge) -> int:
 
 def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the columns of unit nuisance (r, q) [m] and what the free frames say that they add to the residual (r,) [m]."""
-    field = _kernel(knowledge, rows.place)
+    field = _kernel(knowledge, rows)
     every = np.hstack([common_columns(rows, sag), field, rows.way[:, None] * field])
     mean = knowledge.mean.copy()
     mean[commons(knowledge) :] *= rows.of_clouds  # markers do not see what clouds have alike
@@ -127,17 +134,6 @@ def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple
 def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
     """Return how the residual changes with pose steps, the modulus and the pulls, shape (r, 6 v + 1 + a + c)."""
     return np.hstack([rows.by_pose, rows.functional(sag)])
-
-
-def response_std(knowledge: Knowledge, cameras: int) -> float:
-    """Return how far the model's answer to a force may be off beside its answer to gravity and cables, relative [1].
-
-    Gravity and cables pull as declared, but the model needs another modulus or other pulls to move as the body does (mesh, law, ties): what it
-    needs of them, it needs of a contact. The root mean square of the pulls that the free frames ask for, and that of the modulus beside it.
-    """
-    asked = np.arange(6 * cameras, commons(knowledge))
-    square = knowledge.mean[asked] ** 2 + (knowledge.root[asked] ** 2).sum(axis=1)
-    return float(np.sqrt(square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
 
 
 def robust_std(rows: Rows, residual: FloatArray, *, firm: bool = False) -> FloatArray:
@@ -270,11 +266,15 @@ def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> fl
     return max(1.0, sums / max(squares, 1e-12))
 
 
-def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
-    """Return smooth weights of each place to each centre, squares summing to 1, shape (r, p)."""
-    squared = np.zeros((len(places), len(knowledge.centres)))
+def _kernel(knowledge: Knowledge, rows: Rows) -> FloatArray:
+    """Return smooth weights of each row to each centre, squares summing to 1, shape (r, p).
+
+    Faces that look elsewhere err on their own: a body that sags too far is too low on its upper face, and right on its sides.
+    """
+    squared = np.zeros((len(rows.place), len(knowledge.centres)))
     for i in range(3):
-        squared += (places[:, None, i] - knowledge.centres[None, :, i]) ** 2
+        squared += (rows.place[:, None, i] - knowledge.centres[None, :, i]) ** 2
+        squared += (ASIDE * knowledge.length * (rows.facing[:, None, i] - knowledge.facing[None, :, i])) ** 2
     weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / knowledge.length**2)
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
 
@@ -293,7 +293,7 @@ def _scatter(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> flo
 def gram_of(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
     """Return all inner products of (common, field, way × field, residual) in whitened rows, shape (c + 2p + 1,) squared."""
     std = robust_std(rows, rows.residual)
-    field = rows.of_clouds * _kernel(knowledge, rows.place)  # that of a marker is in its standard deviation
+    field = rows.of_clouds * _kernel(knowledge, rows)  # that of a marker is in its standard deviation
     A = np.hstack([common_columns(rows, sag), field, rows.way[:, None] * field, rows.residual[:, None]]) / std[:, None]
     return np.asarray(A.T @ A)
 

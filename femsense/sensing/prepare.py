@@ -15,7 +15,7 @@ from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, Scan, parted, read_scan
-from femsense.core.arrays import FloatArray, as_points, freeze
+from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.core.errors import FemsenseError, InputError
 from femsense.core.pose import moved_poses
 from femsense.fem.compliance import tangent_at
@@ -30,8 +30,8 @@ from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.background import background_of
-from femsense.sensing.measurement_rows import rows_at, seen_through
-from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
+from femsense.sensing.measurement_rows import facing_of, rows_at, seen_through
+from femsense.sensing.nuisance import first_knowledge, learn, sag_at
 from femsense.sensing.places import near_places, object_touches, objects_near
 from femsense.sensing.pose_beside_field import commons_beside_field
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
@@ -118,7 +118,8 @@ def prepare(
     pulls_are_modelled = recording.has_clouds and recording.actuation == "displacement"
     knowledge = first_knowledge(
         noises,
-        robot.body.mesh.nodes[surface.nodes],
+        robot.body.mesh.nodes[surface.triangles].mean(axis=1),
+        facing_of(robot.body.mesh.nodes[surface.triangles]),
         size,
         min(options.modulus_std, MODULUS_STD) if pulls_are_modelled else options.modulus_std,
         _pose_covariance(recording, calibration),
@@ -142,8 +143,9 @@ def prepare(
     sensor = replace(sensor, scenery=_scenery(sensor))
     free = _free_frames(sensor)
     learned = _taught(knowledge, free.values())
-    if pulls_are_modelled:
-        sensor = _better_posed(sensor, learned, free.values())
+    if free and (pulls_are_modelled or _declared(calibration).any()):
+        beside = commons_beside_field(knowledge, learned, _rows_of(free.values()), 6 * len(calibration.poses))
+        sensor = _better_posed(sensor, beside if pulls_are_modelled else learned.mean)
         knowledge, free = sensor.knowledge, _free_frames(sensor)
         learned = _taught(knowledge, free.values())
     background = background_of(sensor, min(free)) if free else None
@@ -156,11 +158,15 @@ def _pose_covariance(recording: Recording, calibration: Calibration) -> FloatArr
     A pose that was 0.1° and 0.07 mm off, taken for exact, made five of seven touches of `bar-gray` be taken for parts of the scene.
     """
     covariance = calibration.joint_covariance.copy()
-    for i in range(0, len(covariance), 6):
-        own = slice(i, i + 6)
-        if recording.has_clouds and not covariance[own, own].any():
-            covariance[own, own] = np.diag(DECLARED_STD**2)
+    for view in np.flatnonzero(_declared(calibration) & recording.has_clouds):
+        own = slice(6 * view, 6 * view + 6)
+        covariance[own, own] = np.diag(DECLARED_STD**2)
     return covariance
+
+
+def _declared(calibration: Calibration) -> BoolArray:
+    """Return which cameras have a pose that nobody fitted, shape (v,)."""
+    return np.asarray(~calibration.joint_covariance.reshape(len(calibration.poses), -1).any(axis=1))
 
 
 def _corrected(
@@ -190,12 +196,11 @@ def _corrected(
     return corrected(recording, correction, calibration.poses), correction.of_rows(recording)[1]
 
 
-def _better_posed(sensor: Sensor, learned: Knowledge, frames: Collection[FreeFrame]) -> Sensor:
-    """Return the sensor with poses and modulus as the free frames show them: rays and states near the true ones."""
+def _better_posed(sensor: Sensor, shown: FloatArray) -> Sensor:
+    """Return the sensor with poses and modulus as the free frames show them, shape (≥ 6 v + 1,): rays and states near the true ones."""
     v = 6 * len(sensor.calibration.poses)
-    if not learned.mean[: commons(learned)].any():
+    if not shown[: v + 1].any():
         return sensor
-    shown = commons_beside_field(sensor.knowledge, learned, _rows_of(frames), v)
     poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -shown[:v], sensor.pivot))
     robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + shown[v])))
     expected = sensor.knowledge.mean.copy()  # what was known beforehand, as it looks from there

@@ -10,8 +10,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.judge import unspoken
-from femsense.sensing.law import law_std
-from femsense.sensing.nuisance import response_std
+from femsense.sensing.law import law_std, response_std
 from femsense.sensing.touches import contact_radius, touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor, Touch
 

@@ -278,18 +278,14 @@ class Rows:
     """Node displacements (k, n, 3) → rows (r, k)."""
     residual: FloatArray
     """Measured minus modelled [m], shape (r,)."""
-    std: FloatArray
-    """[m], shape (r,)."""
+    std: FloatArray  # [m], shape (r,)
     by_pose: FloatArray
     """How the measured side moves with (rotation about the pivot [rad], shift [m]) of each camera, shape (r, 6 v)."""
-    place: FloatArray
-    """Where on the body at rest each row is taken [m], shape (r, 3)."""
+    place: FloatArray  # where on the body at rest each row is taken [m], shape (r, 3)
     way: FloatArray
     """How far that place has moved from rest [m], shape (r,)."""
-    count: int
-    """Points or markers."""
-    rms: float
-    """[m]."""
+    count: int  # points or markers
+    rms: float  # [m]
     missed: FloatArray = field(default_factory=lambda: np.zeros(0))
     """How far points of the scan whose rays meet nothing, or graze it, lie from the surface, in standard deviations, shape (q,)."""
     of_clouds: bool = False
@@ -304,6 +300,8 @@ class Rows:
     """How many points each row is the mean of, shape (r,); `std` is that of one of them. None: each row is one."""
     scatter: FloatArray | None = None
     """Mean square of the residuals of these about their mean [m²], shape (r,)."""
+    facing: FloatArray = field(default_factory=lambda: np.zeros((1, 3)))
+    """Outward unit normal of the body at rest there, shape (r, 3); zero for markers."""
     missed_number: FloatArray | None = None
     """How many points each of `missed` is, shape (q,); None: each is one."""
 
@@ -336,6 +334,8 @@ class Knowledge:
     """One a camera."""
     centres: FloatArray
     """Centres of the field of shared errors on the body at rest [m], shape (p, 3)."""
+    facing: FloatArray
+    """Outward unit normal of the surface at each, shape (p, 3)."""
     length: float
     """Over which errors go together [m]."""
     bias_m: float

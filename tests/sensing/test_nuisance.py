@@ -18,6 +18,7 @@ from femsense.model.camera import CameraNoise
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
+from femsense.sensing.law import response_std
 from femsense.sensing.nuisance import (
     first_knowledge,
     learn,
@@ -25,7 +26,6 @@ from femsense.sensing.nuisance import (
     misfit_of,
     nuisance_columns,
     nuisance_excess,
-    response_std,
     robust_std,
 )
 from femsense.sensing.pipeline import estimate
@@ -34,6 +34,7 @@ from femsense.sensing.types import Knowledge, Rows
 
 STD = 3e-4
 SAG = np.zeros((1, 4, 3))
+UP, ASIDE = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
 FRICTION = [{"name": "cable_friction", "coefficient": 0.5}]
 
 
@@ -41,7 +42,9 @@ def knowledge() -> Knowledge:
     """Return what is known of a plate of 200 × 100 mm before a free frame is seen."""
     x, y = np.meshgrid(np.linspace(0, 0.2, 21), np.linspace(0, 0.1, 11))
     nodes = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    return first_knowledge((CameraNoise("stereo", at_1m=0.002),), nodes, 0.22, 0.03, 1e-8 * np.eye(6))
+    return first_knowledge(
+        (CameraNoise("stereo", at_1m=0.002),), nodes, UP * np.ones((len(nodes), 1)), 0.22, 0.03, 1e-8 * np.eye(6)
+    )
 
 
 def plate_rows(window: int, seed: int = 0) -> Rows:
@@ -165,9 +168,21 @@ def test_what_free_frames_leave_alike_is_expected_of_the_next_one():
     assert np.linalg.norm(columns[middle], axis=1).max() < 1e-4
 
 
+def test_faces_that_look_elsewhere_err_on_their_own():
+    """Of two rows at one edge, one on the upper face and one on the side; and of two on the upper face."""
+    known, rows = knowledge(), plate_rows(1)
+    known = replace(known, centres=np.repeat(known.centres[:12], 2, axis=0), facing=np.tile([UP, ASIDE], (12, 1)))
+    pick = np.array([5000, 5000, 5001])
+    edge = replace(rows, place=rows.place[pick], by_pose=np.zeros((3, 6)), functional=lambda u: np.zeros((3, len(u))))
+    columns, _ = nuisance_columns(known, replace(edge, way=np.ones(3), facing=np.array([UP, ASIDE, UP])), SAG)
+    together = columns @ columns.T
+    assert together[0, 1] < 0.1 * together[0, 0]
+    assert together[0, 2] > 0.9 * together[0, 0]
+
+
 def test_free_frames_tell_how_hard_a_cable_truly_pulls():
     moves = np.zeros((2, 4, 3))
-    before = first_knowledge(knowledge().noises, knowledge().centres, 0.22, 0.03, 1e-8 * np.eye(6), drives=1)
+    before = first_knowledge(knowledge().noises, knowledge().centres, knowledge().facing, 0.22, 0.03, 1e-8 * np.eye(6), drives=1)
     frames = []
     for seed in range(3):
         rows = plate_rows(1, seed)
@@ -180,7 +195,7 @@ def test_free_frames_tell_how_hard_a_cable_truly_pulls():
 
 
 def test_pulls_that_the_model_needs_say_how_far_its_answer_to_a_force_is_off():
-    before = first_knowledge(knowledge().noises, knowledge().centres, 0.22, 0.03, 1e-8 * np.eye(6), drives=2)
+    before = first_knowledge(knowledge().noises, knowledge().centres, knowledge().facing, 0.22, 0.03, 1e-8 * np.eye(6), drives=2)
     mean, root = before.mean.copy(), before.root.copy()
     mean[7:9], root[6:9, 6:9] = (0.04, -0.04), np.diag([0.0, 0.03, 0.03])
     assert response_std(replace(before, mean=mean, root=root), 1) == pytest.approx(0.05)
@@ -230,8 +245,10 @@ def test_a_declared_pose_is_not_taken_for_exact_where_clouds_tell_it(tmp_path):
     off = moved_poses(fitted.poses, np.array([0.0, 4e-3, 0.0, 0.0, 0.0, 5e-4]), np.zeros(3))
     nobody = np.zeros_like(fitted.pose_covariance)
     declared = replace(fitted, poses=off, T_robot_camera=off[0], pose_covariance=nobody, joint_covariance=nobody)
-    known = make_sensor(robot, recording, declared).knowledge
-    assert known.mean[:6].any() and known.bias_m < 3e-4
+    sensor = make_sensor(robot, recording, declared)
+    moved = np.linalg.norm((sensor.calibration.poses[0] - off[0])[:3, :3])
+    assert moved > 0.2 * np.linalg.norm((fitted.poses[0] - off[0])[:3, :3])
+    assert sensor.knowledge.bias_m < 3e-4
 
 
 def test_what_clouds_leave_does_not_judge_frames_with_markers_alone(tmp_path):
