@@ -22,7 +22,7 @@ from femsense.sensing.states import solve_with
 from femsense.sensing.touches import moved_to, pressed, touch_normal, within_cones
 from femsense.sensing.types import Fit, Response, Sensor, Start, Touch
 
-TRIES = 4
+TRIES = 6
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
 SLIGHT = 1e-4
 """A step that lowered the cost by less than this share of it is the last one."""
