@@ -150,7 +150,12 @@ class _Frame:
         """Return an iterate with its equilibrium and rows; None where it has none."""
         try:
             state = solve_with(self.sensor, self.k, there.touches, there.forces, there.state, before=self.before, tried=True)
-            return replace(there, state=state, rows=rows_at(self.sensor, self.k, self.scan, state))
+            forces = within_cones(self.sensor, there.touches, there.forces, state)
+            if not np.array_equal(
+                forces, there.forces
+            ):  # the surface has turned: outside its cone a force could explain more than any within
+                state = solve_with(self.sensor, self.k, there.touches, forces, state, before=self.before, tried=True)
+            return replace(there, forces=forces, state=state, rows=rows_at(self.sensor, self.k, self.scan, state))
         except DataError:
             return None
 
