@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from femsense.core.pose import invert_pose, transform_points
 from femsense.model.recording import Recording
 
 TRIED = 1.5
-"""A pose is fitted where it could take a third of the residual away, inputs as they are."""
+"""A pose is fitted where it could take a third of the residual away, inputs as they are; and spoken of where it does."""
 DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
 """What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/forces.md has the trial)."""
 Fitted = tuple[float, Sequence[FloatArray]]
@@ -25,7 +26,8 @@ def check_declared_poses(
     recording: Recording, poses: Sequence[FloatArray], pairs: Sequence[Pairs], refit: Callable[[Recording], Fitted]
 ) -> None:
     """Refuse a declared pose where one that is fitted leaves a quarter of the residual. What the model lacks does not: with a modulus
-    of half to three times the true one, the arm of the tests leaves half, as it sags by the same in all frames.
+    of half to three times the true one, the arm of the tests leaves half, as it sags by the same in all frames. Where the fitted one
+    leaves a third less, a warning names both, pose and model.
 
     Arguments:
         recording: as it is calibrated.
@@ -42,15 +44,19 @@ def check_declared_poses(
             continue
         before = float(np.sqrt(((one.measured - one.modelled) ** 2).sum(axis=1).mean()))
         freedom = float(np.sqrt(rows / (rows - 6.0)))
-        if before < max(SUSPICIOUS * one.spread, TRIED * rigid_rms(one.modelled, one.measured)):
+        if before < TRIED * rigid_rms(one.modelled, one.measured):
             continue
         open_poses = tuple(None if v == view else T for v, T in enumerate(recording.T_robot_camera))
         try:
             left, fitted = refit(replace(recording, T_robot_camera=open_poses))
         except DataError:
             continue
-        if before > EXPLAINED * freedom * left:
-            raise DataError(said(recording, view, declared, fitted[view], one.modelled.mean(axis=0), before, left))
+        if before < TRIED * freedom * left:
+            continue
+        text = said(recording, view, declared, fitted[view], one.modelled.mean(axis=0), before, left)
+        if before > max(EXPLAINED * freedom * left, SUSPICIOUS * one.spread):
+            raise DataError(text)
+        warnings.warn(f"{text}. Or the model errs by as much: femsense improve", stacklevel=5)
 
 
 def said(

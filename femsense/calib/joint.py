@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.inputs import input_bounds
 from femsense.core.arrays import FloatArray
 from femsense.core.least_squares import FitResult, gauss_newton
@@ -47,6 +50,7 @@ def fit_joint(
             break
         problem.weigh(jet, huber, len(theta))
     moved, inputs = problem.place(theta)
+    fit = replace(fit, covariance=problem.beside_declared(jet, fit.covariance))
     return fit, moved, inputs, jet  # an input at its bound is no better known than others: what they have in common moves all
 
 
@@ -60,6 +64,7 @@ class _Problem:
         self.base_poses, self.initial = list(poses), initial
         self.pivot = robot.marker_points.mean(axis=0)
         self.moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
+        self.declared = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is not None]
         self.free_inputs = len(initial) if initial is not None and free_inputs else 0
         self.repeats = _repeats(scene)
         self.weights, self.std, self.placement_std = self.repeats, 5e-4, PLACEMENT_STD_FLOOR
@@ -107,16 +112,30 @@ class _Problem:
         return residual, self._jacobian(jet, row[:, :, None]) if derivative else None
 
     def _jacobian(self, jet: SceneJet, row: FloatArray) -> FloatArray:
-        columns = [c for v in self.moving for c in range(6 * v, 6 * v + 6)]
-        by_pose = np.vstack(
+        a = self.free_inputs
+        by_inputs = np.vstack([(row * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
+        return np.hstack([self._by_poses(jet, row, self.moving), by_inputs])
+
+    def _by_poses(self, jet: SceneJet, row: FloatArray, views: list[int]) -> FloatArray:
+        columns = [c for v in views for c in range(6 * v, 6 * v + 6)]
+        return np.vstack(
             [
                 (row * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
                 jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / self.placement_std,
             ]
         )
-        a = self.free_inputs
-        by_inputs = np.vstack([(row * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
-        return np.hstack([by_pose, by_inputs])
+
+    def beside_declared(self, jet: SceneJet, covariance: FloatArray) -> FloatArray:
+        """Return the covariance of what is free where declared poses may be off by `DECLARED_STD`, as far as the markers do not tell them
+        (the block of the inverse of all normal equations)."""
+        if not self.declared or not self.free_inputs or not np.isfinite(covariance).all():
+            return covariance
+        row = (self.weights / self.std)[:, None, None]
+        own, other = self._jacobian(jet, row), self._by_poses(jet, row, self.declared)
+        moved = np.linalg.lstsq(own, other, rcond=None)[0]
+        left = other - own @ moved
+        normal = left.T @ left + np.diag(np.tile(DECLARED_STD**-2.0, len(self.declared)))
+        return np.asarray(covariance + moved @ np.linalg.solve(normal, moved.T))
 
     def weigh(self, jet: SceneJet, huber: FloatArray, parameters: int) -> None:
         """Take weights and noise from a residual; an outlier counts as the largest residual that is none."""
