@@ -222,8 +222,8 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
     _watch(live, readings, shown, lambda: readings.trouble)
 
     def run() -> None:
-        for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
-            message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers))
+        for seq, (time_s, markers, why) in enumerate(markers_of_sensors(readings, model)):
+            message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers, why))
             live.hub.publish([message])
             live.hub.received(message, "sensors")
 

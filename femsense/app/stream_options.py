@@ -10,20 +10,23 @@ from femsense.core.errors import InputError
 
 def need_stream(runs: Sequence[Path], sensors: str | None, *, drag: bool) -> None:
     """Raise InputError unless there are runs or sensors; both go together where sensors measure what is dragged."""
-    if not (runs and sensors is not None and drag):
+    if runs and sensors is not None:
+        need_with("RUN with --sensors", True, "--drag", drag)
+    else:
         need_one(runs, sensors)
 
 
 def need_one(runs: Sequence[Path], source: str | None) -> None:
     """Raise InputError unless there are runs or a live source, and not both."""
     if bool(runs) == (source is not None):
-        raise InputError("one of both is needed", where="femsense", expected="RUN, or a live source (--sensors, --stream)")
+        found = "both" if runs else "neither"
+        raise InputError("either a run or a live source", where="RUN", found=found, expected="RUN, --sensors or --stream")
 
 
 def need_model(sensors: str | None, model: Path | None) -> None:
     """Raise InputError where sensors come without a model, or a model without sensors."""
     if (sensors is None) != (model is None):
-        raise InputError("sensors go with a model", where="femsense stream", expected="--sensors SOURCE --model MODEL")
+        raise InputError("sensors go with a model", where="--sensors", expected="--sensors SOURCE --model MODEL")
 
 
 def need_with(option: str, given: bool, other: str, there: bool) -> None:

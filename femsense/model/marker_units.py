@@ -17,6 +17,8 @@ APART, NEAR = 2.0, 0.2
 """Markers that are so many times as far apart as on the robot are in another unit: no silicone stretches so far, and none coils up so tightly."""
 SMALLEST, LARGEST = 0.02, 2.0
 """A robot's markers span between these [m]: those of the robots in meshes/ span 0.06 to 0.25 m, in centimetres that would read 6 to 25."""
+FARTHEST = 10.0
+"""Markers that span more [m] are no robot's: depth cameras see less far."""
 FEWEST = 3
 """Fewer markers in a frame tell nothing of their distances."""
 
@@ -63,12 +65,17 @@ def doubt_of_size(points: FloatArray) -> str:
 
     Used where nothing says how large the robot is.
     """
-    low, high = np.quantile(points.reshape(-1, 3), [0.01, 0.99], axis=0)
-    across = float(np.linalg.norm(high - low))
+    across = span(points)
     if not across > LARGEST:
         return ""
     meant = [f"in {UNITS[times]} ({across / times:.2g} m)" for times in (1e3, 1e2) if SMALLEST < across / times < LARGEST]
     return f"the markers span {across:.4g} m: are they {' or '.join(meant) or 'in another unit'}? The file holds metres"
+
+
+def span(points: FloatArray) -> float:
+    """Return how far markers (n, m, 3) are apart, in all rows together [m]; a few that are lost do not count."""
+    low, high = np.quantile(points.reshape(-1, 3), [0.01, 0.99], axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def _check_scale(scale: float, than: str, hint: Callable[[float], str]) -> None:

@@ -70,6 +70,13 @@ def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str
     files = write_day(tmp_path / "few", 1, rows=30)
     assert run(["learn", *files, "-o", str(tmp_path / "m.onnx")]) == 1
     assert "at least 60 are needed" in capsys.readouterr().err and not (tmp_path / "m.onnx").exists()
+    sensors, markers = write_day(tmp_path / "millimetres", 1)
+    head, *rows = Path(markers).read_text(encoding="utf-8").splitlines()
+    numbers = [row.split(",") for row in rows]
+    larger = [",".join([*row[:2], *(f"{1e3 * float(value):.4f}" for value in row[2:])]) for row in numbers]
+    Path(markers).write_text("\n".join([head, *larger]), encoding="utf-8")
+    assert run(["learn", sensors, markers, "-o", str(tmp_path / "m.onnx")]) == 1
+    assert "are they in millimetres" in capsys.readouterr().err and not (tmp_path / "m.onnx").exists()
     assert run(["learn", files[0], files[0], "-o", str(tmp_path / "m.onnx")]) == 2
     assert run(["learn", *files, "-o", str(tmp_path / "m.onnx"), "--plane", "up"]) == 2
     assert "not a direction" in capsys.readouterr().err

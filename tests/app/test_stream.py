@@ -286,11 +286,11 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
             (said,) = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)["markers"]
             assert said["name"] == marker and said["position_m"]["z"] == pytest.approx(rest[2] + 1e-3, abs=1e-7)
             assert told["measured_error_m"] == pytest.approx(1e-3, abs=1e-6)
-            file.write("1e9,50\n")  # never learnt: says nothing
+            file.write("1e9,50\n")  # never learnt: says no place, and why
             file.flush()
             time.sleep(0.2)
-    (said,) = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)["markers"]
-    assert said["position_m"]["z"] < rest[2] + 2e-3
+    unknown = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)
+    assert unknown["markers"] == [] and unknown["detail"].startswith("bend = 50 is outside ")
 
 
 def heeding_interrupts() -> None:
@@ -322,11 +322,11 @@ def command_line(*arguments: str) -> Iterator[str]:
 def test_commands_that_name_nothing_or_too_much_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     from femsense.app.cli import run
 
-    assert run(["stream"]) == 2 and "one of both" in capsys.readouterr().err
+    assert run(["stream"]) == 2 and "femsense: RUN: either a run or a live source" in capsys.readouterr().err
     assert run(["stream", "no-such-run"]) == 2 and "no states.npz" in capsys.readouterr().err
     assert (
         run(["stream", "no-such-run", "--sensors", "x.csv", "--model", "m.onnx"]) == 2
-        and "one of both" in capsys.readouterr().err
+        and "femsense: RUN with --sensors: RUN with --sensors does nothing without --drag" in capsys.readouterr().err
     )
     for call, needs in (
         (["stream", "a-run", "--commands"], "--commands does nothing without --drag"),

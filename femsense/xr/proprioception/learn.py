@@ -11,7 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, InputError
-from femsense.model.marker_units import doubt_of_size
+from femsense.model.marker_units import FARTHEST, doubt_of_size, span
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.domain import learn_domain
@@ -176,6 +176,8 @@ def saturated_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[
 
 def _check(data: Labelled, options: LearnOptions) -> None:
     if doubt := doubt_of_size(data.markers):
+        if span(data.markers) > FARTHEST:
+            raise DataError(f"{doubt}\n  try:      x_m, y_m and z_m in metres")
         warnings.warn(doubt, stacklevel=3)
     if not options.kinds or not set(options.kinds) <= set(KINDS):
         raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(KINDS))

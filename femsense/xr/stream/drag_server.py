@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Event, Lock, Thread
 from typing import Any, TypeGuard
 
@@ -133,7 +133,10 @@ class DragServer:
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
         self._settled_since: float | None = None
-        self._fresh, self._stop, self._lock = Event(), Event(), Lock()
+        self._measured_at: dict[str, float] = {}  # marker → when it was measured last
+        self._unmeasured, self._unmeasured_at = "", float("-inf")  # why it is not
+        self._answer: tuple[FloatArray, dict[str, Any]] | None = None
+        self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
         self._seq = self._commands = 0
         hub.listen(self._hear)
         self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
@@ -165,6 +168,9 @@ class DragServer:
         inputs = self._values(told)
         with self._lock:
             place = places.get(self._handle)
+            self._measured_at.update((name, now) for name, there in places.items() if there is not None)
+            if why := str(told.get("detail", "")):
+                self._unmeasured, self._unmeasured_at = why, now
             if place is not None and self._is_near(place):
                 self.feedback.measured(now, np.array(place))
             if inputs:
@@ -228,9 +234,12 @@ class DragServer:
             moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
             current = {**self.gate.last, **self._current(time.monotonic())} if moves else self._shown()
             last = self._motion
-            reached = None if last is None or last.status == REACHED else last.reached_m.get(handle)
+            reached = None if last is None else last.reached_m.get(handle)
+            arrived = last is not None and last.status == REACHED
             since = self._settled()
-            wanted = self.feedback.target(time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached)
+            wanted = self.feedback.target(
+                time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached, arrived=arrived
+            )
         if grabbed and len(current) == len(self.gate.inputs):
             self._follower.begin(current)
         if (handle, target_m) != self._wanted:
@@ -242,11 +251,23 @@ class DragServer:
             with self._lock:
                 self.gate.want(motion.inputs, turn=turn)
         self._bones = self._fit(self._skin.positions(motion.positions), start=self._bones)
-        self._seq += 1
-        found = self._document(motion, 1e3 * (time.perf_counter() - begun))
-        ghost = pose_bytes(self._seq, time.time(), bone_rows(self._bones))
-        self.hub.publish([Message(topic(self.name, GHOST), ghost), Message(topic(self.name, REACH), found)])
+        off = float(np.linalg.norm(self.feedback.expected(motion.reached_m[handle]) - np.array(target_m)))
+        asked = replace(motion, error_m=off)  # the search knows only of the target that was moved
+        self._tell((self._bones, self._document(handle, asked, 1e3 * (time.perf_counter() - begun))))
         return motion
+
+    def _tell(self, answer: tuple[FloatArray, dict[str, Any]] | None = None) -> None:
+        """Publish an answer, or the newest once more, with whether commands go out now."""
+        with self._telling:
+            self._answer = answer or self._answer
+            if self._answer is None:
+                return
+            self._seq += 1
+            bones, document = self._answer
+            document = {"header": header(self._seq, time.time(), "robot"), **document, "armed": self.gate.moving}
+            ghost = pose_bytes(self._seq, time.time(), bone_rows(bones))
+            found = json.dumps(document).encode()
+            self.hub.publish([Message(topic(self.name, GHOST), ghost), Message(topic(self.name, REACH), found)])
 
     def _settled(self) -> float | None:
         """Return since when the commanded inputs are those of the newest answer, or None."""
@@ -256,25 +277,31 @@ class DragServer:
             self._settled_since = time.monotonic()
         return self._settled_since
 
-    def _document(self, motion: Motion, ms: float) -> bytes:
+    def _why_not_measured(self, handle: str, now: float) -> str:
+        """Return in words why nothing corrects a point at a time [s]; empty where it is measured, or nobody ever measured."""
+        fresh, ago = self.options.feedback.fresh_s, now - self._measured_at.get(handle, float("-inf"))
+        if ago <= fresh or not (self._measured_at or self._unmeasured):
+            return ""
+        if now - self._unmeasured_at <= fresh:
+            return f"; not measured: {self._unmeasured}"
+        return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'nobody says where {handle} is'}"
+
+    def _document(self, handle: str, motion: Motion, ms: float) -> dict[str, Any]:
         units = {one.name: one.unit for one in self.gate.inputs}
         missed = self.feedback.missed_m
-        measured = "" if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
+        unknown = self._why_not_measured(handle, time.monotonic())
+        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
         known = {} if np.isnan(missed) else {"measured_error_m": missed}
         begins = "" if self._is_known(time.monotonic()) else BEGINS
-        return json.dumps(
-            {
-                "header": header(self._seq, time.time(), "robot"),
-                "status": motion.status,
-                "text": motion.text + measured + begins,
-                "error_m": motion.error_m,
-                **known,
-                "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
-                "ms": ms,
-                "armed": self.gate.moving,
-                "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in motion.inputs.items()],
-            }
-        ).encode()
+        return {
+            "status": motion.status,
+            "text": motion.text + measured + begins,
+            "error_m": motion.error_m,
+            **known,
+            "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
+            "ms": ms,
+            "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in motion.inputs.items()],
+        }
 
     # ---- commands
 
@@ -288,10 +315,18 @@ class DragServer:
             if inputs is not None:
                 self._command(inputs, armed=True)
             elif was_moving and not moving:
-                self._command({}, armed=False)
+                self._stopped()
             was_moving = moving
         if was_moving:
-            self._command({}, armed=False)
+            with self._lock:
+                self.gate.release()
+                self.gate.step(time.monotonic(), {})
+            self._stopped()
+
+    def _stopped(self) -> None:
+        """Say that no more commands come: the inputs stay. The newest answer, which who comes late gets, says so too."""
+        self._command(self.gate.last, armed=False)
+        self._tell()
 
     def _command(self, inputs: Mapping[str, float], *, armed: bool) -> None:
         units = {one.name: one.unit for one in self.gate.inputs}

@@ -279,10 +279,10 @@ def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Seque
     return _json({"header": header(seq, time_s, frame_id), "inputs": rows})
 
 
-def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike]) -> bytes:
-    """Return where markers of a robot were measured, name → place [m], robot frame, shape (3,)."""
+def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike], detail: str = "") -> bytes:
+    """Return where markers of a robot were measured, name → place [m], robot frame, shape (3,); `detail`: why they were not."""
     rows = [{"name": name, "position_m": _vector(place)} for name, place in markers.items()]
-    return _json({"header": header(seq, time_s, "robot"), "markers": rows})
+    return _json({"header": header(seq, time_s, "robot"), "markers": rows, **({"detail": detail} if detail else {})})
 
 
 def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:

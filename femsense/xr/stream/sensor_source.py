@@ -54,16 +54,18 @@ def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterato
         yield TwinFrame(time_s, bones, contacts=None, inputs=inputs, status=said or "ok", read_at=read_at)
 
 
-def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray]]]:
+def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray], str]]:
     """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading (see `readings_of`).
 
-    Readings outside of what the model was taught are left out: their markers are guesses. So are those that are old when they come.
+    Of readings outside of what the model was taught there are no places, which would be guesses, but why there are none.
+    Those that are old when they come are left out.
     """
     live = model.live()
     for time_s, row in readings:
         pose = live.step(row, time_s)
-        if not pose.outside and time.monotonic() - readings.came <= STALE_S:
-            yield time_s, dict(zip(model.marker_names, pose.markers))
+        if time.monotonic() - readings.came <= STALE_S:
+            why = "; ".join(item.text for item in pose.outside[:1])
+            yield time_s, {} if why else dict(zip(model.marker_names, pose.markers)), why
 
 
 def tube_around(places: FloatArray, across: FloatArray) -> tuple[Skin, IntArray]:

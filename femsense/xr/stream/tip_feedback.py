@@ -40,6 +40,8 @@ class TipFeedback:
         """What is added to the target [m], shape (3,)."""
         self.missed_m = float("nan")
         """How far the point was measured from where it is wanted [m]; nan where nothing fresh is known."""
+        self.offset_m: FloatArray = np.zeros(3)
+        """Where the point was measured, from where the model had it at the same inputs [m], shape (3,)."""
         self._most = self.options.most_share * size_m
         self._seen: tuple[float, FloatArray] | None = None
         self._used = float("-inf")
@@ -51,11 +53,21 @@ class TipFeedback:
 
     def forget(self) -> None:
         """Begin anew: another point, or nobody holds on."""
-        self.correction_m, self.missed_m = np.zeros(3), float("nan")
+        self.correction_m, self.offset_m, self.missed_m = np.zeros(3), np.zeros(3), float("nan")
         self._seen, self._used, self._wanted = None, float("-inf"), None
 
+    def expected(self, reached_m: FloatArray) -> FloatArray:
+        """Return where the point will be measured whose inputs bring it to a place by the model [m], shape (3,)."""
+        return np.asarray(reached_m + self.offset_m)
+
     def target(
-        self, now: float, wanted_m: FloatArray, *, settled_since: float | None, reached_m: FloatArray | None = None
+        self,
+        now: float,
+        wanted_m: FloatArray,
+        *,
+        settled_since: float | None,
+        reached_m: FloatArray | None = None,
+        arrived: bool = False,
     ) -> FloatArray:
         """Return the target for the model [m], shape (3,).
 
@@ -63,7 +75,8 @@ class TipFeedback:
             now: the time [s].
             wanted_m: where the point is to be [m], shape (3,).
             settled_since: since when the inputs stand still where the model wants them [s]; None: they do not.
-            reached_m: where the model's inputs for the target before bring the point [m], shape (3,), if not to that target.
+            reached_m: where the model's inputs for the target before bring the point [m], shape (3,); None: to that target.
+            arrived: they bring it to that target, but for the search's tolerance, which is not to wind the correction up.
         """
         wanted = np.asarray(wanted_m, dtype=np.float64)
         at, place = self._seen or (float("-inf"), wanted)
@@ -76,7 +89,9 @@ class TipFeedback:
             return self._aimed(wanted)
         elapsed = min(at - (self._used if np.isfinite(self._used) else settled_since), self.options.time_s)
         self._used = at
-        done = self.correction_m if reached_m is None or self._wanted is None else reached_m - self._wanted
+        aimed = (wanted if self._wanted is None else self._wanted) + self.correction_m
+        self.offset_m = place - (aimed if reached_m is None else reached_m)
+        done = self.correction_m if reached_m is None or arrived or self._wanted is None else reached_m - self._wanted
         grown = done + (1.0 - np.exp(-elapsed / self.options.time_s)) * error
         self.correction_m = grown * min(1.0, self._most / max(float(np.linalg.norm(grown)), 1e-12))
         return self._aimed(wanted)

@@ -272,6 +272,58 @@ def test_a_correction_is_bounded_waits_for_the_robot_and_forgets() -> None:
     np.testing.assert_array_equal(feedback.target(9.0, wanted, settled_since=1.05), wanted)
 
 
+@pytest.mark.parametrize("arrived", [True, False])
+def test_where_a_point_will_be_is_what_the_model_says_beside_what_was_measured(arrived: bool) -> None:
+    feedback, wanted = TipFeedback(0.1), np.array([0.0, 0.0, 0.2])
+    reached = wanted if arrived else np.array([0.0, 0.0, 0.19])
+    np.testing.assert_array_equal(feedback.expected(reached), reached)
+    for k in range(40):
+        feedback.measured(2.0 + 0.1 * k, reached - [0.01, 0.0, 0.0])
+        feedback.target(2.0 + 0.1 * k, wanted, settled_since=1.05, reached_m=reached, arrived=arrived)
+    np.testing.assert_allclose(feedback.expected(reached + 1e-3), reached + 1e-3 - [0.01, 0.0, 0.0], atol=1e-15)
+    feedback.forget()
+    np.testing.assert_array_equal(feedback.expected(reached), reached)
+
+
+def test_an_answer_speaks_of_the_target_that_was_asked_and_says_why_nothing_is_measured(
+    served: tuple[Hub, DragServer, ObedientRobot],
+) -> None:
+    hub, server, _ = served
+    real = ObedientRobot(hub, bar((6, 2, 2)), "bar", drive_inputs(server.robot))
+    far = server.robot.marker_points[0] + [0.02, 0.0, 0.0]  # it does not grow longer
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end and not reach_of(hub).get("correction_m", 0.0) > 1e-3:
+        drag(hub, far)
+        real.report(("tip", "side"))
+        time.sleep(0.03)
+    told = reach_of(hub)
+    assert told["measured_error_m"] > 0.015 and told["error_m"] == pytest.approx(told["measured_error_m"], abs=3e-3)
+    assert f"{1e3 * told['error_m']:.3g} mm" in told["text"] and "not measured" not in told["text"]
+
+    def says(text: str, more: dict[str, Any] | None = None) -> bool:
+        drag(hub, far)
+        if more:
+            hub.received(Message("femsense/bar/measured", json.dumps(more).encode()), "sensors")
+        return text in reach_of(hub)["text"] and "measured_error_m" not in reach_of(hub)
+
+    assert within(10.0, lambda: says("; not measured: nothing for "))
+    assert within(10.0, lambda: says("; not measured: bend = 50 is outside", {"markers": [], "detail": "bend = 50 is outside"}))
+    drag(hub, far, handle="side", held=False)
+
+
+def test_a_drag_that_has_ended_is_armed_for_nobody_and_its_inputs_stay(alone: tuple[Hub, DragServer]) -> None:
+    hub, server = alone
+    out = Commands(hub, server)
+    far = target_of(server.robot, dict(zip(server.robot.body.cable_names, (1.5, 0.6))))
+    for end in (lambda: drag(hub, far, held=False), server.close):
+        hold(hub, out, far)
+        assert within(5.0, lambda: reach_of(hub)["armed"])
+        end()
+        assert within(5.0, lambda: not reach_of(hub)["armed"])
+        last = json.loads(hub.newest()["femsense/bar/command"].payload)
+        assert not last["armed"] and [row["value"] for row in last["inputs"]] == out.sent[-1]
+
+
 def test_after_a_lapse_commands_go_on_from_the_last_one_though_a_run_plays_on(alone: tuple[Hub, DragServer]) -> None:
     hub, server = alone
     names, out = server.robot.body.cable_names, Commands(hub, server)

@@ -246,7 +246,7 @@ def test_markers_of_a_row_that_is_old_say_nothing(model: ProprioceptiveModel, tm
     time.sleep(0.3)
     with file.open("a", encoding="utf-8") as stream:
         stream.write("1,0.3,0.4\n")
-    assert within(5.0, lambda: bool(found)) and [at for at, _ in found] == [1.0]
+    assert within(5.0, lambda: bool(found)) and [at for at, *_ in found] == [1.0]
     stop.set()
 
 
