@@ -22,6 +22,7 @@ from femsense.io.provenance import finished, recording_input
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import check_loop_folder, loop_inputs, read_loop, write_loop
+from femsense.report.text import model_error
 from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, write_run
 
 if TYPE_CHECKING:
@@ -78,6 +79,8 @@ def estimate_into(
         raise DataError(f"the calibration is not to be used: {used.status}")
     if given is not None:
         check_given(body, frames, given)
+    elif model_error(used):
+        say(f"residual of the calibration {1e3 * used.rms_m:.3f} mm, error of the model {model_error(used)}")
     began = time.perf_counter()
     run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
     write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)

@@ -47,7 +47,7 @@ def calibration_text(calibration: Calibration) -> str:
         rows.append(["residual", f"{1e3 * c.rms_m:.3f} mm rms over {len(c.marker_rms_m)} markers in {len(c.frames)} frames"])
         worst = max(c.marker_rms_m, key=lambda name: c.marker_rms_m[name], default=None)
         rows += [] if worst is None else [["worst marker", f"{worst}, {1e3 * c.marker_rms_m[worst]:.3f} mm rms"]]
-        rows += _model_error(c)
+        rows += [["error of the model", model_error(c)]] if model_error(c) else []
     for name, tension in c.cable_tension_n.items():
         rows.append(
             [
@@ -62,16 +62,15 @@ def calibration_text(calibration: Calibration) -> str:
     return "calibration\n" + columns(rows)
 
 
-def _model_error(c: Calibration) -> list[list[str]]:
-    """Return how much of the residual is an error of the model, where it is much more than what markers repeat to."""
+def model_error(c: Calibration) -> str:
+    """Return how much of the residual is an error of the model, where it is much more than what markers repeat to; else nothing."""
     if not c.rms_m > MODEL_ERRS * c.noise_m:
-        return []
+        return ""
     own = float(np.sqrt(c.rms_m**2 - c.noise_m**2))
-    said = (
+    return (
         f"{1e3 * own:.3f} mm of it: markers repeat to {1e3 * c.noise_m:.3f} mm. The pose is no better than the model "
         f"(femsense improve)"
     )
-    return [["error of the model", said]]
 
 
 def run_document(run: Run) -> dict[str, Any]:

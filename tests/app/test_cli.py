@@ -335,6 +335,14 @@ def test_without_a_calibration_one_is_made_and_said(run: Any, robot: Path, recor
     assert read_calibration(tmp_path / "run").status == "converged"
 
 
+def test_an_error_of_the_model_is_said_where_estimate_calibrates(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
+    table, body = recording / "recording.toml", robot / "robot.toml"
+    table.write_text("marker_noise_m = 1e-6\n" + table.read_text(encoding="utf-8"), encoding="utf-8")
+    body.write_text(body.read_text(encoding="utf-8").replace("= 150000.0", "= 40e3"), encoding="utf-8")
+    said = run("estimate", robot, recording, "-o", tmp_path / "run", "--at", "0.1,0.015,0.015")
+    assert said.status == 0 and "error of the model" in said.err
+
+
 def test_a_second_run_computes_nothing(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
     arguments = ("estimate", robot, recording, "-o", tmp_path / "run", "--at", "0.1,0.015,0.015")
     first = run(*arguments)
