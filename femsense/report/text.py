@@ -76,15 +76,16 @@ def model_error(c: Calibration) -> str:
 def run_document(run: Run) -> dict[str, Any]:
     """Return a run in numbers."""
     good = [frame for frame in run.frames if frame.status == "ok"]
-    touched = [frame for frame in good if frame.contacts] or good
     strongest, felt = _strongest(run), sensed(run.contacts)
+    feels = {contact.frame for contact in felt}
+    touched = [frame for frame in good if frame.frame in feels] or good
     return {
         "robot": run.robot.name,
         "frames": len(run.frames),
         "frames_ok": len(good),
         "contacts": count_of(run),
         "contacts_in_frames": len(felt),
-        "frames_with_contact": len({contact.frame for contact in felt}),
+        "frames_with_contact": len(feels),
         "largest_force_n": None if strongest is None else strongest.force_n,
         "rms_before_m": _median([frame.rms_before_m for frame in touched]),
         "rms_after_m": _median([frame.rms_after_m for frame in touched]),
@@ -107,7 +108,7 @@ def run_text(run: Run) -> str:
     """Return a run in a few lines."""
     facts, strongest = run_document(run), _strongest(run)
     rows = [["frames", f"{facts['frames_ok']} of {facts['frames']} ok"]]
-    touched = f"{facts['contacts']} in {facts['frames_with_contact']} frames"
+    touched = f"{facts['contacts']} in {facts['frames_with_contact']} frames" if facts["contacts"] else "none"
     doubted = len({c.frame for c in sensed(run.contacts)} - {frame.frame for frame in run.frames if frame.status == "ok"})
     rows.append(["contacts", f"{touched}, {doubted} of them not ok" if doubted else touched])
     if facts["rms_after_m"] is not None:
@@ -116,7 +117,7 @@ def run_text(run: Run) -> str:
                 "residual",
                 (
                     f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with the forces, median of "
-                    f"the frames with contact"
+                    f"{'the frames with contact' if facts['contacts'] else 'all frames'}"
                 ),
             ]
         )
@@ -179,9 +180,9 @@ def known_part(contact: ContactForce) -> str:
 
 
 def _strongest(run: Run) -> ContactForce | None:
-    """Return the contact with the largest force of the frames that are ok; None where there is none."""
+    """Return the sensed contact with the largest force of the frames that are ok; None where there is none."""
     good = {frame.frame for frame in run.frames if frame.status == "ok"}
-    return max((c for c in run.contacts if c.frame in good), key=lambda contact: contact.force_n, default=None)
+    return max((c for c in sensed(run.contacts) if c.frame in good), key=lambda contact: contact.force_n, default=None)
 
 
 def _median(values: Sequence[float]) -> float | None:

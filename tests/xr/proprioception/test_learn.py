@@ -133,10 +133,10 @@ def test_a_lag_is_met_by_a_memory() -> None:
     assert learn(session(3), options=LearnOptions(kinds=("radial",))).memory_s == ()
 
 
-def test_markers_in_millimetres_are_doubted_and_against_a_model_refused(model) -> None:
+def test_markers_in_millimetres_are_refused_also_against_a_model(model) -> None:
     data = session(3)
     wrong = replace(data, markers=1e3 * data.markers)
-    with pytest.warns(UserWarning, match=r"are they in millimetres \(0\.1\d* m\)"):
+    with pytest.raises(DataError, match=r"are they in millimetres \(0\.1\d* m\)"):
         learn(wrong, options=LearnOptions(kinds=("ridge",), memories=((),)))
     for use in (drift, adapt):
         with pytest.raises(DataError, match=r"do not fit the model: .* are they in millimetres"):

@@ -400,15 +400,19 @@ def test_before_the_first_command_it_is_said_where_it_begins_unless_the_robot_sa
     drag(hub, far, armed=False)
     assert within(20.0, lambda: warned in reach_of(hub).get("text", ""))
     inputs = [{"name": name, "unit": "N", "value": 0.1} for name in names]
-    for count, known in ((1, False), (2, True)):  # all of them must be known
+
+    def says_where_it_begins(count: int) -> bool:
         said = json.dumps({"inputs": inputs[:count]}).encode()
         hub.received(Message("femsense/bar/measured", said), "the robot")
-        server.answer("tip", (float(far[0]), float(far[1]), float(far[2])))
-        assert (warned in reach_of(hub)["text"]) is not known
+        drag(hub, far, armed=False)
+        time.sleep(0.1)
+        return warned in reach_of(hub)["text"]
+
+    assert within(20.0, lambda: not says_where_it_begins(2))
     time.sleep(0.6)  # that is too old now
+    assert within(20.0, lambda: says_where_it_begins(1))  # all of them must be known
     hold(hub, out, far)
-    server.answer("tip", (float(far[0]), float(far[1]), float(far[2])))
-    assert warned not in reach_of(hub)["text"]
+    assert within(20.0, lambda: warned not in reach_of(hub)["text"])
 
 
 def test_who_comes_back_after_a_lapse_begins_anew(alone: tuple[Hub, DragServer]) -> None:

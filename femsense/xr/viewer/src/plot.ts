@@ -3,7 +3,7 @@
 import { timeText, type Frame } from "./data";
 
 const COLORS = ["#ffb454", "#5fd3c6", "#c69bff", "#ff8a8a", "#9fd35f", "#6db3ff"];
-const LEFT = 42;
+const LEFT = 54;
 const BOTTOM = 15;
 const TOP = 8;
 
