@@ -79,8 +79,8 @@ def estimate_into(
         raise DataError(f"the calibration is not to be used: {used.status}")
     if given is not None:
         check_given(body, frames, given)
-    elif model_error(used):
-        say(f"residual of the calibration {1e3 * used.rms_m:.3f} mm, error of the model {model_error(used)}")
+    elif said := model_error(used):
+        say(f"residual of the calibration {1e3 * used.rms_m:.3f} mm, error of the model {said}")
     began = time.perf_counter()
     run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
     write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)

@@ -47,7 +47,7 @@ def calibration_text(calibration: Calibration) -> str:
         rows.append(["residual", f"{1e3 * c.rms_m:.3f} mm rms over {len(c.marker_rms_m)} markers in {len(c.frames)} frames"])
         worst = max(c.marker_rms_m, key=lambda name: c.marker_rms_m[name], default=None)
         rows += [] if worst is None else [["worst marker", f"{worst}, {1e3 * c.marker_rms_m[worst]:.3f} mm rms"]]
-        rows += [["error of the model", model_error(c)]] if model_error(c) else []
+        rows += [["error of the model", said]] if (said := model_error(c)) else []
     for name, tension in c.cable_tension_n.items():
         rows.append(
             [

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from helpers import write_block_robot
 from results import NAN, make_calibration
+from small_run import make_run
 
+from femsense.io.robot_toml import load_robot
 from femsense.report.loop.document import Loop
 from femsense.report.loop.text import loop_text
-from femsense.report.text import calibration_text, known_part
+from femsense.report.text import calibration_text, known_part, run_text
 from femsense.sensing.types import ContactForce
 
 
@@ -54,3 +60,12 @@ def test_a_component_that_is_not_known_is_told_apart_from_what_is() -> None:
 )
 def test_other_forces_are_told_whole(force: list[float], std: list[float]) -> None:
     assert known_part(contact(force, std)) == ""
+
+
+def test_a_run_whose_forces_noise_may_make_has_no_contact(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    felt = run_text(run)
+    assert "the frames with contact" in felt and "largest force" in felt
+    weak = run_text(replace(run, contacts=tuple(replace(one, std_n=one.force_n) for one in run.contacts)))
+    assert "median of all frames" in weak and "largest force" not in weak
+    assert any(line.split() == ["contacts", "none"] for line in weak.splitlines())
