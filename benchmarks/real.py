@@ -56,7 +56,7 @@ class Asked:
 def tentacle_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
     """Return the ways of asking about the tentacle, by their numbers from 1."""
     chosen = [(i, way) for i, way in enumerate(tentacle.WAYS, 1) if not ways or i in ways]
-    return [Asked(way.name, *tentacle.make(out / f"way-{i}", data, way)) for i, way in chosen]
+    return [Asked(way.name, *tentacle.make(out / f"way-{i}", data, way), list(way.options)) for i, way in chosen]
 
 
 def trunk_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:

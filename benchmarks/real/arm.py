@@ -26,8 +26,10 @@ ARM_MM = 40.0
 """A second marker of each rigid body lies so far along its x."""
 TURNED = {"base": 1.0, "mid": 1.0, "tip": -1.0}
 """The rigid body of the tip is turned by half a turn about the vertical."""
-RADIUS_MM, DISTANCE_MM, CHAMBER_MM, END_MM = 25.0, 15.0, 7.0, 8.0
-MODULUS_PA, DENSITY = 187e3, 800.0
+RADIUS_MM, END_MM = 25.0, 8.0
+INNER_MM, OUTER_MM, SPAN_DEG = 7.0, 22.0, 76.0
+"""Of a chamber: as large as four have room for, so that a body that is stiff enough not to be blown up bends as far as the arm does."""
+MODULUS_PA, DENSITY = 750e3, 800.0
 HOLD_S = 10.0
 
 
@@ -37,8 +39,9 @@ def description(day: str) -> dict[str, object]:
     chambers = []
     for segment, (low, high) in (("base", (0.0, middle)), ("tip", (middle, tip))):
         for name, angle in (("1", 180.0), ("2", 0.0), ("3a", 90.0), ("3b", 270.0)):
-            place = {"from_mm": low + END_MM, "to_mm": high - END_MM, "distance_mm": DISTANCE_MM, "angle_deg": angle}
-            chambers.append({"name": f"{segment}-{name}", "radius_mm": CHAMBER_MM, "max_pressure_pa": 120e3} | place)
+            place = {"from_mm": low + END_MM, "to_mm": high - END_MM, "angle_deg": angle}
+            shape = {"inner_mm": INNER_MM, "outer_mm": OUTER_MM, "span_deg": SPAN_DEG}
+            chambers.append({"name": f"{segment}-{name}", "max_pressure_pa": 120e3} | shape | place)
     markers = []
     for name, along in (("base", 0.0), ("mid", middle), ("tip", tip)):
         markers.append({"name": name, "along_mm": along})

@@ -140,6 +140,8 @@ class Way:
     """The two-tendon runs are for validation; else they are fitted too, and whole runs are left out in turn."""
     noise: bool = False
     """recording.toml declares what a marker repeats to."""
+    options: tuple[str, ...] = ()
+    """Of `femsense improve`."""
 
 
 WAYS = (
@@ -150,6 +152,12 @@ WAYS = (
     Way("the same, zeros of the tensions unknown", zero="unknown"),
     Way("the same, all runs at once", held_out=False),
     Way("the same, noise of the markers declared", noise=True),
+    Way(
+        "all runs at once, gains and zeros alone",
+        held_out=False,
+        options=("--effects", "cable_gain", "cable_offset", "stiffness"),
+    ),
+    Way("density 1500, no payload offered", density=PRIOR_DENSITY, options=("--without", "payload", "tip_mass")),
 )
 
 
