@@ -21,24 +21,25 @@ from femsense.calib.first_poses import first_poses
 from femsense.calib.from_clouds import free_clouds, pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.input_checks import check_inputs
-from femsense.calib.inputs import first_inputs, initial_state, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.inputs_from_clouds import with_initial_inputs
-from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
+from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, holding_law, root_mean_square
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.other_readings import check_other_readings
 from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
 from femsense.calib.rigid import fit_rigid
 from femsense.calib.single_inputs import check_single_inputs
 from femsense.calib.still_camera import check_camera_still
+from femsense.calib.without_fit import as_declared, from_rest
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.core.least_squares import FitResult, covariance_of
+from femsense.core.least_squares import FitResult
 from femsense.core.parallel import one_blas_thread
-from femsense.core.pose import move_pose
+from femsense.core.pose import std_of_entries
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera_frame import in_robot_frame
 from femsense.model.marker_correction import corrected
-from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene, rest_residual
+from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against, how_to_free
 from femsense.model.repeats import marker_repeatability
@@ -85,7 +86,7 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     robot = robot.in_recording(recording.label)
     chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)
     if recording.rest is not None and not np.isin(recording.marker_frame, chosen).any():
-        return _from_rest(robot, recording)
+        return from_rest(robot, recording)
     if not len(chosen):
         raise DataError(
             f"no frame is free of undeclared contact: mark free frames {how_to_free(recording)}, or declare the loads (loads.csv)"
@@ -102,7 +103,7 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     elif has_unknown_zeros(robot, recording):
         raise DataError('zeros of pressures need markers with names: record those, or declare actuation_zero = "absolute"')
     else:
-        by_markers = _declared(robot, seen, chosen)
+        by_markers = as_declared(robot, seen, chosen)
     if by_clouds:
         by_markers = placed_by_clouds(robot, recording, by_markers, by_clouds)
     found = _beside_clouds(robot, recording, by_markers, by_clouds, named=bool(len(seen.marker_frame)))
@@ -253,13 +254,13 @@ def _result(
     jet: SceneJet,
     history: list[float],
 ) -> Calibration:
-    recording = scene.recording
+    fit, recording = holding_law(robot, scene, fit, poses, initial, jet), scene.recording
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
     joint = np.zeros((6 * len(poses),) * 2)
     free = [c for v in moving for c in range(6 * v, 6 * v + 6)]
     joint[np.ix_(free, free)] = fit.covariance[: len(free), : len(free)]
     pose_covariance = joint[:6, :6]
-    pose_std = _pose_std(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
+    pose_std = std_of_entries(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
     a = len(robot.body.cables) if initial is not None else 0
     input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
     tables = input_tables(robot, recording, initial, input_covariance)
@@ -303,19 +304,7 @@ def _with_clouds(robot: Robot, recording: Recording, by_markers: Calibration) ->
 
 
 def _with_std(robot: Robot, fitted: Calibration) -> Calibration:
-    return replace(fitted, pose_std=_pose_std(fitted.poses[0], fitted.pose_covariance, pose_pivot(robot)))
-
-
-def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:
-    """Return one standard deviation of the entries of T from the covariance of (rotation about the pivot, shift)."""
-    std = np.zeros((4, 4))
-    J = np.zeros((3, 4, 6))
-    for j in range(6):
-        step = np.zeros(6)
-        step[j] = 1e-6
-        J[:, :, j] = (move_pose(T, step, pivot_a=pivot) - T)[:3] / 1e-6
-    std[:3] = np.sqrt(np.maximum(np.einsum("abi,ij,abj->ab", J, covariance, J), 0.0))
-    return std
+    return replace(fitted, pose_std=std_of_entries(fitted.poses[0], fitted.pose_covariance, pose_pivot(robot)))
 
 
 def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) -> str:
@@ -325,76 +314,3 @@ def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) 
         return "converged"
     weak = weak_inputs(recording, own)
     return f"converged, but these data hardly determine the initial input of {weak}" if weak else "converged"
-
-
-def _from_rest(robot: Robot, recording: Recording) -> Calibration:
-    """Return the calibration of a recording none of whose frames can be used: poses from the markers at rest alone."""
-    if recording.actuation_zero == "unknown" and (robot.body.cables or robot.body.chambers):
-        raise DataError(f"initial inputs need a frame that is free of undeclared contact: mark it {how_to_free(recording)}")
-    number = {name: i for i, name in enumerate(robot.marker_names)}
-    rest = recording.rest
-    assert rest is not None
-    marker = np.array([number.get(name, -1) for name in rest.names], dtype=np.int64)
-    known = marker >= 0
-    scene = Scene(
-        recording, *(np.zeros(0, np.int64),) * 4, np.zeros((0, 3)), marker[known], rest.view[known], rest.positions[known]
-    )
-    poses = first_poses(robot, scene)
-    left = rest_residual(robot, scene, poses)
-    sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), PLACEMENT_STD_FLOOR)
-    arm = robot.marker_points[scene.rest_marker] - robot.marker_points.mean(axis=0)
-    J = np.concatenate([np.hstack([np.cross(a, np.eye(3)), np.eye(3)]) for a in arm])
-    covariance = covariance_of(J / sigma)
-    state = initial_state(robot, recording, None)
-    none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
-    per_marker = {robot.marker_names[m]: float(np.linalg.norm(r)) for m, r in zip(scene.rest_marker, left)}
-    places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
-    placements_m = {robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)}
-    return Calibration(
-        poses[0],
-        tuple(poses),
-        recording.camera_names,
-        dict(state.tension),
-        dict(state.shortening),
-        root_mean_square(left),
-        per_marker,
-        (),
-        _pose_std(poses[0], covariance, robot.marker_points.mean(axis=0)),
-        covariance,
-        none,
-        dict(none),
-        "converged (from rest.csv alone: no frame is free)",
-        placements_m,
-    )
-
-
-def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibration:
-    """Return the calibration of a recording without markers whose poses are declared."""
-    missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
-    if missing:
-        raise DataError(
-            f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record "
-            f"markers or clouds, or write T_robot_camera in recording.toml"
-        )
-    unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
-    if unknown and not recording.has_clouds:
-        raise DataError("initial inputs need markers or clouds of free frames: record those, or absolute inputs")
-    poses = tuple(T for T in recording.T_robot_camera if T is not None)
-    state = initial_state(robot, recording, first_inputs(robot, recording))
-    none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
-    return Calibration(
-        poses[0],
-        poses,
-        recording.camera_names,
-        dict(state.tension),
-        dict(state.shortening),
-        float("nan"),
-        {},
-        (),
-        np.zeros((4, 4)),
-        np.zeros((6, 6)),
-        none,
-        dict(none),
-        "as declared: there are no markers to fit",
-        frames=tuple(int(recording.frame_numbers[k]) for k in frames),
-    )

@@ -14,6 +14,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.inputs import calibrated_inputs
+from femsense.calib.other_law import with_other_law
 from femsense.calib.residual_field import field_scores, row_weights
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import BoolArray, FloatArray, freeze
@@ -129,14 +130,6 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
         joint_covariance=freeze(covariance),
         normal_rms_m=rms,
     )
-
-
-def with_other_law(robot: Robot) -> Robot | None:
-    """Return the robot under the neo-Hookean law; None where it declares a law by an effect."""
-    body = robot.body
-    if body.material.law != "corotational":
-        return None
-    return replace(robot, body=replace(body, material=replace(body.material, law="neo_hookean")))
 
 
 def _moved_by_law(

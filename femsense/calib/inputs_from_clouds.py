@@ -19,10 +19,10 @@ from femsense.calib.from_clouds import (
     pose_pivot,
     ray_sums,
     what_clouds_know,
-    with_other_law,
     worth_of_clouds,
 )
 from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.other_law import with_other_law
 from femsense.calib.residual_field import field_scores
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray, freeze

@@ -8,8 +8,10 @@ import numpy as np
 
 from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.inputs import input_bounds
+from femsense.calib.other_law import with_other_law
 from femsense.core.arrays import FloatArray
-from femsense.core.least_squares import FitResult, gauss_newton
+from femsense.core.errors import DataError
+from femsense.core.least_squares import FitResult, covariance_of, gauss_newton
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
@@ -52,6 +54,34 @@ def fit_joint(
     moved, inputs = problem.place(theta)
     fit = replace(fit, covariance=problem.beside_declared(jet, fit.covariance))
     return fit, moved, inputs, jet  # an input at its bound is no better known than others: what they have in common moves all
+
+
+def holding_law(
+    robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet
+) -> FitResult:
+    """Return a fit whose covariance holds by how much the neo-Hookean law moves it, too; as it was where the robot declares its law.
+
+    One step from where the fit ended, −C Jᵀ Δr: Δr is how the whitened residual changes with the law, C = (JᵀJ)⁻¹.
+
+    Arguments:
+        robot, scene: as they were fitted.
+        fit, poses, initial, jet: where `fit_joint` ended.
+    """
+    other = with_other_law(robot)
+    if other is None or not np.isfinite(fit.covariance).all():
+        return fit
+    there = _Problem(other, scene, poses, initial, free_inputs=True)
+    there.starts = dict(jet.states)
+    there.weigh(jet, _huber_weights(jet.residual), len(fit.theta))
+    row = (there.weights / there.std)[:, None, None]
+    J = there._jacobian(jet, row)
+    try:
+        changed = there.jet_at(there.start(), derivative=False)
+    except DataError:
+        return fit
+    by_law = np.concatenate([(row[:, :, 0] * (changed.residual - jet.residual)).ravel(), np.zeros(jet.rest.size)])
+    moved = -covariance_of(J) @ (J.T @ by_law)
+    return replace(fit, covariance=fit.covariance + np.outer(moved, moved))
 
 
 class _Problem:

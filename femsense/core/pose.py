@@ -67,3 +67,15 @@ def move_pose(T_a_b: FloatArray, step: npt.ArrayLike, *, pivot_a: npt.ArrayLike 
 def moved_poses(poses: Sequence[FloatArray], steps: FloatArray, pivot_a: FloatArray) -> list[FloatArray]:
     """Return each pose moved by its six of the steps, shape (6 v,); see `move_pose`."""
     return [move_pose(T, step, pivot_a=pivot_a) for T, step in zip(poses, steps.reshape(-1, 6), strict=True)]
+
+
+def std_of_entries(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:
+    """Return one standard deviation of the entries of T from the covariance of (rotation about the pivot, shift)."""
+    std = np.zeros((4, 4))
+    J = np.zeros((3, 4, 6))
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = 1e-6
+        J[:, :, j] = (move_pose(T, step, pivot_a=pivot) - T)[:3] / 1e-6
+    std[:3] = np.sqrt(np.maximum(np.einsum("abi,ij,abj->ab", J, covariance, J), 0.0))
+    return std
