@@ -25,6 +25,7 @@ from femsense.calib.inputs import first_inputs, input_bounds, input_tables, larg
 from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, holding_law, root_mean_square
 from femsense.calib.marker_assignment import name_markers
+from femsense.calib.marker_scale import check_marker_scale
 from femsense.calib.other_readings import check_other_readings
 from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
 from femsense.calib.rigid import fit_rigid
@@ -171,6 +172,7 @@ def _fitted(
         said = check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
         if initial is None and not said:
             check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of)
+        check_marker_scale(robot, scene, poses, initial, jet, _residual_of)
         check_camera_still(robot, scene.recording, pairs)
     check_reading(robot, pairs, strict=strict)
     return scene, fit, poses, initial, jet

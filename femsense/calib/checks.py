@@ -32,6 +32,8 @@ HOPELESS = 0.5
 OUTLIER = 0.1
 """An outlier is off by this share of the markers' spread at least. No measurement set it; on a real tendon robot one marker was
 named for it, which may be the model's error."""
+LEFT_HANDED = "Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
+UNNAMED = "Where names are not known, leave the column marker empty: the model names the markers"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,15 +115,12 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
         ):
             raise DataError(f"{found}. They are {scale:.4g} times too large: {unit_hint(scale)} The files hold metres")
         if not most_fit and rigid_rms(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
-            raise DataError(
-                f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, "
-                f"z forward): change the sign of one axis"
-            )
+            raise DataError(f"{found}. {LEFT_HANDED}")
         swapped = _swapped(one, plain)
         if swapped:
-            raise DataError(f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv")
+            raise DataError(f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv. {UNNAMED}")
         if strict and plain > HOPELESS * one.spread:
-            raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names?")
+            raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names? {UNNAMED}")
 
 
 def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:
@@ -252,7 +251,7 @@ def relabelled(
         if strict and swapped < len(scene.frames):
             names = " and ".join(robot.marker_names[m] for m in np.unique(scene.marker[renamed]))
             raise DataError(
-                f"the labels of {names} seem swapped in {swapped} of {len(scene.frames)} frames. Make them the same in all frames of markers.csv"
+                f"the labels of {names} seem swapped in {swapped} of {len(scene.frames)} frames. Make them the same in all frames of markers.csv. {UNNAMED}"
             )
         return scene.recording, False
     far &= ~renamed & ~_mostly(far, scene.marker)

@@ -14,15 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.calib.checks import EXPLAINED
+from femsense.calib.checks import EXPLAINED, LEFT_HANDED, SUSPICIOUS
 from femsense.calib.inputs import first_inputs
 from femsense.calib.joint import fit_joint
 from femsense.calib.pose_search import PosedNames, apart, refine_names, search_poses, squared
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.pose import transform_points
 from femsense.model.camera_frame import undo_depth
 from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.marker_units import check_marker_sizes
 from femsense.model.observation import make_scene
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
@@ -89,7 +90,7 @@ def name_markers(
         initial: initial inputs where they are known; by default found with the pose.
 
     Raises:
-        DataError: too few points, or points that fit the robot under more than one pose.
+        DataError: too few points, points in another unit, mirrored ones, or those that fit the robot under more than one pose.
     """
     frames = np.intersect1d(frames, recording.unnamed_frame)
     if not len(frames):
@@ -100,10 +101,12 @@ def name_markers(
     model = _modelled(robot, recording, frames, first_inputs(robot, recording) if initial is None else initial)
     readings = [_readings(robot, one, model, known[one.view]) for one in seen]
     best = _combined(recording, seen, [r[0] for r in readings])
+    _check_units(seen, model, readings, _spread(robot))
     if all(T is not None for T in known):
         named = _settled(robot, recording, seen, best, model)
     else:
         named = _fitted(robot, recording, seen, best)
+        _check_handed(robot, recording, seen, model, named)
         _require_one(robot, recording, seen, readings, named)
     _say(robot, recording, frames, named)
     return _with_names(robot, recording, frames, named.marker)
@@ -209,6 +212,39 @@ def _alike(names: IntArray, squares: FloatArray, least: float) -> list[tuple[int
     return pairs
 
 
+def _spread(robot: Robot) -> float:
+    """Return the root mean square distance of the markers at rest from their middle [m]."""
+    return float(np.sqrt(((robot.marker_points - robot.marker_points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _check_units(
+    seen: Sequence[Nameless], model: dict[int, FloatArray], readings: Sequence[Sequence[PosedNames]], spread: float
+) -> None:
+    """Refuse points that fit nowhere and are far from as large as the model's markers (DataError, with the unit that this hints at)."""
+    for one, reading in zip(seen, readings):
+        if reading[0].error_m > SUSPICIOUS * spread:
+            check_marker_sizes(one.points, [model[int(k)] for k in one.frames])
+
+
+def _check_handed(
+    robot: Robot, recording: Recording, seen: Sequence[Nameless], model: dict[int, FloatArray], named: Named
+) -> None:
+    """Refuse points that fit the robot once they are mirrored, and far worse as they are (DataError)."""
+    spread = _spread(robot)
+    if named.error_m < SUSPICIOUS * spread or any(T is not None for T in recording.T_robot_camera):
+        return
+    mirror = np.array([-1.0, 1.0, 1.0])
+    turned = replace(recording, unnamed_xyz=freeze(recording.unnamed_xyz * mirror))
+    others = [replace(one, points=tuple(points * mirror for points in one.points)) for one in seen]
+    first = _combined(turned, others, [_readings(robot, one, model, None)[0] for one in others])
+    left = _fitted(robot, turned, others, first).error_m
+    if left * EXPLAINED < named.error_m:
+        raise DataError(
+            f"the markers without names do not fit the robot: {1e3 * named.error_m:.3g} mm are left of their spread of "
+            f"{1e3 * spread:.3g} mm, mirrored {1e3 * left:.3g} mm. {LEFT_HANDED}"
+        )
+
+
 def _require_one(
     robot: Robot, recording: Recording, seen: Sequence[Nameless], readings: Sequence[Sequence[PosedNames]], best: Named
 ) -> None:
@@ -217,7 +253,7 @@ def _require_one(
     Raises:
         DataError: says how far the poses are apart and what each leaves.
     """
-    spread = float(np.sqrt(((robot.marker_points - robot.marker_points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = _spread(robot)
     for i, one in enumerate(seen):
         chosen = PosedNames(best.poses[one.view], readings[i][0].marker, best.error_m)
         likely = [r for r in readings[i][1:] if r.error_m < EXPLAINED * max(readings[i][0].error_m, 1e-6)]

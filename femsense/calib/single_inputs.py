@@ -106,11 +106,11 @@ def single_inputs(robot: Robot, scene: Scene, poses: Sequence[FloatArray], state
     free = [c for v, T in enumerate(scene.recording.T_robot_camera) if T is None for c in range(6 * v, 6 * v + 6)]
     by_pose, frame = jet.by_pose[:, :, free].reshape(len(by_offset), -1), np.repeat(scene.frame, 3)
     common = np.column_stack([by_pose, by_gain.sum(axis=1)])
-    plain = float(np.linalg.norm(_fit(by_pose, jet.residual.ravel(), frame)[2]))
+    plain = float(np.linalg.norm(fit_by_frames(by_pose, jet.residual.ravel(), frame)[2]))
     found = []
     for j in moving.tolist():
         own = by_offset[:, [j]] if len(moving) == 1 else np.column_stack([by_offset[:, j], by_gain[:, j]])
-        x, std, left = _fit(np.column_stack([common, own]), jet.residual.ravel(), frame)
+        x, std, left = fit_by_frames(np.column_stack([common, own]), jet.residual.ravel(), frame)
         p = common.shape[1]
         gain, gain_std = (1.0, 0.0) if len(moving) == 1 else (1.0 + float(x[p + 1]), float(std[p + 1]))
         share = float(np.linalg.norm(left)) / max(plain, 1e-300)
@@ -118,7 +118,7 @@ def single_inputs(robot: Robot, scene: Scene, poses: Sequence[FloatArray], state
     return found
 
 
-def _fit(J: FloatArray, residual: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fit_by_frames(J: FloatArray, residual: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the step that takes most of a residual (r,) away, its standard deviations, and what is left.
 
     The errors of one frame are counted as one (Liang and Zeger 1986): the model errs alike in all its markers.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -50,8 +50,8 @@ def check_marker_distances(robot: Robot, recording: Recording) -> None:
     _check_scale(float(np.median(ratios)) if ratios else 1.0, "the robot", unit_hint)
 
 
-def check_marker_sizes(measured: FloatArray, known: FloatArray) -> None:
-    """Refuse markers [m], shape (n, m, 3), that are far from as large as those that a model makes of the same rows, shape (n, m, 3).
+def check_marker_sizes(measured: Sequence[FloatArray] | FloatArray, known: Sequence[FloatArray] | FloatArray) -> None:
+    """Refuse markers [m], n times (k, 3), that are far from as large as those that a model makes of the same rows, n times (m, 3).
 
     Raises DataError, as `check_marker_distances`.
     """

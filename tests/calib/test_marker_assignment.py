@@ -214,3 +214,19 @@ def test_a_frame_of_strays_alone_costs_only_itself() -> None:
     given = names_given(robot, bare, named)
     assert (given[bare.unnamed_frame == 2] == -1).all()
     assert (given == np.where(bare.unnamed_frame == 2, -1, truth[kept])).all()
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100.0, "centimetres"), (39.37, "inches"), (1000.0, "millimetres")])
+def test_another_unit_is_named(factor: float, unit: str) -> None:
+    recording, _ = record(INPUTS, noise=2e-4, seed=1)
+    bare, _ = nameless(recording, KEPT, seed=1)
+    with pytest.raises(DataError, match=rf"times too large: are they in {unit}\?"):
+        calibrate(lopsided(arm()), replace(bare, unnamed_xyz=factor * bare.unnamed_xyz))
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+def test_left_handed_axes_are_named(zero: str) -> None:
+    recording, _ = record(INPUTS, noise=2e-4, seed=1, zero=zero, initial=None if zero == "absolute" else np.full(4, 0.3))
+    bare, _ = nameless(recording, KEPT, seed=1)
+    with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
+        calibrate(lopsided(arm()), replace(bare, unnamed_xyz=bare.unnamed_xyz * [1.0, -1.0, 1.0]))

@@ -1,0 +1,137 @@
+"""Whether the markers of a camera are all a little too large or too small: a scale, fitted beside poses and initial inputs.
+
+A motion capture that was calibrated with a wand of another length, or a camera whose depth is off by a share, enlarges all that it sees.
+Poses and inputs take up a part of that, and the rest looks like an error of the model. To first order about the fit of the files as
+they stand, beside the modulus, which inputs that are fitted turn into a scale; a scale counts by what a fit then leaves.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.calib.other_readings import TOLD, Refit
+from femsense.calib.single_inputs import fit_by_frames
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import DataError
+from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+
+KNOWN = 3.0
+"""A scale is off where it is farther than so many standard deviations from 1."""
+STIFFER = 0.02
+"""Step for the derivative by the modulus, as a share of it."""
+MARKERS, FRAMES = 4, 2
+"""Fewer markers or frames tell nothing."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MarkerScale:
+    """How many times too large the markers of a camera are."""
+
+    scale: float
+    """[1]."""
+    std: float
+    """The errors of a frame counted as one [1]."""
+    share: float
+    """What is left with it, as a share of what poses, initial inputs and what is beside them leave [1]."""
+
+
+def check_marker_scale(
+    robot: Robot, scene: Scene, poses: Sequence[FloatArray], initial: FloatArray | None, jet: SceneJet, refit: Refit
+) -> None:
+    """Warn where the markers of a camera fit far better once they are divided by one number, and another modulus does not do the same.
+
+    Arguments:
+        robot: the robot.
+        scene: the markers that were fitted.
+        poses: as fitted, each (4, 4).
+        initial: fitted initial inputs [N] or [m], shape (a,); None where they are known.
+        jet: where the fit ended, with derivatives.
+        refit: fits another reading.
+    """
+    before = _rms(jet.residual)
+    for view, name in enumerate(scene.recording.camera_names):
+        best = marker_scale(scene, poses, jet, view)
+        if not _tells(best):
+            continue
+        best = marker_scale(scene, poses, jet, view, by_modulus(robot, scene, poses, initial, jet))
+        if best is None or not _tells(best):
+            continue
+        try:
+            left = _rms(refit(robot, scaled(scene.recording, view, 1.0 / best.scale), scene.frames))
+        except DataError:
+            continue
+        if before > TOLD * left:
+            warnings.warn(_text(name, best, before, left), stacklevel=5)
+
+
+def _tells(found: MarkerScale | None) -> bool:
+    return found is not None and found.share * TOLD < 1.0 and abs(found.scale - 1.0) > KNOWN * found.std
+
+
+def marker_scale(
+    scene: Scene, poses: Sequence[FloatArray], jet: SceneJet, view: int, beside: FloatArray | None = None
+) -> MarkerScale | None:
+    """Return how many times too large the markers of a camera are; None where they are too few to tell.
+
+    Arguments:
+        scene, poses, jet: as of `check_marker_scale`.
+        view: the camera.
+        beside: what else may be off, as the change of the residual with it, shape (k, 3).
+    """
+    mine = scene.view == view
+    if len(np.unique(scene.marker[mine])) < MARKERS or len(np.unique(scene.frame[mine])) < FRAMES:
+        return None
+    free = [c for v, T in enumerate(scene.recording.T_robot_camera) if T is None for c in range(6 * v, 6 * v + 6)]
+    rows, frame, residual = jet.residual.size, np.repeat(scene.frame, 3), jet.residual.ravel()
+    common = np.hstack([jet.by_pose[:, :, free].reshape(rows, -1), jet.by_initial.reshape(rows, -1)])
+    if beside is not None:
+        common = np.column_stack([common, beside.ravel()])
+    by_scale = -(mine[:, None] * scene.points) @ poses[view][:3, :3].T
+    plain = fit_by_frames(common, residual, frame)[2]
+    x, std, left = fit_by_frames(np.column_stack([common, by_scale.ravel()]), residual, frame)
+    share = float(np.linalg.norm(left)) / max(float(np.linalg.norm(plain)), 1e-300)
+    return MarkerScale(1.0 + float(x[-1]), float(std[-1]), share)
+
+
+def by_modulus(robot: Robot, scene: Scene, poses: Sequence[FloatArray], initial: FloatArray | None, jet: SceneJet) -> FloatArray:
+    """Return how the residual changes with the logarithm of the modulus [m], shape (k, 3)."""
+    stiffer = replace(robot, body=robot.body.with_stiffness_scale(1.0 + STIFFER))
+    there = evaluate_scene(
+        Hypothesis(stiffer),
+        scene,
+        np.zeros(0),
+        poses,
+        initial,
+        derivative=False,
+        vary_initial=False,
+        pivot=robot.marker_points.mean(axis=0),
+        starts=dict(jet.states),
+    )
+    return np.asarray((there.residual - jet.residual) / STIFFER)
+
+
+def scaled(recording: Recording, view: int, scale: float) -> Recording:
+    """Return the recording with the markers of a camera scaled about it."""
+    factor = np.where(recording.marker_view == view, scale, 1.0)[:, None]
+    rest = recording.rest
+    if rest is not None:
+        rest = replace(rest, positions=freeze(rest.positions * np.where(rest.view == view, scale, 1.0)[:, None]))
+    return replace(recording, marker_xyz=freeze(recording.marker_xyz * factor), rest=rest)
+
+
+def _rms(residual: FloatArray) -> float:
+    return float(np.sqrt((residual**2).sum(axis=1).mean()))
+
+
+def _text(name: str, best: MarkerScale, before: float, left: float) -> str:
+    return (
+        f"the markers of camera {name or '(only one)'} are {best.scale:.3f} ± {best.std:.1g} times too large: divided by that they fit to "
+        f"{1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm. Is the scale of the motion capture or of the camera's depth right, "
+        f"and the size of the robot's mesh?"
+    )

@@ -1,0 +1,68 @@
+"""Markers that are all a little too large: said with the scale, and right ones are not accused."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from arm import arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.calib.marker_scale import scaled
+from femsense.core.errors import DataError
+from femsense.model.recording import Recording
+
+PULLS = np.array([[0.0, 0, 0, 0], [1.0, 0, 0, 0], [1.0, 0, 0.7, 0], [0, 0, 1.2, 0], [0, 0, 0, 1.0]])
+SAID = r"camera \(only one\) are ([\d.]+) ± [\d.]+ times too large"
+
+
+@cache
+def recording(zero: str = "absolute") -> Recording:
+    how = {"zero": zero, "initial": np.array([0.6, 0.3, 0.2, 0.4])} if zero == "unknown" else {}
+    return record(PULLS, noise=2e-4, seed=1, **how)[0]
+
+
+def scales_said(seen: Recording, modulus: float = 300e3) -> list[float]:
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        try:
+            calibrate(arm(modulus=modulus), seen)
+        except DataError as error:
+            return [float(x) for x in re.findall(SAID, str(error))]
+    return [float(x) for w in heard for x in re.findall(SAID, str(w.message))]
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+@pytest.mark.parametrize("scale", [1.03, 0.97])
+def test_a_scale_is_said_with_its_number(zero: str, scale: float) -> None:
+    (found,) = scales_said(scaled(recording(zero), 0, scale))
+    assert found == pytest.approx(scale, abs=0.003)
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+@pytest.mark.parametrize("modulus", [180e3, 300e3, 500e3])
+def test_right_markers_are_not_accused_whatever_the_modulus(zero: str, modulus: float) -> None:
+    assert scales_said(recording(zero), modulus) == []
+
+
+def test_the_camera_is_named_whose_markers_are_too_large() -> None:
+    one = recording()
+    count = len(one.marker_frame)
+    both = replace(
+        one,
+        camera_names=("left", "right"),
+        cameras=(None, None),
+        T_robot_camera=(None, None),
+        cloud_files=((None, None),) * one.frame_count,
+        color_files=((None, None),) * one.frame_count,
+        marker_frame=np.tile(one.marker_frame, 2),
+        marker_index=np.tile(one.marker_index, 2),
+        marker_view=np.repeat([0, 1], count),
+        marker_xyz=np.vstack([one.marker_xyz, 1.04 * one.marker_xyz]),
+    )
+    with pytest.warns(UserWarning, match=r"the markers of camera right are 1\.0[34]\d ± \S+ times too large"):
+        calibrate(arm(), both)
