@@ -1,11 +1,11 @@
-"""Declared poses of a camera that sees no marker, judged by the clouds of free frames, on the robots that come along.
+"""Declared poses of a camera, judged by the clouds of free frames or by named markers, on the robots that come along.
 
-    python benchmarks/declared_by_clouds.py [--robots NAME …] [--seeds N] [--out FOLDER]
+    python benchmarks/declared_by_clouds.py [--robots NAME …] [--way WAY] [--seeds N] [--out FOLDER]
 
 Recordings are those of calibration_robots.py: a finer mesh with another law, one camera drawn anywhere above, cables with initial inputs that are
 told (known) or not (unknown). The true pose is declared to robots with the right modulus and a wrong one, and poses that are off in a
 direction that is drawn. Cells: what `calibrate` says. *Modulus* is a warning that names both, pose and modulus. Prints the
-table "Declared poses" of docs/calibration.md.
+tables "Declared poses" of docs/calibration.md: by clouds, and with `--way "named markers"`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from calibration_robots import one_camera, recorded, without_markers
+from calibration_robots import WAYS, one_camera, recorded
 
 from femsense import DataError, Recording, Robot, calibrate, load_recording, load_robot
 from femsense.calib.from_clouds import pose_pivot
@@ -40,11 +40,11 @@ CASES = (
 )
 
 
-def seen(robot: Robot, seed: int, folder: Path) -> Iterator[tuple[str, Recording, FloatArray]]:
-    """Yield the recording of one camera without markers, with initial inputs told and not told, and the true pose."""
+def seen(robot: Robot, way: str, seed: int, folder: Path) -> Iterator[tuple[str, Recording, FloatArray]]:
+    """Yield the recording of one camera as a way of calibrating has it, with initial inputs told and not told, and the true pose."""
     there = recorded(robot, seed, folder)
     truth = json.loads((there / "truth" / "truth.json").read_text())
-    recording, T = without_markers(one_camera(load_recording(there))), np.array(truth["cameras"]["a"])
+    recording, T = WAYS[way](one_camera(load_recording(there))), np.array(truth["cameras"]["a"])
     if not robot.body.cables:
         yield "known", recording, T
         return
@@ -75,6 +75,7 @@ def off(T: FloatArray, robot: Robot, shift: float, turn: float, rng: np.random.G
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", nargs="*", default=["finger", "arm", "gripper", "four-leg", "pneu-finger"])
+    parser.add_argument("--way", choices=["clouds alone", "named markers", "markers and clouds"], default="clouds alone")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--out", type=Path, help="keep recordings here")
     options = parser.parse_args()
@@ -84,7 +85,7 @@ def main() -> None:
         for name in options.robots:
             robot = load_robot(name)
             for seed in range(1, 1 + options.seeds):
-                for zero, recording, T in seen(robot, seed, options.out or Path(temporary)):
+                for zero, recording, T in seen(robot, options.way, seed, options.out or Path(temporary)):
                     cells = []
                     for i, (case, shift, turn, modulus) in enumerate(CASES):
                         judged = replace(robot, body=robot.body.with_stiffness_scale(modulus))
