@@ -116,6 +116,13 @@ def test_labels_swapped_in_most_frames_are_refused(robot: Robot) -> None:
         calibrate(robot, recorded(robot, xyz))
 
 
+def test_names_that_change_from_frame_to_frame_are_refused_with_the_way_out(robot: Robot) -> None:
+    rng = np.random.default_rng(2)
+    xyz = np.array([frame[rng.permutation(len(frame))] for frame in seen(robot)])
+    with pytest.raises(DataError, match="leave the column marker empty: the model names the markers"):
+        calibrate(robot, recorded(robot, xyz))
+
+
 def test_a_marker_that_sits_elsewhere_in_all_frames_is_no_stray(robot: Robot, recwarn: pytest.WarningsRecorder) -> None:
     xyz = seen(robot)
     xyz[:, 2] += [0.02, -0.03, 0.01]
