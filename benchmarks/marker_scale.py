@@ -51,31 +51,28 @@ def every_camera(recording: Recording, scale: float) -> Recording:
     return recording
 
 
-def cells(robot: Robot, recording: Recording) -> list[str]:
-    """Return what is told of a recording: right, with moduli that are off, and scaled."""
-    off = [told(softer(robot, factor), recording) for factor in MODULI]
-    return [told(robot, recording), *off, *(told(robot, every_camera(recording, scale)) for scale in SCALES)]
-
-
 def real_recordings(out: Path, data: Path) -> Iterator[tuple[str, Path, Sequence[Path]]]:
     """Yield name, robot and recordings."""
     for robot in ("robot", "robot_gravity"):
         yield f"beam, {robot}", data / "beam" / robot, sorted((data / "beam" / "recordings").iterdir())
     for i, way in enumerate(tentacle.WAYS[:5], 1):
-        where, train, held = tentacle.make(out / f"tentacle-{i}", data, way)
+        where, train, held = tentacle.make(out / f"tentacle-{i}", data / "tentacle", way)
         yield f"tentacle: {way.name}", where, [*train, *held]
-    where, made = trunk.make(out / "trunk", data)
+    where, made = trunk.make(out / "trunk", data / "trunk")
     yield "trunk", where, list(made.values())
     for day in arm.MIDDLES_MM:
-        where, train, held = arm.make(out / f"arm-{day}", data, day)
+        where, train, held = arm.make(out / f"arm-{day}", data / "arm", day)
         yield f"arm, {day}", where, [*train, *held]
 
 
-def print_table(rows: Iterator[tuple[str, Robot, Recording]]) -> None:
-    heading = ["recording", "as it is", *(f"modulus × {m:g}" for m in MODULI), *(f"markers × {s:g}" for s in SCALES)]
+def print_table(rows: Iterator[tuple[str, Robot, Recording]], moduli: Sequence[float], scales: Sequence[float]) -> None:
+    """Print what is told of recordings: right, with moduli that are off, and scaled."""
+    heading = ["recording", "as it is", *(f"modulus × {m:g}" for m in moduli), *(f"markers × {s:g}" for s in scales)]
     print("| " + " | ".join(heading) + " |\n" + "|---" * len(heading) + "|")
     for name, robot, recording in rows:
-        print("| " + " | ".join([name, *cells(robot, recording)]) + " |", flush=True)
+        off = [told(softer(robot, factor), recording) for factor in moduli]
+        larger = [told(robot, every_camera(recording, scale)) for scale in scales]
+        print("| " + " | ".join([name, told(robot, recording), *off, *larger]) + " |", flush=True)
 
 
 def rig_rows(robots: Sequence[str], seeds: int, out: Path) -> Iterator[tuple[str, Robot, Recording]]:
@@ -102,7 +99,10 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         out = options.out or Path(temporary)
-        print_table(real_rows(out, options.data) if options.real else rig_rows(options.robots, options.seeds, out))
+        if options.real:
+            print_table(real_rows(out, options.data), (), SCALES[1:])
+        else:
+            print_table(rig_rows(options.robots, options.seeds, out), MODULI, SCALES)
 
 
 if __name__ == "__main__":
