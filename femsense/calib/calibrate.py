@@ -23,7 +23,7 @@ from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.input_checks import check_inputs
 from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.inputs_from_clouds import with_initial_inputs
-from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, holding_law, root_mean_square
+from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, moved_by_law, root_mean_square
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.marker_scale import check_marker_scale
 from femsense.calib.other_readings import check_other_readings
@@ -256,15 +256,18 @@ def _result(
     jet: SceneJet,
     history: list[float],
 ) -> Calibration:
-    fit, recording = holding_law(robot, scene, fit, poses, initial, jet), scene.recording
+    recording, moved = scene.recording, moved_by_law(robot, scene, fit, poses, initial, jet)
+    covariance = fit.covariance + np.outer(moved, moved)
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
     joint = np.zeros((6 * len(poses),) * 2)
     free = [c for v in moving for c in range(6 * v, 6 * v + 6)]
-    joint[np.ix_(free, free)] = fit.covariance[: len(free), : len(free)]
+    joint[np.ix_(free, free)] = covariance[: len(free), : len(free)]
+    law_step = np.append(np.zeros(6 * len(poses)), moved[len(free) :])
+    law_step[free] = moved[: len(free)]
     pose_covariance = joint[:6, :6]
     pose_std = std_of_entries(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
     a = len(robot.body.cables) if initial is not None else 0
-    input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
+    input_covariance = covariance[len(free) :, len(free) :] if a else np.zeros((0, 0))
     tables = input_tables(robot, recording, initial, input_covariance)
     own = tables.tension_std if recording.actuation == "tension" else tables.displacement_std
     per_marker = {
@@ -292,6 +295,7 @@ def _result(
         noise_m=float(np.sqrt(3.0)) * marker_repeatability(recording),
         joint_covariance=joint,
         marker_covariance=fit.covariance,
+        law_step=law_step,
     )
 
 

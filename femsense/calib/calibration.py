@@ -49,7 +49,10 @@ class Calibration:
     that of the first camera alone is known."""
     marker_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """What markers alone say of undeclared poses (as joint_covariance) and of initial inputs ([N] or [m]) together; empty where
-    nothing was fitted to them. It is not kept in a file."""
+    nothing was fitted to them, without what another law changes. It is not kept in a file."""
+    law_step: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """By how much another law moves all poses (as joint_covariance, which holds its square) and what markers say of initial inputs, shape (6 v + a,);
+    empty where nobody knows. It is not kept in a file."""
     is_corrected: bool = False
     """Whether the robot's empirical correction was used."""
 

@@ -69,17 +69,20 @@ def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatAr
     poses, covariance = list(calibration.poses), np.zeros((6 * len(calibration.poses),) * 2)
     if calibration.joint_covariance.size:
         covariance[:] = calibration.joint_covariance
+    law = calibration.law_step.copy()
     turn, shift = START_STD[0], START_STD[1] * float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     for v, T in starts.items():
         own, poses[v] = slice(6 * v, 6 * v + 6), freeze(T)
         covariance[own, :], covariance[:, own] = 0.0, 0.0
         covariance[own, own] = np.diag([turn**2] * 3 + [shift**2] * 3)
+        law[own] = 0.0
     return replace(
         calibration,
         T_robot_camera=poses[0],
         poses=tuple(poses),
         pose_covariance=freeze(covariance[:6, :6]),
         joint_covariance=freeze(covariance),
+        law_step=freeze(law),
     )
 
 

@@ -101,7 +101,8 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
     noises = measured_noises(robot, recording, calibration)
     pivot, size = pose_pivot(robot), float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
-    prior = _prior(calibration.joint_covariance, which)
+    law = _law_of(calibration)
+    prior = _prior(calibration.joint_covariance - np.outer(law, law), which)
     held = np.zeros(len(robot.body.mesh.nodes), dtype=bool)
     held[robot.body.clamped] = True
     equations = _Equations(frames, noises, pivot, size, which, held)
@@ -119,17 +120,26 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *
         clouds *= worth_of_clouds(clouds, prior, apart) if measured else 1.0
         weight = clouds @ np.linalg.inv(normal)
     ended = replace(calibration, poses=tuple(poses))
-    moved = _moved_by_law(robot, recording, ended, equations, prior, used[0], used[1] - gone)
+    moved = _moved_by_law(robot, recording, ended, equations, prior, used[0], used[1] - gone + law[which])
     covariance = np.zeros((6 * len(poses),) * 2)
     covariance[np.ix_(which, which)] = np.linalg.inv(clouds + prior) + np.outer(moved, moved)
+    law_step = np.zeros(len(covariance))
+    law_step[which] = moved
     return replace(
         calibration,
         T_robot_camera=freeze(poses[0]),
         poses=tuple(freeze(T) for T in poses),
         pose_covariance=freeze(covariance[:6, :6]),
         joint_covariance=freeze(covariance),
+        law_step=freeze(np.append(law_step, calibration.law_step[len(law_step) :])),
         normal_rms_m=rms,
     )
+
+
+def _law_of(calibration: Calibration) -> FloatArray:
+    """Return by how much another law moves the poses of a calibration, shape (6 v,); 0 where nobody knows."""
+    p = 6 * len(calibration.poses)
+    return calibration.law_step[:p] if calibration.law_step.size else np.zeros(p)
 
 
 def _moved_by_law(
@@ -141,7 +151,8 @@ def _moved_by_law(
     weight: FloatArray,
     center: FloatArray,
 ) -> FloatArray:
-    """Return where a fit under the other law ends that begins where a fit ended, shape (p,); 0 where the robot declares its law."""
+    """Return where a fit under the other law ends that begins where a fit ended, shape (p,); 0 where the robot declares its law.
+    The center of the prior is where the other law moves it."""
     other = with_other_law(robot)
     frames = [] if other is None else _free_frames(other, recording, ended.poses, ended)
     if not frames:

@@ -72,7 +72,10 @@ def with_initial_inputs(
     else:
         start, prior = calibrated_inputs(robot, recording, calibration), np.asarray(np.linalg.inv(known))
     assert start is not None
-    fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior)
+    law = np.zeros(len(start) + p)
+    if known is not None and calibration.law_step.size:
+        law = np.append(calibration.law_step[which], calibration.law_step[6 * len(calibration.poses) :])
+    fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), which, start, prior, law)
     end = fit.joint(calibration.poses, DERIVATIVES if known is None else 1)
     if known is not None:
         end = fit.beside_markers(end)
@@ -118,6 +121,8 @@ class _Fit:
     """Initial inputs, shape (a,)."""
     prior: FloatArray
     """Precision of poses and inputs about where they start, shape (p + a, p + a)."""
+    law: FloatArray
+    """By how much another law moves what is known before, shape (p + a,)."""
 
     def joint(
         self,
@@ -186,8 +191,9 @@ class _Fit:
         other = with_other_law(self.robot)
         if other is None:
             return np.zeros(len(self.prior))
-        there = replace(self, robot=other, start=end.initial).joint(end.poses, 1, end.weighed, end.gone)
-        return np.asarray(there.gone - end.gone)
+        gone = end.gone - self.law  # from where the other law leads what is known before
+        there = replace(self, robot=other, start=end.initial).joint(end.poses, 1, end.weighed, gone)
+        return np.asarray(there.gone - gone)
 
     def _sums(
         self, scans: dict[int, Scan], states: dict[int, FloatArray], moves: dict[int, FloatArray], poses: list[FloatArray]

@@ -56,10 +56,10 @@ def fit_joint(
     return fit, moved, inputs, jet  # an input at its bound is no better known than others: what they have in common moves all
 
 
-def holding_law(
+def moved_by_law(
     robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet
-) -> FitResult:
-    """Return a fit whose covariance holds by how much the neo-Hookean law moves it, too; as it was where the robot declares its law.
+) -> FloatArray:
+    """Return by how much the neo-Hookean law moves a fit, shape (p,); 0 where the robot declares its law.
 
     One step from where the fit ended, −C Jᵀ Δr: Δr is how the whitened residual changes with the law, C = (JᵀJ)⁻¹.
 
@@ -67,9 +67,9 @@ def holding_law(
         robot, scene: as they were fitted.
         fit, poses, initial, jet: where `fit_joint` ended.
     """
-    other = with_other_law(robot)
+    other, nothing = with_other_law(robot), np.zeros(len(fit.theta))
     if other is None or not np.isfinite(fit.covariance).all():
-        return fit
+        return nothing
     there = _Problem(other, scene, poses, initial, free_inputs=True)
     there.starts = dict(jet.states)
     there.weigh(jet, _huber_weights(jet.residual), len(fit.theta))
@@ -78,10 +78,9 @@ def holding_law(
     try:
         changed = there.jet_at(there.start(), derivative=False)
     except DataError:
-        return fit
+        return nothing
     by_law = np.concatenate([(row[:, :, 0] * (changed.residual - jet.residual)).ravel(), np.zeros(jet.rest.size)])
-    moved = -covariance_of(J) @ (J.T @ by_law)
-    return replace(fit, covariance=fit.covariance + np.outer(moved, moved))
+    return np.asarray(-covariance_of(J) @ (J.T @ by_law))
 
 
 class _Problem:

@@ -44,6 +44,7 @@ def test_the_pose_under_the_other_law_is_one_deviation_away() -> None:
     law_moves = step_to(found(), found(declared=True).T_robot_camera)
     std = np.sqrt(np.diag(found().pose_covariance))
     assert (np.abs(law_moves) < 1.1 * std).all()
+    assert found().law_step[:6] @ law_moves > 0.9 * law_moves @ law_moves  # it is known in which direction
     assert (np.abs(law_moves) > 3.0 * np.sqrt(np.diag(found(declared=True).pose_covariance))).any()
 
 
