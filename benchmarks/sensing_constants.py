@@ -18,16 +18,24 @@ from independent.grade import grade
 from independent.make import make
 
 from femsense import calibrate, estimate, load_recording, load_robot
-from femsense.sensing import separation, touches
+from femsense.sensing import forces, nuisance, separation, touches
 from femsense.sensing.run_files import write_run
 
 VALUES: dict[str, tuple[ModuleType, tuple[float, ...]]] = {
     "HERTZ": (touches, (0.0, 1.0, touches.HERTZ, 1.6)),
     "ALIKE": (touches, (0.0, touches.ALIKE, 0.3)),
     "KEPT": (separation, (0.0, separation.KEPT, 0.98)),
+    "ASIDE": (nuisance, (0.0, 1.0, nuisance.ASIDE, 4.0)),
+    "TRIES": (forces, (1, 3, forces.TRIES, 10)),
 }
-"""Constants, where they stand, and values to ask with; KEPT matters without colours alone, the others where a round object touches."""
-ASKED = {"HERTZ": "pad-normal", "ALIKE": "pad-normal", "KEPT": "slab-gray"}
+"""Constants, where they stand, and values to ask with; KEPT matters without colours alone, HERTZ and ALIKE where a round object touches."""
+ASKED = {
+    "HERTZ": ("pad-normal",),
+    "ALIKE": ("pad-normal",),
+    "KEPT": ("slab-gray",),
+    "ASIDE": ("slab-gray", "bar-tangential"),
+    "TRIES": ("slab-rod", "bar-tangential"),
+}
 
 
 def main() -> None:
@@ -46,7 +54,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
     for name in given.only:
-        for case in given.case or [ASKED[name]]:
+        for case in given.case or ASKED[name]:
             folder = given.out / case
             if not (folder / "truth.json").exists():
                 make(next(c for c in CASES if c.name == case), folder, given.seed)

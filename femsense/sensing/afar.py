@@ -6,6 +6,7 @@ over the surface, as far as a body may go, and compared with the cloud as they a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,7 +62,7 @@ def from_afar(
         free: the fit without forces.
         before: tensions along the cables until now (friction).
     """
-    if whole is None or not whole.segmented or _is_explained(sensor, fit) or not is_far(scan, free):
+    if whole is None or not whole.segmented or is_explained(sensor, fit) or not is_far(scan, free):
         return scan, fit, free
     best = (left_over(sensor, fit), scan, fit, free)
     touches = _likely(sensor, whole, free)
@@ -69,7 +70,7 @@ def from_afar(
         ramps = sorted((_ramp(sensor, k, whole, touch, free, before) for touch in touches), key=lambda ramp: ramp[0])
         for _, touch, state, force in ramps:
             best = min(best, _begun_at(sensor, k, whole, [touch], (state, force), free, before), key=lambda one: one[0])
-            if _is_explained(sensor, best[2]):
+            if is_explained(sensor, best[2]):
                 return best[1:]
         near = best[2].state if best[2].touches else ramps[0][2]
         touches = object_touches(sensor, seen_objects(sensor, k, whole, near), near)
@@ -78,12 +79,28 @@ def from_afar(
     return best[1:]
 
 
+def averaged_anew(
+    sensor: Sensor, k: int, whole: Scan | None, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None
+) -> tuple[Scan, Fit, Fit]:
+    """Return scan, fit and fit without forces of frame k with its points averaged at the state of the fit, where that explains more.
+
+    The mean of the points of a face says as much as they do near the state where they were averaged. From a state that a touch has moved far, points
+    beside an edge are of the face behind it, and what they scatter about their mean cannot be explained by any force.
+    Arguments as for `from_afar`.
+    """
+    if whole is None or not whole.segmented or not fit.touches or is_explained(sensor, fit):
+        return scan, fit, free
+    left, few, again, alone = _begun_at(sensor, k, whole, fit.touches, (fit.state, fit.forces), free, before)
+    return (few, again, alone) if left < left_over(sensor, fit) else (scan, fit, free)
+
+
 def is_far(scan: Scan, free: Fit) -> bool:
     """Return whether so many rays miss the state without forces that it tells little of the body's."""
     return bool(free.rows.count < MANY * scan.measured.sum())
 
 
-def _is_explained(sensor: Sensor, fit: Fit) -> bool:
+def is_explained(sensor: Sensor, fit: Fit) -> bool:
+    """Return whether a fit leaves no more than free frames let expect."""
     return left_over(sensor, fit) <= sensor.knowledge.misfit_limit
 
 
@@ -140,7 +157,7 @@ def _begun_at(
     sensor: Sensor,
     k: int,
     whole: Scan,
-    touches: list[Touch],
+    touches: Sequence[Touch],
     start: tuple[Equilibrium, FloatArray],
     free: Fit,
     before: tuple[FloatArray, ...] | None,

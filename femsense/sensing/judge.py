@@ -12,6 +12,7 @@ from femsense.core.errors import DataError
 from femsense.fem.mesh import TetMesh
 from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess
+from femsense.sensing.places import away_from_scenery
 from femsense.sensing.responses import response_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
@@ -25,8 +26,16 @@ BESIDE, NEAR = 5.0, 0.01
 """Markers that are off by more than so many times the residual of the calibration, and this share of the body's diagonal, are not on the body.
 On a soft beam whose touch was lost they were off by 9 to 60 times; in frames with the right forces by at most 1.7 times."""
 
+BESIDE_SHAPE = (
+    "an object is seen to touch where no contact was found, and a contact elsewhere that only the shape shows may be its own"
+)
+"""What a frame is said to be where an object touches that explains it no better than a place that nobody sees."""
+
 UNKNOWN = "an object may touch whose force is not known"
 """What a frame is said to be whose other forces hold."""
+
+ELSEWHERE = 3.0
+"""Two places that lie farther apart than so many of their standard deviations are not the same."""
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -120,7 +129,7 @@ def unspoken(fit: Fit, i: int) -> bool:
     return bool(value[i] < SURE <= value.max())
 
 
-def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
+def objects_known(fit: Fit, touching: Sequence[Touch], elsewhere: Sequence[Touch] = ()) -> str:
     """Return "ok", or in words that an object touches whose force may be none: beside a sure one, or where no contact is reported.
 
     One that carries less than how well the sure ones are known is part of their deviation, and not spoken of.
@@ -128,13 +137,34 @@ def objects_known(fit: Fit, touching: Sequence[Touch]) -> str:
     Arguments:
         fit: of the frame.
         touching: those of its contacts, and of the places where completed objects touch the body, where nothing seems to touch in free frames.
+        elsewhere: see `seen_elsewhere`.
     """
+    if elsewhere:
+        return BESIDE_SHAPE
     silent = [i for i, touch in enumerate(fit.touches) if any(touch is one for one in touching) and unspoken(fit, i)]
     most = [float(np.linalg.norm(fit.forces[i])) + 2.0 * _std_along(fit, i) for i in silent]
     sure = [_std_along(fit, i) for i, value in enumerate(chi_squared(fit)) if value >= SURE]
     if most and max(most) > max(sure):
         return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
     return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK
+
+
+def seen_elsewhere(sensor: Sensor, fit: Fit, found: Sequence[Touch]) -> list[Touch]:
+    """Return where objects are seen to touch and the fit has no contact, if it has one that only the shape shows: that one may be theirs.
+
+    Arguments:
+        fit: of the frame.
+        found: where completed objects touch in its state.
+    """
+    if all(touch.source != "shape" for touch in fit.touches):
+        return []
+    return [one for one in away_from_scenery(sensor, found) if not any(_at(sensor, fit, i, one) for i in range(len(fit.touches)))]
+
+
+def _at(sensor: Sensor, fit: Fit, i: int, found: Touch) -> bool:
+    """Return whether contact i is where an object touches, as well as the two places are known."""
+    std = float(np.hypot(np.sqrt(np.trace(fit.place_covariance[i])), found.std_m))
+    return float(np.linalg.norm(fit.touches[i].place - found.place)) < max(ELSEWHERE * std, sensor.surface.edge)
 
 
 def left_over(sensor: Sensor, fit: Fit) -> float:

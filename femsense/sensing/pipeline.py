@@ -26,7 +26,16 @@ from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.judge import OK, behind_body, beside_markers, objects_known, status_of, sure_forces, trusted
+from femsense.sensing.judge import (
+    OK,
+    behind_body,
+    beside_markers,
+    objects_known,
+    seen_elsewhere,
+    status_of,
+    sure_forces,
+    trusted,
+)
 from femsense.sensing.moved_camera import camera_status
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
@@ -148,8 +157,10 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     if status == OK and fit.rows.of_clouds:
         status = beside_markers(sensor, k, fit)
     if status == OK and not len(sensor.places):
-        seen = [] if fit.touches else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
-        status = objects_known(fit, away_from_scenery(sensor, [*fit.touches, *seen]))
+        all_seen = fit.touches and all(touch.source == "cloud" for touch in fit.touches)
+        seen = [] if all_seen else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
+        touching = away_from_scenery(sensor, fit.touches or seen)
+        status = objects_known(fit, touching, seen_elsewhere(sensor, fit, seen))
     report = FrameReport(
         number,
         stamp,

@@ -14,11 +14,11 @@ from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
-from femsense.sensing.afar import ANYWHERE, APART, from_afar
+from femsense.sensing.afar import ANYWHERE, APART, averaged_anew, from_afar
 from femsense.sensing.forces import fit_forces
 from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std
-from femsense.sensing.places import given_touches, object_touches, said_free
+from femsense.sensing.places import away_from_scenery, given_touches, object_touches, said_free
 from femsense.sensing.responses import response_at
 from femsense.sensing.states import foretold
 from femsense.sensing.touches import make_touch, moved_to
@@ -63,8 +63,11 @@ def explain(
     if again is not None and earned and nothing_new(sensor, again, object_touches(sensor, shapes, again.state)):
         return scan, again, free
     fit = _with_objects(sensor, k, scan, shapes, free, free if again is None else again, before)
+    scan, fit, free = averaged_anew(sensor, k, whole, scan, fit, free, before)
     scan, fit, free = from_afar(sensor, k, whole, scan, fit, free, before)
-    return scan, with_hidden(sensor, k, scan, fit, free, before), free
+    fit = with_hidden(sensor, k, scan, fit, free, before)
+    scan, fit, free = averaged_anew(sensor, k, whole, scan, fit, free, before)
+    return scan, _seen_instead(sensor, k, scan, shapes, free, fit, before), free
 
 
 def with_hidden(
@@ -187,6 +190,23 @@ def _with_objects(
         fit = better(free, attempt(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
     fit = _significant(sensor, k, scan, fit, free, before)
     return fit if _earned(sensor, scan, shapes, fit, free) else free
+
+
+def _seen_instead(
+    sensor: Sensor, k: int, scan: Scan, shapes: list[Shape], free: Fit, fit: Fit, before: tuple[FloatArray, ...] | None
+) -> Fit:
+    """Return the fit with what objects touch in its state in place of a contact that only the shape shows, where that explains the frame as well.
+
+    Some objects touch only in the state that a contact makes: in that of the inputs alone they lie inside the body, or beside it.
+    """
+    if all(touch.source == "cloud" for touch in fit.touches):
+        return fit
+    known = [touch for touch in fit.touches if touch.source == "cloud"]
+    if all(_near(sensor, found, known) for found in away_from_scenery(sensor, object_touches(sensor, shapes, fit.state))):
+        return fit
+    seen = _with_objects(sensor, k, scan, shapes, free, fit, before)
+    as_well = left_over(sensor, seen) <= max(sensor.knowledge.misfit_limit, left_over(sensor, fit))
+    return seen if seen.touches and as_well else fit
 
 
 def _earned(sensor: Sensor, scan: Scan, shapes: list[Shape], fit: Fit, free: Fit) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.equilibrium import Equilibrium
+from femsense.model.drive import has_history
 from femsense.sensing.judge import unspoken
 from femsense.sensing.law import law_std, response_std
 from femsense.sensing.touches import contact_radius, touch_normal
@@ -27,7 +28,11 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
     contacts: list[ContactForce] = []
     cloudy = fit.rows.of_clouds
     response = response_std(sensor.knowledge, len(sensor.calibration.poses)) if cloudy else 0.0
-    shares = np.hypot(response, law_std(sensor, fit, free)) if cloudy else np.zeros(len(fit.touches))
+    before = previous.state.segment_tensions if previous is not None and has_history(sensor.robot) else None
+    law, shifted = (
+        law_std(sensor, k, fit, free, before) if cloudy else (np.zeros(len(fit.touches)), np.zeros((len(fit.touches), 3)))
+    )
+    shares = np.hypot(response, law)
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
         if (size == 0.0 and touch.source != "given") or unspoken(fit, i):
@@ -46,7 +51,7 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
                 std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
                 source=touch.source,
                 track=_place_of(sensor, touch) if touch.source == "given" else -1,
-                position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0))),
+                position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0) + shifted[i] ** 2)),
                 radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -11,8 +12,8 @@ from helpers import block_mesh
 
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import ContactPatch
-from femsense.sensing.judge import chi_squared, least_stretch, objects_known, unspoken
-from femsense.sensing.types import Fit, Rows, Touch
+from femsense.sensing.judge import chi_squared, least_stretch, objects_known, seen_elsewhere, unspoken
+from femsense.sensing.types import Fit, Rows, Sensor, Touch
 
 MESH = block_mesh((2, 1, 1))
 
@@ -52,3 +53,20 @@ def test_a_frame_with_a_force_that_is_not_known_is_not_ok():
     none = fit_of([], [])
     assert objects_known(none, ()) == "ok"
     assert "not known: too small" in objects_known(none, sure.touches)
+    assert "touch where no contact was found" in objects_known(sure, (), sure.touches[:1])
+
+
+def test_an_object_that_is_seen_to_touch_beside_a_contact_that_only_the_shape_shows_is_elsewhere():
+    """Places are known to 1 mm each; the contact lies at the origin."""
+    sensor = cast(Sensor, SimpleNamespace(scenery=np.zeros((0, 3)), size=0.2, surface=SimpleNamespace(edge=2e-3)))
+    near, far = (replace(fit_of([[0.0] * 3], ["cloud"]).touches[0], place=np.array([x, 0.0, 0.0])) for x in (0.002, 0.006))
+    shape, seen = (fit_of([[0.0, 0.0, -0.2]], [source]) for source in ("shape", "cloud"))
+    assert seen_elsewhere(sensor, shape, [near, far]) == [far]
+    assert seen_elsewhere(sensor, replace(shape, place_covariance=1e-5 * np.eye(3)[None]), [far]) == []
+    assert seen_elsewhere(sensor, seen, [far]) == []
+    assert seen_elsewhere(replace_scenery(sensor, far.place), shape, [far]) == []
+
+
+def replace_scenery(sensor: Sensor, place: np.ndarray) -> Sensor:
+    """Return a sensor in whose free frames something seems to touch at a place."""
+    return cast(Sensor, SimpleNamespace(scenery=place[None], size=sensor.size, surface=sensor.surface))

@@ -66,6 +66,21 @@ def test_a_body_that_a_touch_has_moved_far_at_once_is_found(tmp_path):
     assert run.contacts[-1].force_n == pytest.approx(0.8, rel=0.08)
 
 
+def test_points_are_averaged_anew_where_a_touch_has_moved_the_body(tmp_path):
+    """Averaged at the state without forces, points beside an edge are of two faces, and what they scatter is never explained."""
+    seen = touched(tmp_path, np.array([0.0, 0, -0.1]), ball=True, noise=5e-5)
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [frame.status for frame in run.frames] == ["ok"] * 4
+    assert run.contacts[-1].force_n == pytest.approx(0.1, rel=0.05)
+
+
+def test_an_object_that_touches_only_in_the_state_of_a_contact_is_that_contact(tmp_path):
+    """In the state without forces the ball lies inside the arm, so the shape alone shows where it pushes."""
+    seen = touched(tmp_path, np.array([0.0, 0, -0.3]), ball=True)
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [(c.frame, c.source) for c in run.contacts] == [(3, "cloud")]
+
+
 def test_a_frame_that_nothing_explains_is_not_ok(tmp_path):
     """In the last frame the whole arm is seen 3 mm beside where it can be."""
     seen = touched(tmp_path, np.zeros(3), ball=False)

@@ -29,7 +29,14 @@ WALLS = np.vstack(
 
 
 def touched(
-    folder: Path, force: np.ndarray, *, ball: bool, place: np.ndarray = PLACE, nudge: np.ndarray | None = None, wall: bool = False
+    folder: Path,
+    force: np.ndarray,
+    *,
+    ball: bool,
+    place: np.ndarray = PLACE,
+    nudge: np.ndarray | None = None,
+    wall: bool = False,
+    noise: float = NOISE,
 ) -> Recording:
     """Return three free frames and one with a force on the upper face, on an arm of another mesh and law; a red ball pushes where it is shown.
 
@@ -37,6 +44,7 @@ def touched(
         place: where it pushes, at rest [m].
         nudge: how the camera has moved in that frame: (rotation about the robot's origin [rad], shift [m]), shape (6,).
         wall: whether two walls stand around the arm.
+        noise: of the points along their rays [m].
     """
     recording, states = record(INPUTS, noise=1e-4, forces={3: (place, force)})
     true, rng, files = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(11), []
@@ -57,7 +65,7 @@ def touched(
             points, shades = np.vstack([points, WALLS]), np.vstack([shades, np.full((len(WALLS), 3), 0.6)])
         pose = T_ROBOT_CAMERA if nudge is None or k != 3 else move_pose(T_ROBOT_CAMERA, nudge)
         ray = points - pose[:3, 3]
-        points = points + NOISE * rng.normal(size=(len(points), 1)) * ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        points = points + noise * rng.normal(size=(len(points), 1)) * ray / np.linalg.norm(ray, axis=1, keepdims=True)
         cloud = PointCloud(transform_points(invert_pose(pose), points), shades)
         write_cloud(folder / f"{k:06d}.ply", cloud)
         files.append((folder / f"{k:06d}.ply",))
