@@ -34,6 +34,8 @@ BESIDE_SHAPE = (
 UNKNOWN = "an object may touch whose force is not known"
 """What a frame is said to be whose other forces hold."""
 
+VAGUE = 2.0
+"""A place is vague that is known so many times worse than another one: that of a few points is by 3.5 times that of a ball (`arm-two --seed 5`)."""
 ELSEWHERE = 3.0
 """Two places that lie farther apart than so many of their standard deviations are not the same."""
 
@@ -114,6 +116,18 @@ def chi_squared(fit: Fit) -> FloatArray:
     """Return how far each force of a fit is from none, squared, in standard deviations, shape (m,); 0 where none is known."""
     blocks = [fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(fit.touches))]
     return np.array([float(f @ np.linalg.pinv(block) @ f) for f, block in zip(fit.forces, blocks)])
+
+
+def first_to_go(fit: Fit, weak: Sequence[int]) -> int:
+    """Return which of some contacts whose forces may be noise is left out first: the weakest of those whose places are known so much worse than another's.
+
+    Where parts of one object are each taken for an object, they share its force and that of one beside them, so that all are weak. The weakest one of all
+    may then be what is seen best.
+    """
+    least = min(fit.touches[i].std_m for i in weak)
+    value = chi_squared(fit)
+    vague = [i for i in weak if fit.touches[i].std_m > VAGUE * least]
+    return min(vague or weak, key=lambda i: value[i])
 
 
 def sure_forces(fit: Fit) -> tuple[bool, ...]:

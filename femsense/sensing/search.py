@@ -16,7 +16,7 @@ from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.afar import ANYWHERE, APART, averaged_anew, from_afar
 from femsense.sensing.forces import fit_forces
-from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
+from femsense.sensing.judge import SURE, chi_squared, first_to_go, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, said_free
 from femsense.sensing.responses import response_at
@@ -327,7 +327,7 @@ def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before
         weak = [i for i, v in enumerate(value) if v < SURE and not unspoken(fit, i)]
         if not weak:
             return fit
-        weakest = min(weak, key=lambda i: value[i])
+        weakest = first_to_go(fit, weak)
         kept = [t for i, t in enumerate(fit.touches) if i != weakest]
         if not kept:
             return free

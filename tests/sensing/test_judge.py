@@ -12,7 +12,7 @@ from helpers import block_mesh
 
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import ContactPatch
-from femsense.sensing.judge import chi_squared, least_stretch, objects_known, seen_elsewhere, unspoken
+from femsense.sensing.judge import chi_squared, first_to_go, least_stretch, objects_known, seen_elsewhere, unspoken
 from femsense.sensing.types import Fit, Rows, Sensor, Touch
 
 MESH = block_mesh((2, 1, 1))
@@ -40,6 +40,15 @@ def test_an_object_that_touches_beside_a_sure_force_stays_in_the_fit_unspoken():
     assert [unspoken(fit, i) for i in range(2)] == [False, True]
     assert not unspoken(fit_of([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]], ["cloud", "cloud"]), 1)  # none is sure
     assert not unspoken(fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.02]], ["cloud", "shape"]), 1)  # no object is seen there
+
+
+def test_of_contacts_that_may_be_noise_the_one_whose_place_is_known_least_goes_first():
+    fit = fit_of([[0.0, 0.0, -0.02], [0.0, 0.0, -0.03], [0.0, 0.0, -0.035]], ["cloud", "cloud", "cloud"])
+    places = [replace(touch, std_m=std) for touch, std in zip(fit.touches, (1.8e-3, 6.4e-3, 6.2e-3))]
+    assert first_to_go(fit, [0, 1, 2]) == 0  # all are known alike
+    assert first_to_go(replace(fit, touches=tuple(places)), [0, 1, 2]) == 1
+    assert first_to_go(replace(fit, touches=tuple(places)), [1, 2]) == 1
+    assert first_to_go(replace(fit, touches=tuple(places)), [0]) == 0
 
 
 def test_a_frame_with_a_force_that_is_not_known_is_not_ok():
