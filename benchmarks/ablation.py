@@ -48,8 +48,33 @@ class OneCriterion(HeldOutComparison):
         return self.error <= decides.not_worse or (self.gain > least and self.beyond_mesh <= decides.not_worse)
 
 
-def nothing(*given: Any) -> None:
+def nothing(*given: Any, **more: Any) -> None:
     """A rule that finds nothing."""
+
+
+def none_at_all(*given: Any) -> tuple[()]:
+    """A rule that yields nothing."""
+    return ()
+
+
+def no_words(*given: Any) -> str:
+    """A rule that has nothing to say."""
+    return ""
+
+
+def zero(*given: Any) -> float:
+    """A rule that adds nothing."""
+    return 0.0
+
+
+def as_it_is(data: Any, fitted: Any, refitted: Any, *given: Any) -> Any:
+    """A rule that leaves a refit as it is."""
+    return refitted
+
+
+def no_spread(data: Any, fitted: Any, *given: Any) -> Any:
+    """A rule that adds nothing to standard deviations."""
+    return np.zeros(len(fitted.fit.coordinates))
 
 
 @dataclass(frozen=True)
@@ -113,6 +138,13 @@ SEARCH = (
     Switch("declared pose", {}, {}, {"fit.joint_fit.BESIDE_MARKERS": np.array([0.1] * 3 + [0.01] * 3)}),
     Switch("two sweeps disagree", {}, {}, {"fit.cross_validation.LEAST_SWEEPS": 2}),
     Switch("needless", {}, {}, {"search.swaps._if_needless": nothing}),
+    Switch("elsewhere", {}, {}, {"search.forward_selection._elsewhere": as_it_is}),
+    Switch("richer forms", {}, {}, {"search.forward_selection._enriched": as_it_is}),
+    Switch("more markers", {}, {}, {"search.forward_selection._with_more_markers": as_it_is}),
+    Switch("surely predicts", {}, {}, {"search.acceptance.surely_predicts": zero}),
+    Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
+    Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
+    Switch("weights with the error", {}, {}, {"search.search.nothing_explains": nothing}),
 )
 """Rules of the search, each with a search of its own."""
 VERDICT = (
@@ -126,6 +158,12 @@ VERDICT = (
     Switch("structure", {"structure": 0.0}),
     Switch("not_worse", {"not_worse": INF}),
     Switch("held-out exceptions", {}, {}, {"verdict.returned_model.HeldOutComparison": OneCriterion}),
+    Switch("much is lacking", {}, {}, {"verdict.verdict.lacks_much": nothing}),
+    Switch("surprise", {}, {}, {"verdict.verdict._surprise": no_words}),
+    Switch("moves alike", {}, {}, {"verdict.confounding._in_common": none_at_all}),
+    Switch("in place of an error", {}, {}, {"verdict.confounding._in_place_of_an_error": none_at_all}),
+    Switch("absorbed", {}, {}, {"verdict.confounding._absorbed": none_at_all}),
+    Switch("open seeds", {}, {}, {"fit.covariance._with_open_seeds": no_spread}),
 )
 """Rules of the verdict, on what one search found."""
 
