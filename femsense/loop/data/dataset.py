@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,6 +83,10 @@ class Data:
         """What the data are: "markers", "clouds" or both."""
         kinds = {"markers" if t.scene.crossings is None else "clouds" for t in self.train}
         return tuple(sorted(kinds, reverse=True))
+
+    def with_trials(self, of: Callable[[Trial], Trial]) -> Data:
+        """Return the data with something else in the place of each trial, fitted and held out."""
+        return replace(self, train=[of(t) for t in self.train], held=[of(t) for t in self.held])
 
     @property
     def settled(self) -> tuple[tuple[Effect, Entry], ...]:

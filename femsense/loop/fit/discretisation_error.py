@@ -94,8 +94,7 @@ def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> D
         known_before = bool(mesh_errors(data))
         return data if known_before else replace(data, mesh_note=f"no state settles on a finer mesh ({error})")
     moves_of = {id(trial): moves for part, moves in sampled for trial in part.trials}
-    train, held = ([replace(t, mesh_moves=moves_of[id(t)]) for t in trials] for trials in (data.train, data.held))
-    return _by_moves(replace(data, train=train, held=held, mesh_note=""), fitted)
+    return _by_moves(replace(data.with_trials(lambda t: replace(t, mesh_moves=moves_of[id(t)])), mesh_note=""), fitted)
 
 
 def with_mesh_errors_of(data: Data, some: Data, fitted: FittedModel) -> Data:
@@ -116,11 +115,7 @@ def as_shown(data: Data, fitted: FittedModel) -> Data:
     shares = np.concatenate([_shares(t, jet, error) for t, jet, error in zip(data.train, fitted.fit.jets, errors)])
     decides = data.thresholds
     size = max(float(abs(shares.mean())) / decides.mesh_share, float(shares.std()) / decides.mesh_varies)
-    train, held = (
-        [replace(t, mesh_error=None if t.mesh_error is None else min(size, 1.0) * t.mesh_error) for t in trials]
-        for trials in (data.train, data.held)
-    )
-    return replace(data, train=train, held=held)
+    return data.with_trials(lambda t: t if t.mesh_error is None else replace(t, mesh_error=min(size, 1.0) * t.mesh_error))
 
 
 def _shares(trial: Trial, jet: SceneJet, error: FloatArray) -> FloatArray:
@@ -153,8 +148,7 @@ def _by_moves(data: Data, fitted: FittedModel) -> Data:
         for part in _parts(data, fitted)
         for trial in part.trials
     }
-    train, held = ([replace(t, mesh_error=errors[id(t)]) for t in trials] for trials in (data.train, data.held))
-    return replace(data, train=train, held=held)
+    return data.with_trials(lambda t: replace(t, mesh_error=errors[id(t)]))
 
 
 def errs_alike(before: FittedModel, after: FittedModel) -> bool:

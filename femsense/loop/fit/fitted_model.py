@@ -12,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly, whiteners
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
@@ -220,33 +220,30 @@ def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: Flo
     return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
+def whitened(trial: Trial, residual: FloatArray, noise: Noise) -> FloatArray:
+    """Return rows of a trial, shape (k, c, …), in units of what they may hold by chance, shape (c k, …)."""
+    return whiten(noise.whitener(trial.groups, trial.mesh_error), residual)
+
+
 def held_chi2(data: Data, fitted: FittedModel, noise: Noise) -> float:
     """Return the whitened sum of squares of the held-out residuals."""
-    return float(
-        sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, fitted.held_residuals))
-    )
+    return float(sum((whitened(t, r, noise) ** 2).sum() for t, r in zip(data.held, fitted.held_residuals)))
 
 
 def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
     """Return the mean square of whitened residuals; 1 is noise."""
-    rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
+    rows = [whitened(t, r, noise) for t, r in zip(trials, residuals)]
     return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
 
 def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
     """Return the whitened sum of squares of the difference between two models on held-out data."""
-    return float(
-        sum(
-            (whiten(noise.whitener(t.groups, t.mesh_error), b - a) ** 2).sum()
-            for t, b, a in zip(data.held, before.held_residuals, after.held_residuals)
-        )
-    )
+    pairs = zip(before.held_residuals, after.held_residuals)
+    return float(sum((whitened(t, b - a, noise) ** 2).sum() for t, (b, a) in zip(data.held, pairs)))
 
 
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
-    return JointProblem(
-        fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.placement_std
-    )
+    return JointProblem(fit.hypothesis, fit.prior, data.train, whiteners(data.train, noise), data.placement_std)
 
 
 def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:

@@ -215,8 +215,8 @@ class Structure:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LeftOver:
-    """What a residual looks like: how large, where on the body, in which frames, which way, and what it goes with."""
+class Left:
+    """What is left of the residual at the end: how large, where on the body, in which frames, which way, and what it goes with."""
 
     rms_m: float
     marker_rms_m: Mapping[str, float]
@@ -226,12 +226,6 @@ class LeftOver:
     half_in_frames: float
     """Share of the frames, the worst first, that hold half of the mean square."""
     goes_with: tuple[Correlation, ...]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Left(LeftOver):
-    """What is left of the residual at the end."""
-
     held_out: bool
     """Whether it is that of held-out data, which alone show it."""
     structure: Structure

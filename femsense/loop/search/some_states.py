@@ -38,14 +38,9 @@ def some_states(data: Data) -> Data | None:
     if "clouds" in data.measured or has_history(data.robot):
         return None
     most = data.effort.work // len(data.robot.body.mesh.tets)
-    train, held = ([spread_states(t, most) for t in trials] for trials in (data.train, data.held))
-    if float(np.mean([share for _, share in train])) > SPARED:
+    if float(np.mean([spread_states(t, most)[1] for t in data.train])) > SPARED:
         return None
-    return replace(
-        data,
-        train=[t.part(frames) for t, (frames, _) in zip(data.train, train)],
-        held=[t.part(frames) for t, (frames, _) in zip(data.held, held)],
-    )
+    return data.with_trials(lambda t: t.part(spread_states(t, most)[0]))
 
 
 def in_all_states(every: Data, course: SearchProgress, search: Search, say: Progress) -> SearchProgress:

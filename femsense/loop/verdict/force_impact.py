@@ -162,10 +162,11 @@ def _compliances(before: View, after: View) -> Compliance:
             ends.append((np.diag(W)[: len(nodes)], float(np.linalg.norm(phantom))))
         (first, phantom_before), (second, phantom_after) = ends
         rows.append(Softer(title, before.number(k), tuple((first / second).tolist()), phantom_before, phantom_after))
-    return Compliance(_tuples(declared.nodes[nodes]), tuple(rows))
+    return Compliance(tuples_of(declared.nodes[nodes]), tuple(rows))
 
 
-def _tuples(rows: FloatArray) -> tuple[tuple[float, ...], ...]:
+def tuples_of(rows: FloatArray) -> tuple[tuple[float, ...], ...]:
+    """Return rows as tuples of numbers."""
     return tuple(tuple(row) for row in rows.tolist())
 
 
@@ -208,8 +209,8 @@ def equivalent_forces(views: list[View], noise: Noise) -> ForceField | None:
     return ForceField(
         recording=view.recording,
         frame=view.number(frame),
-        points_m=_tuples(places),
-        forces_n=_tuples(forces),
+        points_m=tuples_of(places),
+        forces_n=tuples_of(forces),
         total_n=tuple(forces.sum(axis=0).tolist()),
         explained_share=float(1.0 - left @ left / (r @ r)),
     )

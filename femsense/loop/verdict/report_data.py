@@ -21,7 +21,7 @@ from femsense.loop.result.records import Structure
 from femsense.loop.search.screening import Candidate
 from femsense.loop.verdict.calibration_tables import calibration_shift, excluded
 from femsense.loop.verdict.candidate_tables import confounding_map, power, ranking
-from femsense.loop.verdict.force_impact import View, chosen_frames, equivalent_forces, force_consequence, views_of
+from femsense.loop.verdict.force_impact import View, chosen_frames, equivalent_forces, force_consequence, tuples_of, views_of
 from femsense.loop.verdict.lack_of_fit import tested
 from femsense.loop.verdict.residual_diagnostics import frame_rms, structure_tests
 
@@ -198,16 +198,12 @@ def _pictures(data: Data, old: list[View], new: list[View]) -> Pictures:
                 recording=view.recording,
                 frame=view.number(k),
                 marker=tuple(data.robot.marker_names[m] for m in view.trial.scene.marker[rows]),
-                measured_m=_vectors(other.measured[rows]),
-                before_m=_vectors(view.vectors[rows]),
-                after_m=_vectors(other.vectors[rows]),
-                nodes_m=_vectors(np.round(state[corners], 6)) if is_small else None,
+                measured_m=tuples_of(other.measured[rows]),
+                before_m=tuples_of(view.vectors[rows]),
+                after_m=tuples_of(other.vectors[rows]),
+                nodes_m=tuples_of(np.round(state[corners], 6)) if is_small else None,
             )
         )
     cameras = tuple(CameraPlace(tuple(T[:3, 2].tolist()), tuple(T[:3, 3].tolist())) for T in other.poses)
     faces = tuple(tuple(face) for face in triangles.reshape(-1, 3).tolist()) if is_small else None
     return Pictures(faces, tuple(frames), cameras)
-
-
-def _vectors(rows: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in rows.tolist())

@@ -7,7 +7,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.covariates import covariates_of, rank_with, stacked
 from femsense.loop.data.trial import Trial, heads_of, vectors_of
-from femsense.loop.result.records import FrameError, LeftOver, Structure, WorstMarker
+from femsense.loop.result.records import FrameError, Left, Structure, WorstMarker
 from femsense.loop.thresholds import DEFAULTS
 from femsense.model.recording import state_key
 from femsense.model.robot import Robot
@@ -131,16 +131,23 @@ def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
         same = sweep[1:] == sweep[:-1]
         above += float((v[1:] * v[:-1]).sum(axis=(1, 2))[same].sum())
         below += float((v**2).sum())
-        if len(values) < 3 or not same.any():
-            below += 0.0
     pairs = sum(int((s[1:] == s[:-1]).sum()) for _, s in fields)
     return above / below if below > 0 and pairs >= 4 else float("nan")
 
 
-def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> LeftOver:
+def describe_left(
+    robot: Robot,
+    trials: list[Trial],
+    residuals: list[FloatArray],
+    *,
+    held_out: bool,
+    structure: Structure,
+    explained_share: float,
+) -> Left:
     """Return what the remaining residual looks like: how large, where on the body, in which frames, which way, and what it goes with.
 
     The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
+    The others are as of `Left`.
     """
     heads = heads_of(trials)
     trials, residuals = [trials[i] for i in heads], [residuals[i] for i in heads]
@@ -150,11 +157,9 @@ def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]
     per_marker = {robot.marker_names[m]: float(np.sqrt((size[marker == m] ** 2).mean())) for m in np.unique(marker)}
     worst = max(per_marker, key=lambda name: per_marker[name])
     own = field[marker == robot.marker_names.index(worst)]
-    rms, numbers, recordings = _frame_sizes(trials, residuals)
-    order = np.argsort(-rms, kind="stable")
-    direction, share = _direction(own)
-    frames = [FrameError(int(recordings[i]), int(numbers[i]), float(rms[i])) for i in order[:WORST_FRAMES]]
-    return LeftOver(
+    frames, direction, share = frame_errors(trials, residuals), *_direction(own)
+    worst_frames = sorted(frames, key=lambda frame: -frame.rms_m)
+    return Left(
         rms_m=float(np.sqrt((size**2).mean())),
         marker_rms_m=per_marker,
         where=WorstMarker(
@@ -164,18 +169,25 @@ def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]
             direction=tuple(direction.tolist()),
             direction_share=share,
         ),
-        worst_frame=frames[0],
-        worst_frames=tuple(frames),
-        half_in_frames=_share_of_half(rms[order]),
-        goes_with=tuple(rank_with(rms, stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH]),
+        worst_frame=worst_frames[0],
+        worst_frames=tuple(worst_frames[:WORST_FRAMES]),
+        half_in_frames=_share_of_half(np.array([frame.rms_m for frame in worst_frames])),
+        goes_with=tuple(
+            rank_with(np.array([frame.rms_m for frame in frames]), stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH]
+        ),
+        held_out=held_out,
+        structure=structure,
+        explained_share=explained_share,
     )
 
 
-def _frame_sizes(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return root mean square [m], number and recording of each frame, in order."""
-    sizes = [frame_rms(t, r) for t, r in zip(trials, residuals)]
-    numbers = [t.scene.recording.frame_numbers[t.scene.frames] for t in trials]
-    return np.concatenate(sizes), np.concatenate(numbers), np.repeat(np.arange(len(trials)), [len(s) for s in sizes])
+def frame_errors(trials: list[Trial], residuals: list[FloatArray]) -> list[FrameError]:
+    """Return what is left in each frame of each recording, in order: of its markers, where there are any, else of its clouds."""
+    return [
+        FrameError(i, int(number), float(rms))
+        for i, (t, r) in enumerate((trials[at], residuals[at]) for at in heads_of(trials))
+        for number, rms in zip(t.scene.recording.frame_numbers[t.scene.frames], frame_rms(t, r))
+    ]
 
 
 def frame_rms(trial: Trial, residual: FloatArray) -> FloatArray:

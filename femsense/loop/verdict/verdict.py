@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.report_data import gather
-from femsense.loop.verdict.residual_diagnostics import describe_left, structure_tests
+from femsense.loop.verdict.residual_diagnostics import describe_left, frame_errors, structure_tests
 from femsense.loop.verdict.returned_model import (
     MODULUS,
     entries_of,
@@ -153,7 +153,8 @@ def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     held = mean_square(data.held, back.held_residuals, noise)
     if held <= data.thresholds.lacks * max(fitted, 1.0):
         return ""
-    worst = describe_left(data.robot, data.held, _beyond_mesh(data.held, back.held_residuals, noise)).worst_frame
+    frames = frame_errors(data.held, _beyond_mesh(data.held, back.held_residuals, noise))
+    worst = max(frames, key=lambda frame: frame.rms_m)
     return (
         f" Held-out data show what the fitted ones do not, most in frame {worst.frame} ({1e3 * worst.rms_m:.2f} mm):"
         " record more sweeps like that one."
@@ -163,9 +164,8 @@ def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
 def _left(data: Data, fitted: FittedModel, noise: Noise, tests: Structure, excess: Excess, *, held: bool) -> Left:
     """Return what the residual of the fitted data looks like, or of the held-out data where these alone show it."""
     trials, residuals = (data.held, fitted.held_residuals) if held else (data.train, [jet.residual for jet in fitted.fit.jets])
-    found = describe_left(data.robot, trials, _beyond_mesh(trials, residuals, noise))
-    described = {f.name: getattr(found, f.name) for f in fields(found)}
-    return Left(**described, held_out=held, structure=tests, explained_share=excess.explained)
+    beyond = _beyond_mesh(trials, residuals, noise)
+    return describe_left(data.robot, trials, beyond, held_out=held, structure=tests, explained_share=excess.explained)
 
 
 def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> list[FloatArray]:
