@@ -315,3 +315,17 @@ def covariance_of(jacobian: FloatArray) -> FloatArray:
     part[blind, blind] = np.inf
     covariance[np.ix_(seen, seen)] = part / np.outer(scale[seen], scale[seen])
     return covariance
+
+
+def basis_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return an orthonormal basis Q of columns J (N, p), and A with A Qᵀ = J⁺, so that A Aᵀ = (JᵀJ)⁻¹ over the directions that J sees."""
+    norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, s, Vt = np.linalg.svd(columns / norm, full_matrices=False)
+    seen = s > max(1e-9 * s.max(initial=0.0), 1e-300)
+    return np.asarray(U[:, seen]), np.asarray(Vt[seen].T / s[seen] / norm[:, None])
+
+
+def beside(columns: FloatArray, values: FloatArray) -> FloatArray:
+    """Return what is left of values (N, …) once columns (N, p) explain what they can."""
+    Q = basis_of(columns)[0]
+    return np.asarray(values - Q @ (Q.T @ values))

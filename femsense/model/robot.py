@@ -193,13 +193,13 @@ def spread_features(body: BodyModel, count: int, *, among: IntArray | None = Non
     return freeze(free[spread_points(x, count, first=first)], np.int64)
 
 
-def spread_points(points: FloatArray, count: int, *, first: int = 0) -> IntArray:
-    """Return which of some points (p, 3) are spread evenly among them (farthest-point sampling), shape (≤ count,)."""
+def spread_points(points: FloatArray, count: int, *, first: int = 0, apart: float = -1.0) -> IntArray:
+    """Return which of some points (p, q) are spread evenly among them (farthest-point sampling), farther than `apart` from each other, shape (≤ count,)."""
     if not len(points) or count <= 0:
         return np.zeros(0, dtype=np.int64)
     chosen = [first]
     distance = np.linalg.norm(points - points[first], axis=1)
-    while len(chosen) < min(count, len(points)):
+    while len(chosen) < min(count, len(points)) and distance.max() > apart:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.array(chosen, dtype=np.int64)

@@ -9,7 +9,17 @@ from scipy.optimize import least_squares
 
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.errors import DataError, InputError
-from femsense.core.least_squares import NEARLY, GaussNewtonOptions, Learning, Pace, broyden_update, covariance_of, gauss_newton
+from femsense.core.least_squares import (
+    NEARLY,
+    GaussNewtonOptions,
+    Learning,
+    Pace,
+    basis_of,
+    beside,
+    broyden_update,
+    covariance_of,
+    gauss_newton,
+)
 from femsense.core.pose import invert_pose, make_pose, move_pose, transform_points
 
 
@@ -392,3 +402,19 @@ def test_a_fit_whose_steps_promise_less_than_half_of_what_is_missing_is_given_up
         gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=7.1)).status == "stopped early"
     )  # tried, and no better than that
     assert gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=9.1)).cost[-1] == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize("width", [0, 1, 4])
+def test_a_basis_spans_its_columns_and_tells_their_inverse(width: int) -> None:
+    rng = np.random.default_rng(3)
+    J = rng.normal(size=(30, width)) * 10.0 ** rng.integers(-6, 6, width)
+    J = np.column_stack([J, J.sum(axis=1), np.zeros(30)])  # one that others make up, and one that nothing answers to
+    Q, A = basis_of(J)
+    np.testing.assert_allclose(Q.T @ Q, np.eye(width), atol=1e-9)
+    np.testing.assert_allclose(J @ (A @ (Q.T @ J)), J, atol=1e-9 * np.abs(J).max(initial=0.0))
+    values = rng.normal(size=(30, 2))
+    left = beside(J, values)
+    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    np.testing.assert_allclose((J / size).T @ left, 0.0, atol=1e-9)
+    np.testing.assert_allclose(beside(J, J / size), 0.0, atol=1e-9)
+    np.testing.assert_allclose(beside(J, left), left, atol=1e-12)

@@ -9,6 +9,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.sampled_states import drive_table, ranges
 from femsense.loop.data.trial import Trial
 from femsense.model.recording import Recording
+from femsense.model.robot import spread_points
 
 FEWEST = 16
 """They are as many at least."""
@@ -32,11 +33,6 @@ def state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
     return np.asarray((table - table[0]) / ranges(table))
 
 
-def representatives(vectors: FloatArray, most: int) -> list[int]:
-    """Return indices of distinct states, at most so many, spread widely (farthest-point sampling)."""
-    chosen = [0]
-    distance = np.linalg.norm(vectors - vectors[0], axis=1)
-    while len(chosen) < most and distance.max() > SAME:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
-    return chosen
+def representatives(vectors: FloatArray, most: int) -> IntArray:
+    """Return indices of distinct states, at most so many, spread widely."""
+    return spread_points(vectors, most, apart=SAME)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +24,6 @@ def ranges(table: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.ptp(table, axis=0), 1e-12))
 
 
-def between(vectors: FloatArray, known: Sequence[int] | IntArray, values: FloatArray) -> FloatArray:
-    """Return values of all states, shape (f, …), from those of some of them (indices `known`), shape (k, …), by how near their vectors (f, q) are."""
-    flat = RBFInterpolator(vectors[known], values.reshape(len(known), -1), kernel="linear", degree=0)(vectors)
-    return np.asarray(flat).reshape(len(vectors), *values.shape[1:])
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class Sampled:
     """What was computed in some states, and lies in between in others."""
@@ -44,5 +37,6 @@ class Sampled:
 
     def at(self, drives: FloatArray) -> FloatArray:
         """Return the values of states that are driven so, shape (f, …), drives of shape (f, q)."""
-        vectors = np.vstack([self.drives, drives]) / self.ranges
-        return between(vectors, np.arange(len(self.drives)), self.values)[len(self.drives) :]
+        count = len(self.values)
+        known = RBFInterpolator(self.drives / self.ranges, self.values.reshape(count, -1), kernel="linear", degree=0)
+        return np.asarray(known(drives / self.ranges)).reshape(len(drives), *self.values.shape[1:])

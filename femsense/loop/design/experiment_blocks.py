@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.least_squares import FitResult
-from femsense.core.pose import rotation_from_vector
 from femsense.loop.data.trial import States, Trial
 from femsense.loop.design.candidate_experiments import MOST_EACH
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
@@ -251,13 +251,4 @@ def turns_of(gravity: FloatArray | None, declared: FloatArray) -> FloatArray | N
     if gravity is None:
         return None
     first = declared if np.any(declared) else gravity[0]
-    a = first / np.linalg.norm(first)
-    result = []
-    for g in gravity:
-        b = g / max(float(np.linalg.norm(g)), 1e-300)
-        axis = np.cross(a, b)
-        size = float(np.linalg.norm(axis))
-        spare = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
-        unit = axis / size if size > 1e-9 else spare / np.linalg.norm(spare)
-        result.append(rotation_from_vector(unit * np.arctan2(size, float(a @ b))))
-    return np.array(result)
+    return np.array([Rotation.align_vectors(g[None], first[None])[0].as_matrix() for g in gravity])

@@ -212,10 +212,7 @@ class _Left:
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Return the pseudo-inverse of a positive semi-definite matrix, columns scaled to unit size."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    good = values > 1e-12 * max(float(values.max(initial=0.0)), 1e-300)
-    half = vectors[:, good] / np.sqrt(values[good]) / scale[:, None]
-    return np.asarray(half @ half.T)
+    return np.asarray(np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale))
 
 
 def _root(matrix: FloatArray, scale: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from itertools import product
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.least_squares import basis_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.fitted_model import FittedModel
@@ -106,8 +107,7 @@ class _Model:
     def __init__(self, rows: _Rows, terms: FloatArray) -> None:
         self.rows, self.terms, self.q = rows, terms, terms.shape[1]
         flat = rows.columns.reshape(-1, rows.columns.shape[2])
-        U, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
-        self.along = U[:, s > 1e-9 * s[0]].reshape(*rows.columns.shape[:2], -1)
+        self.along = basis_of(flat)[0].reshape(*rows.columns.shape[:2], -1)
 
     def _groups(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
         """Yield terms, residuals and columns for each axis of each marker: independent of each other but for the columns."""

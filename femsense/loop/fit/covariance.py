@@ -16,10 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
-from femsense.core.least_squares import covariance_of
+from femsense.core.least_squares import basis_of, covariance_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.cross_validation import LEAST_SWEEPS, half_inverse, sweep_rows
+from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweep_rows
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior, whiteners
 from femsense.loop.fit.noise_components import NEAR_STD, Noise
@@ -132,7 +132,7 @@ def std_by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
     sweeps = sweep_rows(data.train, fitted.fit)
     if len(sweeps) < LEAST_SWEEPS:
         return np.zeros(J.shape[1])
-    A = half_inverse(J)
+    A = basis_of(J)[1]
     pulls = []
     for rows in sweeps:
         U, s, _ = np.linalg.svd(J[rows] @ A, full_matrices=False)

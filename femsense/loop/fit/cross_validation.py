@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import IntArray
+from femsense.core.least_squares import basis_of
 from femsense.loop.data.trial import Trial, numbers_of
 from femsense.loop.fit.joint_fit import JointFit
 
@@ -46,19 +47,10 @@ def sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
 def _density(fit: JointFit, rows: IntArray) -> float:
     """Return twice the log density of left-out rows, up to a constant."""
     J, r = np.asarray(fit.fit.jacobian), np.asarray(fit.fit.residual)
-    A = half_inverse(J)
-    B = J[rows] @ A  # H_bb = B Bᵀ
+    B = J[rows] @ basis_of(J)[1]  # H_bb = B Bᵀ
     inner = np.eye(B.shape[1]) - B.T @ B
     values, vectors = np.linalg.eigh(inner)
     mixed = vectors.T @ (B.T @ r[rows])
     mixed[values < OPEN] = 0.0  # whatever the value, these rows fit it
     values = np.maximum(values, OPEN)
     return float(np.log(values).sum() - r[rows] @ r[rows] - (mixed**2 / values).sum())
-
-
-def half_inverse(J: FloatArray) -> FloatArray:
-    """Return A with A Aᵀ = (JᵀJ)⁻¹ over the directions that J sees."""
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
-    keep = s > 1e-9 * s[0]
-    return np.asarray(Vt[keep].T / s[keep] / scale[:, None])

@@ -284,7 +284,7 @@ def _moves_in(robot: Robot, fine: Robot, part: _Part, frames: IntArray) -> tuple
     return np.array(list(moves), dtype=np.int64), np.array(list(moves.values())).reshape(len(moves), len(here), 3)
 
 
-def _chosen(vectors: FloatArray, tets: int) -> list[int]:
+def _chosen(vectors: FloatArray, tets: int) -> IntArray:
     """Return indices of distinct states in which a finer mesh of so many elements is asked."""
     return representatives(vectors, max(8, MOST_WORK // tets))
 

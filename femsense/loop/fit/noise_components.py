@@ -20,6 +20,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.least_squares import basis_of
 from femsense.core.parallel import each
 from femsense.loop.data.trial import COMPONENTS, Groups
 
@@ -336,9 +337,7 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
 
     The latter take at most a third of the degrees of freedom that the nuisance leaves, so that some are left for the noise.
     """
-    Z = _stacked(nuisance)
-    U, s, _ = np.linalg.svd(Z, full_matrices=False)
-    basis = list(U[:, s > 1e-9 * max(s.max(initial=0.0), 1e-300)].T)
+    basis = list(basis_of(_stacked(nuisance))[0].T)
     spare = max((distinct - len(basis)) // 3, 0)
     for column in _stacked(extra).T:
         if spare == 0:

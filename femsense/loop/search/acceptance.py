@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
-from femsense.core.least_squares import STOPPED_EARLY
+from femsense.core.least_squares import STOPPED_EARLY, beside
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.cross_validation import sweeps_predicted
@@ -120,15 +119,9 @@ def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) 
     J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(fitted.fit.jets, errors)]
     fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
     if whole or any(len(np.unique(t.groups.sweep)) < 2 for t in data.train):
-        return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
-    left = [_rest(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
+        return rms_of([beside(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
+    left = [beside(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
     return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
-
-
-def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    fitted = np.linalg.lstsq(columns / scale, values, rcond=1e-9)[0]
-    return np.asarray(values - columns / scale @ fitted)
 
 
 def _objection(made: FittedModel, candidate: Candidate, score: float, decides: Thresholds) -> str | None:

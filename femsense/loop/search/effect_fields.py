@@ -11,13 +11,9 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import NUISANCE, Data
-from femsense.loop.data.representative_states import representatives, spread_states, state_vectors
-from femsense.loop.data.sampled_states import between
 from femsense.loop.data.trial import States, Trial, spans_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
-from femsense.loop.thresholds import EFFORT, Effort
-from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, InRecording, Parameter
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis
@@ -100,8 +96,6 @@ def effect_fields(
     trials: list[Trial],
     todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
     answers: list[Answers] | None = None,
-    *,
-    effort: Effort = EFFORT,
 ) -> Fields:
     """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
     the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a quasi-static path of its own."""
@@ -119,7 +113,7 @@ def effect_fields(
         rest.append(jet.rest_by_effect)
     usable, near = smooth, [jet.states for jet in base.jets]
     for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
-        changes = _whole_change(base, trials, fixed, one, near, effort)
+        changes = _whole_change(base, trials, fixed, one, near)
         if changes is not None:
             usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
@@ -142,12 +136,10 @@ def _whole_change(
     fixed: Robot,
     one: tuple[Effect, Entry, tuple[Parameter, ...]],
     near: list[States],
-    effort: Effort,
 ) -> list[FloatArray] | None:
     """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
 
     It starts from states `near`, which those of another law take the place of: laws differ less from each other than from what is declared.
-    On large meshes some of the states tell it for the markers in all.
     """
     parameters = one[2]
     robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
@@ -156,39 +148,15 @@ def _whole_change(
     try:
         for i, (trial, jet, span) in enumerate(zip(trials, base.jets, spans_of(trials))):
             own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, near[i])
-            asked = part_that_tells(trial, robot, effort)
             try:
-                moved = probe.jet(asked, own, np.zeros(0), False, starts, rough=True)
+                moved = probe.jet(trial, own, np.zeros(0), False, starts, rough=True)
             except DataError:
-                moved = probe.jet(asked, own, np.zeros(0), False, starts)
-            whole = asked is trial
-            changes.append(moved.residual - jet.residual if whole else -_between(trial, fixed, jet.states, robot, moved.states))
+                moved = probe.jet(trial, own, np.zeros(0), False, starts)
+            changes.append(moved.residual - jet.residual)
             near[i] = starts if robot.body.mesh is fixed.body.mesh else near[i]
     except FemsenseError:
         return None
     return changes
-
-
-def part_that_tells(trial: Trial, robot: Robot, effort: Effort) -> Trial:
-    """Return a trial with some states that tell what changes in all; the whole of it where they are few, or clouds, or depend on each other."""
-    if trial.scene.crossings is not None or has_history(robot):
-        return trial
-    frames, share = spread_states(trial, effort.work // len(robot.body.mesh.tets))
-    return trial if share == 1.0 else trial.part(frames)
-
-
-def _between(trial: Trial, fixed: Robot, before: States, robot: Robot, after: States) -> FloatArray:
-    """Return by how much the marker of each row of a trial moves from one robot to another [m], (k, 3), from its moves in some of the states."""
-    frames = trial.scene.frames
-    vectors = state_vectors(trial.scene.recording, frames)
-    asked = np.flatnonzero(np.isin(frames, list(after)))
-    known = asked[representatives(vectors[asked], len(asked))]  # states that come back are one
-
-    def move(k: int) -> FloatArray:
-        return robot.markers.positions(after[k].positions) - fixed.markers.positions(before[k].positions)
-
-    every = between(vectors, known, np.array([move(int(k)) for k in frames[known]]))
-    return np.asarray(every[np.searchsorted(frames, trial.scene.frame), trial.scene.marker])
 
 
 def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
@@ -211,4 +179,4 @@ def fields_of(data: Data, fitted: FittedModel, names: Sequence[str]) -> Fields:
     todo = candidates_for(
         fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=placed_at_rest
     )
-    return effect_fields(fitted.fit, data.train, todo, effort=data.effort)
+    return effect_fields(fitted.fit, data.train, todo)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.core.arrays import FloatArray
+from femsense.core.least_squares import basis_of, beside
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import spans_of
 from femsense.loop.fit.fitted_model import FittedModel, problem_of
@@ -94,7 +95,7 @@ def screen(
         n_effective: number of independent observations, for BIC.
         wanted: dBIC at which an effect would just have been seen.
     """
-    Q, inverse = _factors(np.asarray(base.fit.jacobian))
+    Q, inverse = basis_of(np.asarray(base.fit.jacobian))
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
     effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
@@ -121,9 +122,7 @@ def screen(
 
 def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], placements: list[FloatArray]) -> float:
     """Return the decrease of χ² that is predicted of columns of markers and placements (see `Candidate`) beside a fit, without bounds."""
-    Q = _orthonormal(np.asarray(base.fit.jacobian))
-    whole = _whitened(base, problem, raw, placements)
-    more = _orthonormal(whole - Q @ (Q.T @ whole))
+    more = basis_of(beside(np.asarray(base.fit.jacobian), _whitened(base, problem, raw, placements)))[0]
     return float(np.sum((more.T @ base.fit.residual) ** 2))
 
 
@@ -138,24 +137,6 @@ def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest
         result[at + k : at + k + s] = rows.reshape(s, q) / problem.placement_std
         at += k + s + 6 * len(trial.poses)
     return result
-
-
-def _orthonormal(columns: FloatArray) -> FloatArray:
-    return _factors(columns)[0]
-
-
-def _factors(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q, an orthonormal basis of columns J (N, p), and A with A Qᵀ = J⁺."""
-    norm = np.linalg.norm(columns, axis=0)
-    seen = norm > 0
-    inverse = np.zeros((columns.shape[1], 0))
-    if not seen.any():
-        return np.zeros((len(columns), 0)), inverse
-    U, s, Vt = np.linalg.svd(columns[:, seen] / norm[seen], full_matrices=False)
-    kept = s > 1e-9 * s[0]
-    inverse = np.zeros((columns.shape[1], int(kept.sum())))
-    inverse[seen] = (Vt[kept].T / s[kept]) / norm[seen, None]
-    return np.asarray(U[:, kept]), inverse
 
 
 def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
@@ -191,11 +172,8 @@ def one_each(table: list[Candidate]) -> list[Candidate]:
 
 def confounding(a: Candidate, b: Candidate) -> float:
     """Return how much of a's field is collinear with b once nuisance is projected out (the largest canonical correlation)."""
-    A, B = _orthonormal(a.columns), _orthonormal(b.columns)
-    if not A.size or not B.size:
-        return 0.0
-    direction = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
-    return float(np.linalg.norm(B.T @ direction) / max(float(np.linalg.norm(direction)), 1e-300))
+    field = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
+    return float(np.linalg.norm(basis_of(b.columns)[0].T @ field) / max(float(np.linalg.norm(field)), 1e-300))
 
 
 def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:

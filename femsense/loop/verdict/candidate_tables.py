@@ -11,7 +11,7 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweep_rows
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.result.evidence import ConfoundingMap, Estimate, Ranked, Size
-from femsense.loop.search.screening import Candidate, one_each
+from femsense.loop.search.screening import Candidate, confounding, one_each
 from femsense.loop.thresholds import Thresholds
 
 DRAWS = 200
@@ -77,8 +77,8 @@ def _first_share(data: Data, fit: JointFit, ones: list[Candidate], rng: np.rando
 
 def without_first(gram: FloatArray, p: int) -> FloatArray:
     """Return a Gram matrix with its first p columns projected out."""
-    A, B, D = gram[:p, :p], gram[:p, p:], gram[p:, p:]
-    return np.asarray(D - B.T @ np.linalg.pinv(A, rcond=1e-12, hermitian=True) @ B)
+    B = gram[:p, p:]
+    return np.asarray(gram[p:, p:] - B.T @ np.linalg.pinv(gram[:p, :p], rcond=1e-12, hermitian=True) @ B)
 
 
 def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> float:
@@ -97,10 +97,7 @@ def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> floa
 def confounding_map(first: list[Candidate], decides: Thresholds) -> ConfoundingMap:
     """Return how much of each effect's field (row) is collinear with that of another one (column), nuisance projected out."""
     shown = [c for c in one_each(first) if c.retained >= decides.testable][:MAP]
-    bases = [np.linalg.qr(c.columns / np.maximum(np.linalg.norm(c.columns, axis=0), 1e-300))[0] for c in shown]
-    fields = [c.columns @ c.step if np.linalg.norm(c.columns @ c.step) > 0 else c.columns[:, 0] for c in shown]
-    share = tuple(tuple(float(np.linalg.norm(Q.T @ f) / max(float(np.linalg.norm(f)), 1e-300)) for Q in bases) for f in fields)
-    return ConfoundingMap(tuple(c.effect.name for c in shown), share)
+    return ConfoundingMap(tuple(c.effect.name for c in shown), tuple(tuple(confounding(a, b) for b in shown) for a in shown))
 
 
 def power(last: list[Candidate]) -> dict[str, tuple[Size, ...]]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
+from femsense.core.least_squares import beside
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.fit.fitted_model import span_of
 from femsense.loop.result.records import ConfoundedPair, RefitRecord
@@ -95,17 +96,14 @@ def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iter
     """Yield the effects that this recording cannot test because most of each is collinear with one named nuisance, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
-    poses = np.linalg.qr(J[:, : fit.own])[0]
+    poses = J[:, : fit.own]
     present = search.final.fit.hypothesis.names
     hidden = [c for c in one_each(search.first) if c.retained < decides.testable and c.effect.name not in present]
     for name in (n for n in names if n in NUISANCE):
-        own = J[:, fit.own :][:, span_of(fit, name)]
-        own = own - poses @ (poses.T @ own)
+        own = np.hstack([poses, J[:, fit.own :][:, span_of(fit, name)]])
         for c in hidden:
-            whole = c.columns - J @ c.response
-            whole = whole - poses @ (poses.T @ whole)
-            left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
-            if np.linalg.norm(left) < (1.0 - decides.alike**2) ** 0.5 * np.linalg.norm(whole):
+            whole = beside(poses, c.columns - J @ c.response)
+            if np.linalg.norm(beside(own, whole)) < (1.0 - decides.alike**2) ** 0.5 * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
@@ -122,10 +120,9 @@ def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterat
     """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
     forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
     fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
-    poses = np.linalg.qr(np.asarray(fit.fit.jacobian)[:, : fit.own])[0]
     left = widest.columns.sum(axis=1)
-    whole = left - np.asarray(fit.fit.jacobian) @ widest.response.sum(axis=1)
-    size = float(np.linalg.norm(whole - poses @ (poses.T @ whole)))
+    J = np.asarray(fit.fit.jacobian)
+    size = float(np.linalg.norm(beside(J[:, : fit.own], left - J @ widest.response.sum(axis=1))))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
     if retained < decides.testable:
         yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))

@@ -12,20 +12,19 @@ from arm import arm, record, sweeps
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.representative_states import FEWEST, spread_states
-from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, held_chi2, own_of, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
-from femsense.loop.search.effect_fields import effect_fields, fields_of, part_that_tells
+from femsense.loop.search.effect_fields import effect_fields, fields_of
 from femsense.loop.search.forward_selection import select_next
 from femsense.loop.search.location_search import climbed, closer, located, may_lie_elsewhere, same_place, without_term
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import Candidate, screen, screen_model
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
-from femsense.model.effects import apply_effects, find_effect
+from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis
 
 RECORD = RefitRecord("", {})
@@ -183,22 +182,6 @@ def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, 
         effect_fields(made.fit, data.train, [(one.effect, one.seed, one.parameters)]),
         COUNT,
     )
-
-
-def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedModel]):
-    data, fitted = started
-    law = next(f for f in data.forms if f.name == "hyperelastic" and f.discrete)
-    seed = law.seeds(data.robot)[0]
-    todo = [(law, seed, law.parameters(data.robot, data.control))]
-    less = replace(EFFORT, work=FEWEST * len(data.robot.body.mesh.tets))
-    whole, between = (effect_fields(fitted.fit, data.train, todo, effort=e).raw[0][:, :, 0] for e in (EFFORT, less))
-    part = part_that_tells(data.train[0], data.robot, less)
-    assert len(part.scene.frames) < 0.7 * len(data.train[0].scene.frames)
-    assert 0.0 < rms_of([between - whole]) < 0.25 * rms_of([whole])
-    exact = np.isin(data.train[0].scene.frame, spread_states(data.train[0], FEWEST)[0])
-    assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
-    rubbing = apply_effects(data.robot, [{"name": "cable_friction", "coefficient": 0.2}])
-    assert part_that_tells(data.train[0], rubbing, less) is data.train[0]  # states there need those before
 
 
 @pytest.mark.parametrize(("score", "passes"), [(16.0, True), (14.0, False)])
