@@ -60,10 +60,12 @@ class Scene:
 
     def pick(self, frames: IntArray) -> Scene:
         """Return the scene of some of its frames."""
-        rows = np.isin(self.frame, frames)
+        return replace(self.of_rows(np.isin(self.frame, frames)), frames=np.intersect1d(self.frames, frames))
+
+    def of_rows(self, rows: BoolArray) -> Scene:
+        """Return the scene with some of its rows (k,) only, its frames as they are."""
         return replace(
             self,
-            frames=np.intersect1d(self.frames, frames),
             frame=self.frame[rows],
             marker=self.marker[rows],
             view=self.view[rows],

@@ -35,9 +35,7 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     )
     if not off.any():
         return trial
-    scene, keep = trial.scene, ~off
-    fewer = replace(scene, frame=scene.frame[keep], marker=scene.marker[keep], view=scene.view[keep], points=scene.points[keep])
-    return replace(trial, scene=fewer, groups=trial.groups.of_rows(keep), mesh_error=None)
+    return replace(trial, scene=trial.scene.of_rows(~off), groups=trial.groups.of_rows(~off), mesh_error=None)
 
 
 def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, decides: Thresholds) -> BoolArray:

@@ -287,16 +287,7 @@ def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
         apart[rows] = heights[rows] - np.median(heights[rows][near], axis=1)
     usual = 1.4826 * float(np.median(np.abs(apart)))
     keep = np.abs(apart) <= STANDS_OUT * max(usual, 2e-4)
-    assert scene.crossings is not None
-    return replace(
-        scene,
-        frames=np.unique(scene.frame[keep]),
-        frame=scene.frame[keep],
-        marker=scene.marker[keep],
-        view=scene.view[keep],
-        points=scene.points[keep],
-        crossings=scene.crossings.pick(keep),
-    )
+    return replace(scene.of_rows(keep), frames=np.unique(scene.frame[keep]))
 
 
 def renewed_rows(

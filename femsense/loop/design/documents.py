@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from femsense.loop.design.identifiability import (
     Identifiability,
     Row,
 )
 from femsense.loop.design.planner import Proposal, pair_labels
+from femsense.loop.verdict.candidate_tables import own_size
 
 
 def identifiability_document(identifiability: Identifiability) -> dict[str, Any]:
@@ -50,11 +49,8 @@ def _row_document(r: Row) -> dict[str, Any]:
 
 def _change(p: Any, coordinate: float) -> float | None:
     """Return a size in the effect's own unit: a relative change for scales, the stiffness itself for compliances."""
-    if not np.isfinite(coordinate):
-        return None
-    if p.scale == "log":
-        return float(np.expm1(min(coordinate, 50.0)))
-    return 1.0 / float(coordinate) if p.scale == "reciprocal" else float(coordinate)
+    size = own_size(float(coordinate), p.scale)
+    return size - 1.0 if size is not None and p.scale == "log" else size
 
 
 def _unit(p: Any) -> str:

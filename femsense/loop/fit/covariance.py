@@ -40,10 +40,9 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
     std = np.maximum.reduce(
         [coordinate_std(fitted.fit, data.train, noise), std_by_sweeps(data, fitted)[own:], _with_open_seeds(data, fitted, noise)]
     )
-    result, at = dict[str, FloatArray](), 0
-    for effect, _, parameters in fitted.fit.hypothesis.terms:
-        part = std[at : at + len(parameters)]
-        at += len(parameters)
+    result = dict[str, FloatArray]()
+    for effect, _, _, span in fitted.fit.terms:
+        part = std[span]
         extra = np.zeros(len(part))
         known = seed_std.get(effect.name, extra)
         extra[: len(known)] = known[: len(part)]
@@ -146,15 +145,13 @@ def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArra
     """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
     hypothesis = fitted.fit.hypothesis
     terms, null, moving, known = [], [], [], []
-    at = 0
-    for effect, seed, parameters in hypothesis.terms:
+    for effect, seed, parameters, span in fitted.fit.terms:
         held = {p.key for p in parameters}
         more = tuple(p for p in effect.polish(data.robot, data.control, seed) if p.key not in held)
         terms.append((effect, seed, (*parameters, *more)))
-        null += [*fitted.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
+        null += [*fitted.fit.coordinates[span], *(p.null for p in more)]
         moving += [True] * len(parameters) + [False] * len(more)
         known += [min(p.known, NEAR_STD) for p in (*parameters, *more)]
-        at += len(parameters)
     mask = np.array(moving, dtype=bool)
     if mask.all():
         return np.zeros(len(fitted.fit.coordinates))

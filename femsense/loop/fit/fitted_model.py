@@ -142,12 +142,7 @@ def found_in(fitted: FittedModel) -> list[str]:
 
 def span_of(fit: JointFit, name: str) -> slice:
     """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
-    at = 0
-    for effect, _, parameters in fit.hypothesis.terms:
-        if effect.name == name:
-            return slice(at, at + len(parameters))
-        at += len(parameters)
-    return slice(0, 0)
+    return next((span for effect, _, _, span in fit.terms if effect.name == name), slice(0, 0))
 
 
 def own_of(fitted: FittedModel) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypedDict
 
@@ -17,6 +17,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
+from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
@@ -62,6 +63,14 @@ class JointFit:
     def coordinates(self) -> FloatArray:
         """Coordinates of the hypothesis, shape (p,)."""
         return self.fit.theta[self.own :]
+
+    @property
+    def terms(self) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ...], slice]]:
+        """Each effect with its seed, its parameters, and where its coordinates stand."""
+        at = 0
+        for effect, seed, parameters in self.hypothesis.terms:
+            yield effect, seed, parameters, slice(at, at + len(parameters))
+            at += len(parameters)
 
     @property
     def std(self) -> FloatArray:

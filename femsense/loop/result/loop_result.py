@@ -90,12 +90,12 @@ class LoopResult:
         return {"format": FORMAT, **tables, "evidence": rounded(tables["evidence"])}
 
 
-def rounded(value: Any) -> Any:
-    """Return plain tables with seven digits, NaN and infinity as null."""
+def rounded(value: Any, digits: int = 7) -> Any:
+    """Return plain tables with so many digits, NaN and infinity as null."""
     if isinstance(value, dict):
-        return {key: rounded(item) for key, item in value.items()}
+        return {key: rounded(item, digits) for key, item in value.items()}
     if isinstance(value, list):
-        return [rounded(item) for item in value]
+        return [rounded(item, digits) for item in value]
     if isinstance(value, float | np.floating):
-        return float(f"{value:.7g}") if np.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

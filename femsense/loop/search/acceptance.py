@@ -144,10 +144,9 @@ def _objection(made: FittedModel, candidate: Candidate, score: float, decides: T
 
 def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
     """Return the effects, or the nuisances, with a value at the edge of what is plausible (a law's limit may be none at all)."""
-    names, at = [], 0
-    for effect, _, parameters in fit.hypothesis.terms:
-        values = fit.coordinates[at : at + len(parameters)]
-        at += len(parameters)
+    names = []
+    for effect, _, parameters, span in fit.terms:
+        values = fit.coordinates[span]
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
         beyond = (values >= high - 1e-9) | ((values <= low + 1e-9) & (low > -np.inf) & (not effect.discrete))
         if beyond.any() and (effect.name in NUISANCE) == nuisance:

@@ -107,16 +107,12 @@ def screen(
         absorbed = Q.T @ whole
         left = whole - Q @ absorbed
         step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
-        q = len(parameters)
         alone = sum(e is effect and len(p) == len(parameters) and s == seed for e, s, p in fields.todo)
-        cost = penalty(q, seed, alone, effects, n_effective)
-        score = gain - cost
+        cost = penalty(len(parameters), seed, alone, effects, n_effective)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
-        smallest = _smallest(left, q, n_effective, wanted)
-        response = -inverse @ absorbed
-        result.append(
-            Candidate(effect, seed, parameters, own, rest, left, response, retained, step, gain, float(score), cost, smallest)
-        )
+        smallest = _smallest(left, len(parameters), n_effective, wanted)
+        found = left, -inverse @ absorbed, retained, step, gain, float(gain - cost), cost, smallest
+        result.append(Candidate(effect, seed, parameters, own, rest, *found))
     return sorted(result, key=lambda c: -c.score)
 
 
@@ -216,14 +212,9 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
         which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
         if which:
             known = None if before is None or fields is None else before.surface if clouds else before.std
-            picked = (
-                [residuals[i] for i in which],
-                [columns[i] for i in which],
-                [extra[i] for i in which],
-                [groups[i] for i in which],
-            )
             most = {"marker": data.placement_std} if fields is None and not clouds else {}
-            noise = noise.joined(estimate_noise(*picked, known, most), clouds)
+            r, nuisance, more = ([arrays[i] for i in which] for arrays in (residuals, columns, extra))
+            noise = noise.joined(estimate_noise(r, nuisance, more, [groups[i] for i in which], known, most), clouds)
     return noise, float(sum(g.observations for g in groups))
 
 

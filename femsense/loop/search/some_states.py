@@ -7,7 +7,6 @@ fitted to all of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from femsense.loop.data.representative_states import spread_states
 from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.marker_placement import with_turning_placements
-from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.calibration import START, calibrated_pose, fitted_again
@@ -65,34 +63,18 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
     data = with_turning_placements(as_shown(with_mesh_errors_of(data, course.data, fitted[-1]), fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
-    refits, over = list(search.refits), False
+    refits = list(search.refits)
     for name, model in search.history[given:]:
-        refits, over = _added(data, history, name, model, search, noise, refits, say)
-        if over:
+        say(f"fitting {name} to all states")
+        if not _added(data, history, name, model, search, refits):
             break
     last, first = history[-1][1], list[Candidate]()
     n_effective = float(sum(t.groups.observations for t in data.train))
     if len(history) > given:  # else it is screened anew
         first = screen_model(data, base.fit, noise, fields_of(data, base, course.names), n_effective)
         data = with_turning_placements(data, last)
-    return SearchProgress(
-        data,
-        data,
-        before,
-        history,
-        given,
-        last,
-        base,
-        course.names,
-        course.quadratic,
-        refits,
-        search.outweighed,
-        noise=noise,
-        n_effective=n_effective,
-        first=first,
-        table=first,
-        holds_error=course.holds_error,
-    )
+    models = replace(course, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
+    return replace(models, noise=noise, n_effective=n_effective, fields=None, first=first, table=first, over=False)
 
 
 def _without_outliers(data: Data, fitted: FittedModel) -> Data:
@@ -105,24 +87,23 @@ def _added(
     name: str,
     model: FittedModel,
     search: Search,
-    noise: Noise,
-    refits: Sequence[RefitRecord],
-    say: Progress,
-) -> tuple[list[RefitRecord], bool]:
-    """Append an effect's model to the history, fitted to all states, if it passes there; return the records, and whether it does not."""
-    say(f"fitting {name} to all states")
+    refits: list[RefitRecord],
+) -> bool:
+    """Return whether an effect passes in all states: then its model, fitted to them, ends the history; its record says what became of it."""
     at = next((i for i, r in reversed(list(enumerate(refits))) if r.name == name and r.is_named), None)
     candidate = _candidate(search, name, model)
     if at is None or candidate is None:  # what replaces another one has no record of its own: all states are asked for it anew
-        return list(refits), True
+        return False
     try:
-        made = fitted_again(data, model, noise)
-        record = acceptance_test(data, history[-1][1], candidate, made, refits[at], noise).record
+        made = fitted_again(data, model, search.noise)
+        record = acceptance_test(data, history[-1][1], candidate, made, refits[at], search.noise).record
     except FemsenseError as error:
-        return [*refits[:at], replace(refits[at], verdict=no_equilibrium(error)), *refits[at + 1 :]], True
+        refits[at] = replace(refits[at], verdict=no_equilibrium(error))
+        return False
+    refits[at] = replace(record, verdict=NAMED) if record.passes else record
     if record.passes:
         history.append((name, made))
-    return [*refits[:at], replace(record, verdict=NAMED) if record.passes else record, *refits[at + 1 :]], not record.passes
+    return record.passes
 
 
 def _candidate(search: Search, name: str, model: FittedModel) -> Candidate | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,23 +55,13 @@ def _terms(models: Mapping[str, FittedModel]) -> list[TermShift]:
     """Return the values that calibration moves, by model."""
     terms: dict[str, TermShift] = {}
     for name, fitted in models.items():
-        for term in _nuisances(fitted.fit, name):
-            before = terms[term.label].values if term.label in terms else {}
-            first = terms.get(term.label, term)
-            terms[term.label] = TermShift(term.label, first.unit, first.declared, {**before, **term.values})
+        for effect, _, parameters, span in fitted.fit.terms:
+            for p, value, std in zip(parameters, fitted.fit.coordinates[span].tolist(), fitted.fit.std[span].tolist()):
+                if effect.name in NUISANCE:
+                    label = f"{effect.name}: {p.label}"
+                    first = terms.get(label, TermShift(label, p.unit, p.value(p.null), {}))
+                    terms[label] = replace(first, values={**first.values, name: (p.value(value), p.value_std(value, std))})
     return list(terms.values())
-
-
-def _nuisances(fit: JointFit, model: str) -> list[TermShift]:
-    result, at = list[TermShift](), 0
-    for effect, _, parameters in fit.hypothesis.terms:
-        for p in parameters:
-            value, std = float(fit.coordinates[at]), float(fit.std[at])
-            at += 1
-            if effect.name in NUISANCE:
-                own = {model: (p.value(value), p.value_std(value, std))}
-                result.append(TermShift(f"{effect.name}: {p.label}", p.unit, p.value(p.null), own))
-    return result
 
 
 def _deviations(fit: JointFit, part: slice) -> Vector:

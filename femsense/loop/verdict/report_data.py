@@ -15,10 +15,9 @@ from femsense.loop.data.repeats import count_repeats
 from femsense.loop.data.trial import heads_of
 from femsense.loop.fit.discretisation_error import without_mesh_error
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.evidence import CameraPlace, Evidence, FrameTable, Pattern, Pictures, Snapshot, Tests, Tip
 from femsense.loop.result.records import Structure
-from femsense.loop.search.screening import Candidate
+from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.calibration_tables import calibration_shift, excluded
 from femsense.loop.verdict.candidate_tables import confounding_map, power, ranking
 from femsense.loop.verdict.force_impact import View, chosen_frames, equivalent_forces, force_consequence, tuples_of, views_of
@@ -30,30 +29,18 @@ MOST_NODES = 4000
 
 
 def gather(
-    data: Data,
-    before: FittedModel,
-    base: FittedModel,
-    final: FittedModel,
-    back: FittedModel,
-    shown: FittedModel,
-    noise: Noise,
-    first: list[Candidate],
-    last: list[Candidate],
-    after_tests: Structure,
-    rng: np.random.Generator,
+    data: Data, search: Search, back: FittedModel, shown: FittedModel, after_tests: Structure, rng: np.random.Generator
 ) -> Evidence:
     """Return what the figures and tables of the report need.
 
     Arguments:
         data: the recordings, split.
-        before: the declared model, calibrated.
-        base: with all that calibration may move.
-        final: with the effects, everything free; `back`: what is handed back; `shown`: that of the two whose residual is what is left.
-        noise: at the end.
-        first, last: the first and the last screening.
+        search: what was found in them.
+        back: what is handed back; `shown`: that or the last model of the search, whose residual is what is left.
         after_tests: tests of structure at the end.
         rng: of the bootstrap and the permutations.
     """
+    before, noise = search.before, search.noise
     old, new = views_of(data, before), views_of(data, back)
     score, pattern = _pattern(data, old, new)
     cleaned, left = (
@@ -66,16 +53,16 @@ def gather(
         score=pattern,
         tip=_tip(data, old, new),
         pictures=_pictures(data, old, new),
-        ranking=ranking(data, base.fit, first, rng),
-        confounding=confounding_map(first, data.thresholds),
-        calibration=calibration_shift(data, {"before": before, "nuisance": base, "after": final}),
+        ranking=ranking(data, search.base.fit, search.first, rng),
+        confounding=confounding_map(search.first, data.thresholds),
+        calibration=calibration_shift(data, {"before": before, "nuisance": search.base, "after": search.final}),
         tests=Tests(
             before=tested(
                 data.train, cleaned, before.fit, structure_tests(data.train, cleaned, rng=rng, level=data.thresholds.structure)
             ),
             after=tested(data.train, left, shown.fit, after_tests),
         ),
-        power=power(last),
+        power=power(search.last),
         excluded=tuple(excluded(trial.scene.recording, data) for trial in heads),
         repeats=sum(count_repeats(trial) for trial in heads),
         forces=force_consequence(old, new, noise),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from femsense.loop.fit.fitted_model import (
     with_seeds_still,
 )
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.loop_result import rounded
 from femsense.loop.search.acceptance import at_edge
 from femsense.loop.search.input_offset import OFFSETS, moved_nuisance, offsets_are_evident
 from femsense.loop.search.search_state import Search
@@ -186,7 +186,7 @@ def entries_of(fitted: FittedModel, names: list[str]) -> list[Entry]:
     settled = [{"name": effect.name, **seed} for effect, seed in fitted.fit.hypothesis.settled]
     tables = {e["name"]: e for e in fitted.fit.hypothesis.entries(fitted.fit.coordinates)}
     order = [*(name for name in names if name in tables), *(name for name in tables if name not in names)]
-    return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in order]
+    return [rounded(entry, 9) for entry in (*settled, *(tables[name] for name in order))]
 
 
 def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> float:
@@ -213,14 +213,3 @@ def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) ->
         jet = evaluate_robot(robot, scene, held.poses, initial, starts)
         gaps.append(jet.residual - held.jet.residual[np.isin(trial.scene.frame, some)])
     return rms_of(gaps) if gaps else 0.0
-
-
-def _rounded(entry: Entry) -> Entry:
-    def tidy(value: Any) -> Any:
-        if isinstance(value, float):
-            return float(f"{value:.9g}")
-        if isinstance(value, list):
-            return [tidy(v) for v in value]
-        return {k: tidy(v) for k, v in value.items()} if isinstance(value, dict) else value
-
-    return {k: tidy(v) for k, v in entry.items()}

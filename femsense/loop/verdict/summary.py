@@ -79,13 +79,10 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
         if effect.name == name:
             result |= {k: Value(v, None, _unit(k)) for k, v in seed.items()}
     full = full_std.get(name)
-    at = 0
-    for effect, seed, parameters in back.fit.hypothesis.terms:
-        values = back.fit.coordinates[at : at + len(parameters)]
-        std = back.fit.std[at : at + len(parameters)]
-        at += len(parameters)
+    for effect, seed, parameters, span in back.fit.terms:
         if effect.name != name:
             continue
+        values, std = back.fit.coordinates[span], back.fit.std[span]
         if full is not None and len(full) == len(std):
             std = np.maximum(std, full)
         for p in absent_elsewhere(parameters):

@@ -109,7 +109,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         fitted_along={e["name"]: values_of(std, back, e["name"]) for e in entries if e["name"] not in names},
         correction=correction,
         residuals=residual_table(data, before, back),
-        evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),
+        evidence=gather(data, search, back, shown, tests, rng),
     )
 
 
