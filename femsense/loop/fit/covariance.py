@@ -21,7 +21,7 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweep_rows
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior, whiteners
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import NEAR_STD, Noise
 from femsense.model.effects.base import KnownLength, known_length
 
@@ -158,7 +158,7 @@ def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArra
     mean, std = np.array(null), np.array(known)
     mean[mask], std[mask] = fitted.fit.prior.mean, fitted.fit.prior.std
     wider = replace(hypothesis, terms=tuple(terms))
-    problem = JointProblem(wider, Prior(mean, std), data.train, whiteners(data.train, noise), data.placement_std)
+    problem = JointProblem(wider, Prior(mean, std), data.train, noise.whiteners(data.train), data.placement_std)
     theta = np.concatenate([fitted.fit.fit.theta[: fitted.fit.own], null])
     jacobian = problem.evaluate(theta, True)[1]
     assert jacobian is not None

@@ -12,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly, whiteners
+from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
@@ -238,7 +238,7 @@ def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise
 
 
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
-    return JointProblem(fit.hypothesis, fit.prior, data.train, whiteners(data.train, noise), data.placement_std)
+    return JointProblem(fit.hypothesis, fit.prior, data.train, noise.whiteners(data.train), data.placement_std)
 
 
 def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:

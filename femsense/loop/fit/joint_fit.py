@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import TypedDict
 
@@ -297,11 +297,6 @@ class JointProblem:
         return np.append(r, (size - length.value) / length.std), np.vstack([J, row])
 
 
-def whiteners(trials: Sequence[Trial], noise: Noise) -> list[Whitener]:
-    """Return what whitens the rows of each trial."""
-    return [noise.whitener(t.groups, t.mesh_error) for t in trials]
-
-
 def _as_near(kept: States, near: States, body: BodyModel) -> States:
     """Return states of a body to start from: those of a fit near by where they are on the same mesh, since others may have gone far since
     then, unless it is those whose clamp has given way, or not, as this body's does. What is kept lends them its factors."""
@@ -373,7 +368,7 @@ def fit_jointly(
     Raises:
         DataError: no equilibrium at the start.
     """
-    problem = JointProblem(hypothesis, prior, trials, whiteners(trials, noise), placement_std)
+    problem = JointProblem(hypothesis, prior, trials, noise.whiteners(trials), placement_std)
     theta = problem.start(coordinates)
     if own is not None:
         theta[: problem.own] = own

@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.least_squares import basis_of
 from femsense.core.parallel import each
-from femsense.loop.data.trial import COMPONENTS, Groups
+from femsense.loop.data.trial import COMPONENTS, Groups, Trial
 
 ROUNDING = 1e-12
 """Directions of fields with less of the largest square are rounding."""
@@ -83,6 +83,10 @@ class Noise:
         `error` (k, c, b) are fields [m] that the residual may hold by chance besides, each with a standard deviation of once its size.
         """
         return _whitener(self, groups, _Same(error))
+
+    def whiteners(self, trials: Sequence[Trial]) -> list[Whitener]:
+        """Return what whitens the rows of each trial, the fields of its mesh's error among them."""
+        return [self.whitener(t.groups, t.mesh_error) for t in trials]
 
     @property
     def total(self) -> float:
