@@ -20,7 +20,7 @@ from femsense.core.least_squares import basis_of, covariance_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweep_rows
-from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.fitted_model import FittedModel, terms_of
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import NEAR_STD, Noise
 from femsense.model.effects.base import KnownLength, known_length
@@ -41,7 +41,7 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
         [coordinate_std(fitted.fit, data.train, noise), std_by_sweeps(data, fitted)[own:], _with_open_seeds(data, fitted, noise)]
     )
     result = dict[str, FloatArray]()
-    for effect, _, _, span in fitted.fit.terms:
+    for effect, _, _, span in terms_of(fitted.fit):
         part = std[span]
         extra = np.zeros(len(part))
         known = seed_std.get(effect.name, extra)
@@ -145,7 +145,7 @@ def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArra
     """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
     hypothesis = fitted.fit.hypothesis
     terms, null, moving, known = [], [], [], []
-    for effect, seed, parameters, span in fitted.fit.terms:
+    for effect, seed, parameters, span in terms_of(fitted.fit):
         held = {p.key for p in parameters}
         more = tuple(p for p in effect.polish(data.robot, data.control, seed) if p.key not in held)
         terms.append((effect, seed, (*parameters, *more)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Unpack
 
@@ -140,9 +140,17 @@ def found_in(fitted: FittedModel) -> list[str]:
     return [name for name in fitted.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
 
 
+def terms_of(fit: JointFit) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ...], slice]]:
+    """Yield each effect of a fit with its seed, its parameters, and where its coordinates stand."""
+    at = 0
+    for effect, seed, parameters in fit.hypothesis.terms:
+        yield effect, seed, parameters, slice(at, at + len(parameters))
+        at += len(parameters)
+
+
 def span_of(fit: JointFit, name: str) -> slice:
     """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
-    return next((span for effect, _, _, span in fit.terms if effect.name == name), slice(0, 0))
+    return next((span for effect, _, _, span in terms_of(fit) if effect.name == name), slice(0, 0))
 
 
 def own_of(fitted: FittedModel) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import TypedDict
 
@@ -17,7 +16,6 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
-from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
@@ -63,14 +61,6 @@ class JointFit:
     def coordinates(self) -> FloatArray:
         """Coordinates of the hypothesis, shape (p,)."""
         return self.fit.theta[self.own :]
-
-    @property
-    def terms(self) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ...], slice]]:
-        """Each effect with its seed, its parameters, and where its coordinates stand."""
-        at = 0
-        for effect, seed, parameters in self.hypothesis.terms:
-            yield effect, seed, parameters, slice(at, at + len(parameters))
-            at += len(parameters)
 
     @property
     def std(self) -> FloatArray:

@@ -209,7 +209,7 @@ class Structure:
     p_value: float
     """The smallest of all tests."""
     tests: Mapping[str, float]
-    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart, one marker apart."""
+    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart."""
     significant: bool
     """Whether any test stands after Holm's adjustment."""
 

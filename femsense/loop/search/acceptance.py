@@ -11,7 +11,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of, terms_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import PASSES, RefitRecord
@@ -145,7 +145,7 @@ def _objection(made: FittedModel, candidate: Candidate, score: float, decides: T
 def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
     """Return the effects, or the nuisances, with a value at the edge of what is plausible (a law's limit may be none at all)."""
     names = []
-    for effect, _, parameters, span in fit.terms:
+    for effect, _, parameters, span in terms_of(fit):
         values = fit.coordinates[span]
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
         beyond = (values >= high - 1e-9) | ((values <= low + 1e-9) & (low > -np.inf) & (not effect.discrete))

@@ -11,7 +11,7 @@ from femsense.calib.calibrate import usable_frames
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.surface_rows import cloud_frames
 from femsense.loop.data.trial import heads_of
-from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.fitted_model import FittedModel, terms_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.result.evidence import CalibrationShift, InputShift, PoseShift, TermShift, Vector
 from femsense.model.recording import Recording
@@ -55,7 +55,7 @@ def _terms(models: Mapping[str, FittedModel]) -> list[TermShift]:
     """Return the values that calibration moves, by model."""
     terms: dict[str, TermShift] = {}
     for name, fitted in models.items():
-        for effect, _, parameters, span in fitted.fit.terms:
+        for effect, _, parameters, span in terms_of(fitted.fit):
             for p, value, std in zip(parameters, fitted.fit.coordinates[span].tolist(), fitted.fit.std[span].tolist()):
                 if effect.name in NUISANCE:
                     label = f"{effect.name}: {p.label}"

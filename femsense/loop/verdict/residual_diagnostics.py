@@ -32,7 +32,7 @@ def structure_tests(
     * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
       shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
     * `pattern`: the largest singular value of states × markers, against shuffles of each marker's states among themselves (Horn 1965).
-    * `sweep`, `marker`: the sweep or marker with the largest mean square, against the same shuffles.
+    * `sweep`: the sweep with the largest mean square, against the same shuffles.
 
     Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
     """

@@ -13,7 +13,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS
 from femsense.loop.fit.discretisation_error import mesh_error_rms, representative_frames
-from femsense.loop.fit.fitted_model import FittedModel, held_out, roughly_keeping
+from femsense.loop.fit.fitted_model import FittedModel, held_out, roughly_keeping, terms_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import (
     NAMED,
@@ -79,7 +79,7 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
         if effect.name == name:
             result |= {k: Value(v, None, _unit(k)) for k, v in seed.items()}
     full = full_std.get(name)
-    for effect, seed, parameters, span in back.fit.terms:
+    for effect, seed, parameters, span in terms_of(back.fit):
         if effect.name != name:
             continue
         values, std = back.fit.coordinates[span], back.fit.std[span]
