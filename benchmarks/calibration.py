@@ -3,7 +3,7 @@ wrong labels, a real tentacle.
 
     python benchmarks/calibration.py [PART …] [--seeds N] [--first SEED]
 
-Parts: bound, nowhere, clouds, labels, single, tentacle, rate; all where none is named.
+Parts: bound, nowhere, clouds, labels, single, tentacle, rate, table1; all where none is named.
 Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/calibration.md.
 """
 
@@ -40,7 +40,7 @@ from femsense.model.contact_patch import body_surface  # noqa: E402
 from femsense.model.drive import DrivenRobot, drive_of  # noqa: E402
 from femsense.model.frame_state import solve_frame  # noqa: E402
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene  # noqa: E402
-from femsense.model.recording import with_marker_table  # noqa: E402
+from femsense.model.recording import make_recording, with_marker_table  # noqa: E402
 from femsense.pointcloud.rays import Surface  # noqa: E402
 from femsense.pointcloud.segmentation import color_mask  # noqa: E402
 from femsense.rig.camera import Shape, camera_of, cloud_of, look, look_at, render  # noqa: E402
@@ -448,13 +448,48 @@ def _nine(robot: Robot) -> Robot:
 
 
 def _seen(robot: Robot) -> tuple[Recording, FloatArray]:
-    from femsense.model.recording import make_recording
-
     count, a = len(robot.marker_names), len(robot.body.cables)
     plain = make_recording(Timeline([0.0]), drives=Drives(robot.body.cable_names, np.full((1, a), 0.1), actuation_zero="unknown"))
     model = robot.marker_points + 1e-4 * np.random.default_rng(0).normal(size=(count, 3))
     seen = transform_points(invert_pose(T_ROBOT_CAMERA), model)
     return with_marker_table(plain, robot.marker_names, np.zeros(count, np.int64), np.arange(count), seen), seen
+
+
+# Table I of the paper
+
+
+def table_one(seeds: int) -> None:
+    """Print how exactly the pose and the tensions of Table I (Zhang et al. 2019) come back from exact markers of the diamond."""
+    from femsense.io.robot_toml import load_robot
+
+    print("\n## Table I of the paper: the diamond under 1.2, 1, 1 and 1.2 N\n")
+    print("| markers | place | turn | tensions | residual |\n|---|---|---|---|---|")
+    U, _, Vt = np.linalg.svd([[-0.147, 0.941, 0.305], [-0.485, 0.200, -0.851], [-0.862, -0.273, 0.427]])
+    T, tensions = make_pose(U @ Vt, [-0.264956, 0.263885, 0.012767]), np.array([1.2, 1.0, 1.0, 1.2])
+    folder = ROOT.parent / "shared" / "data" / "diamond"
+    for count in (5, 9) if folder.is_dir() else ():
+        robot = _marked(load_robot(folder), count)
+        names = robot.body.cable_names
+        plain = make_recording(Timeline([0.0]), drives=Drives(names, np.zeros((1, 4)), actuation_zero="unknown"))
+        state = solve_frame(DrivenRobot(robot, drive_of(robot, plain, initial=tensions)), 0)
+        seen = transform_points(invert_pose(T), robot.markers.positions(state.positions))
+        markers = with_marker_table(plain, robot.marker_names, np.zeros(count, np.int64), np.arange(count), seen)
+        found = calibrate(robot, markers)
+        apart = found.T_robot_camera @ invert_pose(T)
+        off = np.abs(np.array(list(found.cable_tension_n.values())) - tensions).max()
+        place = 1e3 * np.linalg.norm(found.T_robot_camera[:3, 3] - T[:3, 3])
+        turn = np.degrees(np.linalg.norm(apart[:3, :3] - np.eye(3)) / np.sqrt(2.0))
+        print(f"| {count} | {place:.0e} mm | {turn:.0e}° | {off:.0e} N | {1e3 * found.rms_m:.0e} mm |", flush=True)
+
+
+def _marked(diamond: Robot, count: int) -> Robot:
+    """Return the diamond with markers at the top, around its middle, and nearer to the top, as many as asked for."""
+    angle = np.arange(4) * np.pi / 2
+    outer = np.stack([0.09 * np.cos(angle), 0.09 * np.sin(angle), np.full(4, 0.05)], axis=1)
+    wanted = np.vstack([[0, 0, 0.125], outer, outer * [0.5, 0.5, 1.6]])[:count]
+    nodes = np.linalg.norm(diamond.body.mesh.nodes[:, None] - wanted, axis=2).argmin(axis=0)
+    names = tuple(f"m{i}" for i in range(count))
+    return replace(diamond, marker_names=names, marker_share=None).with_marker_points(diamond.body.mesh.nodes[nodes])
 
 
 PARTS = {
@@ -465,6 +500,7 @@ PARTS = {
     "single": single,
     "tentacle": real_tentacle,
     "rate": rate,
+    "table1": table_one,
 }
 
 

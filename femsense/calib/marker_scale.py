@@ -77,7 +77,8 @@ def _tells(found: MarkerScale | None) -> bool:
 def marker_scale(
     scene: Scene, poses: Sequence[FloatArray], jet: SceneJet, view: int, beside: FloatArray | None = None
 ) -> MarkerScale | None:
-    """Return how many times too large the markers of a camera are; None where they are too few to tell.
+    """Return how many times too large the markers of a camera are; None where they are too few to tell. Declared poses may be off, too:
+    a scale about the camera shifts the body as they would.
 
     Arguments:
         scene, poses, jet: as of `check_marker_scale`.
@@ -87,9 +88,8 @@ def marker_scale(
     mine = scene.view == view
     if len(np.unique(scene.marker[mine])) < MARKERS or len(np.unique(scene.frame[mine])) < FRAMES:
         return None
-    free = [c for v, T in enumerate(scene.recording.T_robot_camera) if T is None for c in range(6 * v, 6 * v + 6)]
     rows, frame, residual = jet.residual.size, np.repeat(scene.frame, 3), jet.residual.ravel()
-    common = np.hstack([jet.by_pose[:, :, free].reshape(rows, -1), jet.by_initial.reshape(rows, -1)])
+    common = np.hstack([jet.by_pose.reshape(rows, -1), jet.by_initial.reshape(rows, -1)])
     if beside is not None:
         common = np.column_stack([common, beside.ravel()])
     by_scale = -(mine[:, None] * scene.points) @ poses[view][:3, :3].T

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from arm import arm, record
+from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.marker_scale import scaled
@@ -66,3 +66,10 @@ def test_the_camera_is_named_whose_markers_are_too_large() -> None:
     )
     with pytest.warns(UserWarning, match=r"the markers of camera right are 1\.0[34]\d ± \S+ times too large"):
         calibrate(arm(), both)
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+def test_a_declared_pose_that_is_off_is_no_scale(zero: str) -> None:
+    away = T_ROBOT_CAMERA.copy()
+    away[:3, 3] += 0.002 * away[:3, 2]  # along the view, as a scale about the camera would
+    assert scales_said(replace(recording(zero), T_robot_camera=(away,))) == []
