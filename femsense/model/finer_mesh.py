@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,6 +14,8 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import shortening
 from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linalg.factorization import Factorization, Pattern, factorize, factorize_definite
+from femsense.fem.linalg.iterative import UnsettledError, iterative
 from femsense.fem.linalg.refinement import ROUGH, ROUGH_FROM, prepare_roughly, roughly
 from femsense.fem.mesh import Embedding
 from femsense.fem.rotated_step import rotated_step
@@ -122,7 +125,8 @@ def _stepped(
                 return x
         enough = min(EARLY, ROUGH * first / size) if size < first else EARLY
         here = replace(base, positions=x, factor=None, held=at.held)
-        tangent = tangent_at(body, here, partial(roughly, tolerance=enough, pays_from=how.rough_from))
+        solver = roughly if at.held.any() else stable
+        tangent = tangent_at(body, here, partial(solver, tolerance=enough, pays_from=how.rough_from))
         move = tangent.respond(force[None])[0]
         if at.held.any():
             missing = _missing(fine, frame, at, x)[at.held[: len(body.cables)]]
@@ -136,6 +140,24 @@ def _stepped(
         share = np.abs(move).max() / max(way, 1e-300)
         at, force, size = _pulling(fine, balance, at, x)
     return x if size <= how.enough * first else None
+
+
+def stable(pattern: Pattern, values: FloatArray, *, tolerance: float, pays_from: int) -> Factorization | None:
+    """Return a stiffness as `roughly` does, from `pays_from` unknowns on only one that is positive definite. Raises FemsenseError.
+
+    Steps with any other lead to no state that a body could stay in, unless cables hold it: on the arm of `benchmarks/real.py`, whose
+    chambers are blown up, three indefinite factors took 20 s a state, and no state was found.
+    """
+    if pattern.size < pays_from or pattern.grid is None or not np.isfinite(values).all():
+        return factorize(pattern, values)
+    with contextlib.suppress(UnsettledError):  # too ill-conditioned for conjugate gradients
+        found = iterative(pattern.levels(), values, tolerance=tolerance)
+        if found is not None:
+            return found
+    direct = factorize_definite(pattern, values, tries=0)[0]
+    if direct is None:
+        raise FemsenseError("the body is not stable there on the finer mesh")
+    return direct
 
 
 def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:

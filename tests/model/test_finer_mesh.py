@@ -55,6 +55,15 @@ def test_a_finer_state_that_folds_is_sought_in_shorter_steps():
     )  # nearer than the declared mesh is
 
 
+def test_where_a_body_is_not_stable_on_the_finer_mesh_no_factor_of_it_is_asked_for():
+    asked = on_both_meshes([12.0, 0.0, 0.0, 0.0])
+    with pytest.raises(FemsenseError, match="not stable"):
+        finer_state(*asked, options=FinerOptions(rough_from=0))
+    easy = on_both_meshes([2.0, 0.0, 0.0, 0.0])
+    near, exact = (beyond(easy, finer_state(*easy, options=FinerOptions(rough_from=most))) for most in (0, 10**6))
+    assert np.abs(near - exact).max() < 0.05 * np.abs(exact).max()
+
+
 def test_a_finer_body_that_nothing_holds_is_an_error():
     driven, fine, *rest = on_both_meshes([2.0, 0.0, 0.0, 0.0])
     body = fine.robot.body
