@@ -33,6 +33,10 @@ class Row:
     vector_error: list[float] = field(default_factory=list)
     place_m: list[float] = field(default_factory=list)
     covered: list[bool] = field(default_factory=list)
+    over_std: list[float] = field(default_factory=list)
+    """Error of the size over its standard deviation."""
+    place_over_std: list[float] = field(default_factory=list)
+    """Distance from the true place over the root of the sum of its variances along the axes."""
     over_bound: list[float] = field(default_factory=list)
     """|error| over the bound's standard deviation."""
     bound: list[float] = field(default_factory=list)
@@ -66,6 +70,17 @@ class Row:
             " ".join(f"{k}:{v}" for k, v in self.status.most_common(3)) + (f" {self.note}" if self.note else ""),
         ]
         return " | ".join(cells)
+
+    def deviations(self) -> str:
+        """How errors keep to what is said of them."""
+        sizes, places = np.abs(self.over_std), np.array(self.place_over_std)
+        if not len(sizes):
+            return "no force was matched"
+        share = [f"{100 * np.mean(values <= limit):.0f} %" for values, limit in ((sizes, 1.96), (places, 2.0), (places, 3.0))]
+        return (
+            f"{len(sizes)} forces: errors over their deviations {np.sqrt(np.mean(sizes**2)):.2f} (rms), {share[0]} within 1.96;"
+            f" places {np.sqrt(np.mean(places**2)):.2f} (rms), {share[1]} within 2, {share[2]} within 3"
+        )
 
     def cells(self) -> str:
         """Error of force (median, 95th percentile), place, missed (quietly), false frames and coverage, as cells of a table in docs."""
@@ -163,6 +178,9 @@ def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str)
         row.over_bound.append(abs(error) / size / one["bound_rel"])
         if answer.get("std_n"):
             row.covered.append(abs(error) <= 1.96 * float(answer["std_n"]))
+            row.over_std.append(error / float(answer["std_n"]))
+            spread = float(np.linalg.norm(_vector(answer, "x_std_m", "y_std_m", "z_std_m")))
+            row.place_over_std.append(float(far[i, pairs[i]]) / max(spread, 1e-9))
             row.wrong_quietly += abs(error) > WRONG * size and not row.covered[-1] and status == "ok"
 
 
@@ -211,8 +229,8 @@ def summary(rows: list[Row]) -> str:
     for row in rows:
         for name in ("true", "resolvable", "missed", "missed_quietly", "extra", "false", "calm"):
             setattr(total, name, getattr(total, name) + getattr(row, name))
-        for name in ("size_error", "vector_error", "place_m", "covered", "over_bound", "bound"):
+        for name in ("size_error", "vector_error", "place_m", "covered", "over_std", "place_over_std", "over_bound", "bound"):
             getattr(total, name).extend(getattr(row, name))
         total.status.update(row.status)
         total.largest_false_n = max(total.largest_false_n, row.largest_false_n)
-    return total.line()
+    return f"{total.line()}\n{total.deviations()}"

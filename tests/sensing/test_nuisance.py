@@ -29,7 +29,7 @@ from femsense.sensing.nuisance import (
     robust_std,
 )
 from femsense.sensing.pipeline import estimate
-from femsense.sensing.prepare import make_sensor
+from femsense.sensing.prepare import POSE_STD, make_sensor, prepare
 from femsense.sensing.types import Knowledge, Rows
 
 STD = 3e-4
@@ -245,7 +245,9 @@ def test_a_declared_pose_is_not_taken_for_exact_where_clouds_tell_it(tmp_path):
     off = moved_poses(fitted.poses, np.array([0.0, 4e-3, 0.0, 0.0, 0.0, 5e-4]), np.zeros(3))
     nobody = np.zeros_like(fitted.pose_covariance)
     declared = replace(fitted, poses=off, T_robot_camera=off[0], pose_covariance=nobody, joint_covariance=nobody)
-    sensor = make_sensor(robot, recording, declared)
+    prepared = prepare(robot, recording, declared)
+    sensor = prepared.sensor
+    np.testing.assert_allclose(np.linalg.norm(prepared.first.root[:6], axis=1), POSE_STD)
     moved = np.linalg.norm((sensor.calibration.poses[0] - off[0])[:3, :3])
     assert moved > 0.2 * np.linalg.norm((fitted.poses[0] - off[0])[:3, :3])
     assert sensor.knowledge.bias_m < 3e-4
