@@ -51,7 +51,7 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
                 std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
                 source=touch.source,
                 track=_place_of(sensor, touch) if touch.source == "given" else -1,
-                position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0) + shifted[i] ** 2)),
+                position_std_m=freeze(np.hypot(place_std(touch, fit.place_covariance[i]), shifted[i])),
                 radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
@@ -62,6 +62,20 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
 def _place_of(sensor: Sensor, touch: Touch) -> int:
     """Return which of the given places a touch is at."""
     return int(np.linalg.norm(sensor.places - touch.place, axis=1).argmin())
+
+
+def place_std(touch: Touch, covariance: FloatArray) -> FloatArray:
+    """Return how well the place of a contact is known along each axis [m], shape (3,).
+
+    Where the fit held a place that is seen (its force was none in the frame before, so that the shape says nothing of it), it is known as it is seen.
+
+    Arguments:
+        touch: the contact.
+        covariance: of its place by the fit [m²], shape (3, 3).
+    """
+    held = touch.across_m if touch.source == "cloud" and touch.std_m == 0.0 else 0.0
+    along = held**2 * (1.0 - touch.normal**2)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) + along))
 
 
 def size_std(force: FloatArray, covariance: FloatArray) -> float:
