@@ -179,7 +179,7 @@ def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str)
         if answer.get("std_n"):
             row.covered.append(abs(error) <= 1.96 * float(answer["std_n"]))
             row.over_std.append(error / float(answer["std_n"]))
-            spread = float(np.linalg.norm(_vector(answer, "x_std_m", "y_std_m", "z_std_m")))
+            spread = float(np.linalg.norm([float(answer.get(name) or 0.0) for name in ("x_std_m", "y_std_m", "z_std_m")]))
             row.place_over_std.append(float(far[i, pairs[i]]) / max(spread, 1e-9))
             row.wrong_quietly += abs(error) > WRONG * size and not row.covered[-1] and status == "ok"
 

@@ -143,4 +143,5 @@ def test_the_grader_sees_an_error_a_miss_and_a_false_contact(tmp_path) -> None:
     assert row.vector_error == pytest.approx([0.1] * 4)
     assert row.place_m == pytest.approx([0.002] * 4)
     assert row.over_bound == pytest.approx([2.0] * 4)
+    assert np.abs(row.over_std) == pytest.approx([0.02 / 0.03, 0.03 / 0.03, 40.0, 50.0])
     assert row.covered == [True, True, False, False]
