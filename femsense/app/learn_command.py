@@ -84,6 +84,8 @@ def learn_into(
         found = drift(before, data)
         model = adapted(before, data)
         text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
+        if before.bones is not None:
+            text += "\nthe end-to-end network is left out, as frames of markers do not correct it: bones come from the corrected markers"
         document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
         document["shifts"] = found.shifts
         if other is not None:

@@ -25,6 +25,7 @@ from femsense.pointcloud.matching import MatchingOptions, match_along_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions
+from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state, solve_with
 from femsense.sensing.touches import make_touch
 from femsense.sensing.tracks import contacts_of
@@ -56,7 +57,7 @@ def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> 
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     ms = 1e3 * (time.perf_counter() - began)
     report = FrameReport(
-        number, stamp, "ok", len(contacts), rows.count, rows.rms, after.rms, ms, dict(state.tension), dict(state.pressure)
+        number, stamp, "ok", len(sensed(contacts)), rows.count, rows.rms, after.rms, ms, dict(state.tension), dict(state.pressure)
     )
     return SensedFrame(fit.touches, fit.state, fit.forces, free, report, contacts)
 

@@ -40,6 +40,7 @@ from femsense.sensing.moved_camera import camera_status
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
 from femsense.sensing.prepare import prepare, scan_of
+from femsense.sensing.run_arrays import sensed
 from femsense.sensing.search import explain
 from femsense.sensing.separation import segmented
 from femsense.sensing.states import foretold, free_state
@@ -165,7 +166,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         number,
         stamp,
         status,
-        len(contacts),
+        len(sensed(contacts)),
         fit.rows.count,
         free.rows.rms,
         fit.rows.rms,

@@ -56,6 +56,10 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run(["learn", *files, "--test", *other, "-o", str(model)]) == 0
     said = capsys.readouterr().out
     assert "8 bones along a, b, c, in this order" in said
+    assert "end-to-end network" not in said
+    assert run(["learn", *files, "-o", str(model), "--end-to-end"]) == 0
+    assert run(["learn", *other, "-o", str(mended), "--adapt", str(model)]) == 0
+    assert "the end-to-end network is left out" in capsys.readouterr().out and load_model(mended).bones is None
     assert run(["learn", *files, "-o", str(model), "--robot-frame"]) == 0
     assert "bones are in the robot's frame" in capsys.readouterr().out and load_model(model).frame == "robot"
     assert (

@@ -18,6 +18,7 @@ from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.pipeline import estimate
+from femsense.sensing.run_arrays import sensed
 from femsense.sensing.types import SensingOptions
 
 TIP = np.array([0.1, 0.0, 0.01])
@@ -45,6 +46,9 @@ def test_a_force_at_a_given_place_comes_out_of_markers(touched):
         assert contact.source == "given"
     assert all(report.status == "ok" for report in run.frames)
     assert run.frames[3].rms_after_m < 0.2 * run.frames[3].rms_before_m
+    felt = {contact.frame for contact in sensed(run.contacts)}
+    assert 3 in felt and not {0, 1} & felt  # places without a force are rows of contacts.csv, and no contacts
+    assert [report.contacts for report in run.frames] == [int(k in felt) for k in range(4)]
 
 
 def test_a_contact_at_a_given_place_is_the_same_one_after_a_frame_that_is_not_trusted():

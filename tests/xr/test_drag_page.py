@@ -93,3 +93,51 @@ def test_a_point_is_dragged_on_a_phone_and_wishes_go_on_without_pictures_for_a_s
     finally:
         source.close()
         browser.kill()
+
+
+FINGER = """
+const phone = await opened.newContext({ viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true });
+const page = await phone.newPage(), touch = await phone.newCDPSession(page);
+const say = (what) => console.log(JSON.stringify(what));
+await page.goto(given[0]);
+await page.waitForFunction(() => femsense.shown.robots.get('bar')?.shown, null, { timeout: 60000 });
+await page.tap('#drag');
+await page.waitForTimeout(500);
+const hint = await page.textContent('#reach');
+const point = () => page.evaluate(() => {
+  const { stage, robots } = femsense.shown, { body } = robots.get('bar'), ball = [];
+  body.group.traverse((one) => one.name === 'top' && one.isMesh && ball.push(one));
+  const at = ball[0].getWorldPosition(ball[0].position.clone()).project(stage.camera);
+  return [(at.x + 1) / 2 * innerWidth, (1 - at.y) / 2 * innerHeight];
+});
+const put = (type, ...at) => touch.send('Input.dispatchTouchEvent', { type, touchPoints: at.map(([x, y]) => ({ x, y })) });
+const drag = async (right, down) => {
+  const [x, y] = (await point()).map((at, i) => at + [right, down][i]);
+  await put('touchStart', [x, y]);
+  for (let i = 1; i < 6; i += 1) await put('touchMove', [x + 5 * i, y + i]);
+  await page.waitForTimeout(300);
+  await put('touchEnd');
+  await page.waitForTimeout(200);
+};
+await drag(60, 0);
+say({ hint });
+await new Promise((done) => process.stdin.once('data', done));
+await drag(18, 10);
+say({ dragged: true });
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_finger_that_covers_a_point_takes_it(request: pytest.FixtureRequest, built_page: Path, tmp_path: Path) -> None:
+    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True, commands=True)
+    browser = start_browser(request.config, FINGER, source.server.url)
+    try:
+        assert "Shift" not in said(browser)["hint"] and not source.wishes  # beside it the view turns
+        go_on(browser)
+        assert said(browser)["dragged"]
+        held = [wish for wish in source.wishes if wish["held"]]
+        assert held and {wish["handle"] for wish in held} == {"top"} and not source.wishes[-1]["held"]
+    finally:
+        source.close()
+        browser.kill()

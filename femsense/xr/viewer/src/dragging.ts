@@ -28,7 +28,9 @@ import type { Stage } from "./stage";
 
 const EVERY_MS = 33; // wishes are sent so often while held, however slowly pictures come: the robot stops when they stop
 const BLIND_MS = 1000; // who has seen no new picture for so long leads nobody
-const HINT = "Drag a green point, or hold Shift and use the arrow keys.";
+const BY_FINGER = matchMedia("(pointer: coarse)").matches;
+const HINT = BY_FINGER ? "Drag a green point with a finger." : "Drag a green point, or hold Shift and use the arrow keys.";
+const FINGER = 28; // a finger so near to a handle takes it [px]
 const STEP = 0.01; // of the body's size, for a key
 const TOUCH = 0.03; // a hand that is nearer to a handle touches it [m]
 const NEAR = 0.04; // of the body's size: a ray that passes a handle so closely points at it
@@ -234,11 +236,22 @@ export class Dragging {
     const canvas = this.stage.renderer.domElement;
     this.aim(event);
     const [hit] = this.ray.intersectObjects(this.balls, false);
-    if (!hit) return;
+    const index = hit ? this.balls.indexOf(hit.object as Mesh) : event.pointerType === "touch" ? this.near(event) : null;
+    if (index === null) return;
     event.stopImmediatePropagation();
     canvas.setPointerCapture(event.pointerId);
     this.stage.controls.enabled = false;
-    this.begin(this.balls.indexOf(hit.object as Mesh));
+    this.begin(index);
+  }
+
+  /** Returns the handle that a finger is at: it covers more than the ball. */
+  private near(event: PointerEvent): number | null {
+    const { left, top, width, height } = this.stage.renderer.domElement.getBoundingClientRect();
+    const away = this.balls.map((ball) => {
+      const at = ball.getWorldPosition(new Vector3()).project(this.stage.camera);
+      return Math.hypot(left + (width * (at.x + 1)) / 2 - event.clientX, top + (height * (1 - at.y)) / 2 - event.clientY);
+    });
+    return closest(away, FINGER);
   }
 
   private begin(index: number): void {
