@@ -20,13 +20,14 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, cg
 
-from femsense import BodyModel, TetMesh, load_robot, make_body, solve_equilibrium
+from femsense import BodyModel, Robot, TetMesh, load_robot, make_body, solve_equilibrium
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix, reduced_values
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import factorize
 from femsense.fem.mesh import EDGES, oriented, refined, shape_values, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
+from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.rig.script import TruthTable
 from femsense.rig.truth import true_robot
 
@@ -358,12 +359,36 @@ def large_displacements() -> None:
             print(f"| {element} | {len(body.mesh.tets)} | {1e3 * sag:.2f} | {1e3 * moved:.2f} |", flush=True)
 
 
+def ties(folder: Path) -> None:
+    """Print what elements of half the size do to a pulled cable: to the robot's motion at one tension, and to the length that is wound up."""
+    print(
+        "\n| robot | tetrahedra | path points | motion [mm] | wound up [mm] | motion, finer | wound up, finer |\n|---|---|---|---|---|---|---|"
+    )
+    for which in ("finger", "arm", "four-leg", "gripper", *([folder] if folder.exists() else [])):
+        robot = load_robot(which)
+        cable = robot.body.cables[0]
+        tension = 0.5 * (cable.max_tension if np.isfinite(cable.max_tension) else 4.0)
+        (moved, wound), (moved_finer, wound_finer) = (pulled(robot, n, cable.name, tension) for n in (0, 1))
+        shares = f"{100 * (moved_finer / moved - 1):+.1f} % | {100 * (wound_finer / wound - 1):+.1f} %"
+        counts = f"{len(robot.body.mesh.tets)} | {len(cable.path.element)}"
+        print(f"| {robot.name} | {counts} | {1e3 * moved:.1f} | {1e3 * wound:.2f} | {shares} |", flush=True)
+
+
+def pulled(robot: Robot, refinements: int, cable: str, tension: float) -> tuple[float, float]:
+    """Return how far a cable moves the node that it moves farthest [m], and the length that is wound up for it [m]; quadratic elements."""
+    body = robot_on_mesh(robot, finer_mesh(robot.body.mesh, "tet10", refinements)).body
+    rest = solve_equilibrium(body)
+    state = solve_equilibrium(body, tension={cable: tension}, start=rest)
+    moved = float(np.linalg.norm(state.positions - rest.positions, axis=1).max())
+    return moved, state.shortening[cable] - rest.shortening[cable]
+
+
 def main() -> None:
     """Print errors on block and diamond, large displacements, then times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("diamond", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--fine", type=int, default=1)
-    parser.add_argument("--only", choices=("errors", "diamond", "pad", "large", "times", "finest"))
+    parser.add_argument("--only", choices=("errors", "diamond", "pad", "large", "ties", "times", "finest"))
     arguments = parser.parse_args()
     folder: Path = arguments.diamond
     if arguments.only in (None, "errors"):
@@ -386,6 +411,8 @@ def main() -> None:
         finest(folder)
     if arguments.only in (None, "large"):
         large_displacements()
+    if arguments.only in (None, "ties"):
+        ties(folder)
     if arguments.only in (None, "times"):
         print(
             "\n| ms, wall / process | free unknowns | force | force and tangent | into the matrix | factor | one solve "
