@@ -33,6 +33,7 @@ from femsense.rig.sensors import SensorTable, sensor_readings
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.labelled import Labelled, joined
+from femsense.xr.proprioception.memory import with_memory
 from femsense.xr.proprioception.model import bones_from_numbers
 from femsense.xr.proprioception.selection import marker_rms
 from femsense.xr.skinning import INFLUENCES, Skin, fit_poses, fit_skin, skin_vertices
@@ -236,9 +237,7 @@ def actuator_table(
 ) -> None:
     chain = model.chain
     assert chain is not None and model.bones is not None
-    inputs = Labelled(at, readings, markers, model.channels, model.marker_names, np.zeros(len(at), np.int64)).inputs(
-        model.memory_s
-    )[cut:]
+    inputs = with_memory(at, readings, model.memory_s)[cut:]
     found = model.network(inputs).reshape(-1, 6, 3)
     chained = chain_skin(rest, chain)
     finite = fit_skin(rest, states[:cut], bones=BONES)

@@ -35,8 +35,8 @@ class Outside:
 
     channel: str
     kind: str
-    """"range", "still" (it never moved while it was learnt), "joint" (each channel is in its range, but not together) or
-    "missing" (no finite number)."""
+    """"range", "still" (it never moved while it was learnt), "joint" (each channel is in its range, but not together),
+    "missing" (no finite number), or "gap": the row came too long after the one before for a model with a memory, `value` seconds."""
     value: float
     low: float
     high: float
@@ -49,6 +49,8 @@ class Outside:
         """One line for people."""
         if self.kind == "missing":
             return f"{self.channel}: no number"
+        if self.kind == "gap":
+            return f"{self.value:.2g} s after the row before: the model remembers what came before, and needs a row every {self.high:.2g} s"
         if self.kind == "still":
             return f"{self.channel} = {self.value:.4g}, but it never moved while it was learnt: it stood at {self.low:.4g}"
         seen = "learnt" if self.kind == "range" else "expected from the other channels"

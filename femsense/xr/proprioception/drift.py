@@ -16,6 +16,7 @@ from femsense.xr.proprioception.corrections import Frames, corrected, explain, i
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.learn import error_interval
+from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel
 
 AS_BEFORE = 1.5
@@ -131,6 +132,11 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
     check_frame(model.frame, data.frame)
     if len(data) < FEWEST:
         raise DataError(f"{len(data)} rows have readings and all markers; at least {FEWEST} are needed")
+    if data.spacing_s > longest_gap(model.memory_s):
+        raise DataError(
+            f"readings are {data.spacing_s:.2g} s apart; the model remembers {min(model.memory_s):g} s and needs one every "
+            f"{longest_gap(model.memory_s):g} s\n  try:      all rows of the sensors; markers in a few of them are enough"
+        )
     inputs = data.inputs(model.memory_s)
     check_marker_sizes(data.markers, model.network(inputs).reshape(data.markers.shape))
     return inputs

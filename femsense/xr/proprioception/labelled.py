@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,24 +19,50 @@ WORDS = {ROBOT: "the robot's frame", AS_MEASURED: "the frame in which markers we
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Labelled:
-    """Rows of readings, in order of time, each with all markers."""
+class Course:
+    """All readings of one recording, in order of time, also those beside which no markers were seen: filters run over them."""
 
     time_s: FloatArray
     """shape (n,)."""
     readings: FloatArray
     """In the units of the sensors, shape (n, c)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Labelled:
+    """Rows of readings, in order of time, each with all markers."""
+
+    courses: tuple[Course, ...]
+    """Of the recordings that the rows are from."""
+    part: IntArray
+    """Which course each row is of, shape (n,)."""
+    row: IntArray
+    """And which row of it, shape (n,)."""
     markers: FloatArray
     """[m], shape (n, m, 3)."""
     channels: tuple[str, ...]
     marker_names: tuple[str, ...]
-    part: IntArray
-    """Which recording each row is from, shape (n,)."""
     frame: str = AS_MEASURED
     """Of reference: `ROBOT` or `AS_MEASURED`."""
 
     def __len__(self) -> int:
-        return len(self.time_s)
+        return len(self.row)
+
+    @property
+    def time_s(self) -> FloatArray:
+        """When each row was read [s], shape (n,)."""
+        return self._of([course.time_s for course in self.courses])
+
+    @property
+    def readings(self) -> FloatArray:
+        """In the units of the sensors, shape (n, c)."""
+        return self.inputs(())
+
+    @property
+    def spacing_s(self) -> float:
+        """Median time between readings, with markers or without [s]; 0 where there are none."""
+        gaps = np.concatenate([np.diff(course.time_s) for course in self.courses])
+        return float(np.median(gaps)) if len(gaps) else 0.0
 
     @property
     def targets(self) -> FloatArray:
@@ -45,13 +71,17 @@ class Labelled:
 
     def select(self, rows: npt.NDArray[np.bool_] | IntArray) -> Labelled:
         """Return some of the rows."""
-        t, x, y = freeze(self.time_s[rows]), freeze(self.readings[rows]), freeze(self.markers[rows])
-        return Labelled(t, x, y, self.channels, self.marker_names, freeze(self.part[rows], np.int64), self.frame)
+        part, row = freeze(self.part[rows], np.int64), freeze(self.row[rows], np.int64)
+        return replace(self, part=part, row=row, markers=freeze(self.markers[rows]))
 
     def inputs(self, taus: tuple[float, ...]) -> FloatArray:
         """Return readings with their filters, shape (n, (1 + k) c); filters start anew with each recording."""
-        parts = [self.part == number for number in np.unique(self.part)]
-        return np.concatenate([with_memory(self.time_s[rows], self.readings[rows], taus) for rows in parts])
+        return self._of([with_memory(course.time_s, course.readings, taus) for course in self.courses])
+
+    def _of(self, values: Sequence[FloatArray]) -> FloatArray:
+        """Return the rows' own of the values of all rows, one array a course."""
+        first = np.cumsum([0, *(len(course.time_s) for course in self.courses)])
+        return np.asarray(np.concatenate(values)[first[self.part] + self.row])
 
 
 def labelled(
@@ -63,7 +93,7 @@ def labelled(
     marker_names: Sequence[str] | None = None,
     frame: str = AS_MEASURED,
 ) -> Labelled:
-    """Return readings with markers from arrays; rows without a finite marker or reading are left out.
+    """Return readings with markers from arrays. Rows without a finite reading are left out, those without a finite marker tell only what came before others.
 
     Arguments:
         time_s: when each row was read [s], not decreasing, shape (n,).
@@ -91,7 +121,6 @@ def labelled(
         )
     if frame not in (ROBOT, AS_MEASURED):
         raise InputError("unknown frame of reference", where="frame", found=frame, expected=f"{ROBOT} | {AS_MEASURED}")
-    good = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=(1, 2)) & np.isfinite(t)
     names = tuple(channels) if channels is not None else tuple(f"channel_{i}" for i in range(x.shape[1]))
     points = tuple(marker_names) if marker_names is not None else tuple(f"marker_{i}" for i in range(y.shape[1]))
     if len(names) != x.shape[1] or len(points) != y.shape[1]:
@@ -101,9 +130,13 @@ def labelled(
             found=(len(names), len(points)),
             expected=x.shape[1:] + y.shape[1:2],
         )
+    read = np.isfinite(x).all(axis=1) & np.isfinite(t)
+    good = read & np.isfinite(y).all(axis=(1, 2))
     _say_what_is_left_out(good, x, names)
-    part = freeze(np.zeros(good.sum()), np.int64)
-    return Labelled(freeze(t[good]), freeze(x[good]), freeze(y[good]), names, points, part, frame)
+    at = freeze((np.cumsum(read) - 1)[good], np.int64)
+    return Labelled(
+        (Course(freeze(t[read]), freeze(x[read])),), freeze(0 * at, np.int64), at, freeze(y[good]), names, points, frame
+    )
 
 
 def _say_what_is_left_out(good: npt.NDArray[np.bool_], x: FloatArray, channels: Sequence[str]) -> None:
@@ -123,9 +156,14 @@ def joined(parts: Sequence[Labelled]) -> Labelled:
             found, expected = (*other.channels, *other.marker_names), (*first.channels, *first.marker_names)
             raise InputError("recordings of other channels or markers", where="parts", found=found, expected=expected)
         check_frame(first.frame, other.frame)
-    t, x, y = (freeze(np.concatenate([getattr(part, name) for part in parts])) for name in ("time_s", "readings", "markers"))
-    number = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return Labelled(t, x, y, first.channels, first.marker_names, freeze(number, np.int64), first.frame)
+    first_course = np.cumsum([0, *(len(part.courses) for part in parts)])
+    return replace(
+        first,
+        courses=tuple(course for part in parts for course in part.courses),
+        part=freeze(np.concatenate([part.part + number for part, number in zip(parts, first_course)]), np.int64),
+        row=freeze(np.concatenate([part.row for part in parts]), np.int64),
+        markers=freeze(np.concatenate([part.markers for part in parts])),
+    )
 
 
 def check_frame(known: str, found: str) -> None:

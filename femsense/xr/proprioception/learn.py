@@ -16,6 +16,7 @@ from femsense.xr.armature import Armature, ArmatureOptions, make_armature
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
+from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
 from femsense.xr.proprioception.selection import (
     MEMORIES,
@@ -85,7 +86,8 @@ def learn(
     held = rows_kept(len(data)) if test is None else np.zeros(len(data), dtype=bool)
     work, test = data.select(~held), data.select(held) if test is None else test
     kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
-    compared = compare_plans(work, kinds, options.memories, seed=options.seed, progress=progress)
+    memories = tuple(taus for taus in options.memories if data.spacing_s <= longest_gap(taus)) or ((),)
+    compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
     chosen = simplest_good(compared)
     chain = _chain(data.markers[options.rest_row], options.bones)
     rows = thinned_rows(len(work), TRAINED_ROWS)
@@ -95,7 +97,7 @@ def learn(
     }
     table = {}
     for item in compared:
-        errors = networks[item.plan.kind](_test_inputs(data, test, held, item.plan.memory_s)) - test.targets
+        errors = networks[item.plan.kind](test.inputs(item.plan.memory_s)) - test.targets
         table[item.plan.kind] = _row(errors) | {
             "blocks_mm": 1e3 * item.rms,
             "median_block_mm": 1e3 * item.typical,
@@ -103,7 +105,7 @@ def learn(
             "channels": int(item.plan.used.sum()),
         }
     network, plan = networks[chosen.plan.kind], chosen.plan
-    inputs = _test_inputs(data, test, held, plan.memory_s)
+    inputs = test.inputs(plan.memory_s)
     report = {
         "kind": plan.kind,
         **{key: table[plan.kind][key] for key in ("error_mm", "error_ci_mm")},
@@ -187,11 +189,6 @@ def _check(data: Labelled, options: LearnOptions) -> None:
         )
     if len(dead_channels(data.readings, data.channels)) == len(data.channels):
         raise DataError("no channel ever changes: " + ", ".join(data.channels))
-
-
-def _test_inputs(data: Labelled, test: Labelled, held: np.ndarray, taus: tuple[float, ...]) -> FloatArray:
-    """Return the inputs of the test rows; filters run over the whole recording where the test is a part of it."""
-    return data.inputs(taus)[held] if held.any() else test.inputs(taus)
 
 
 def _chain(rest: FloatArray, options: ArmatureOptions) -> Armature | None:

@@ -13,7 +13,7 @@ from femsense.core.errors import InputError
 from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
 from femsense.xr.proprioception.domain import Domain, Outside
 from femsense.xr.proprioception.labelled import AS_MEASURED
-from femsense.xr.proprioception.memory import step_memory, with_memory
+from femsense.xr.proprioception.memory import longest_gap, step_memory, with_memory
 from femsense.xr.proprioception.network import Network
 
 
@@ -148,6 +148,7 @@ class LiveModel:
         self.model = model
         self._needed = model.needed
         self._memory: FloatArray | None = None
+        self._row: FloatArray = np.zeros(len(model.channels))
         self._time_s = 0.0
 
     def step(self, row: npt.ArrayLike, time_s: float) -> LivePose:
@@ -162,8 +163,13 @@ class LiveModel:
         if not np.isfinite(x).all():
             return LivePose(np.full((len(model.marker_names), 3), np.nan), None, outside)
         taus = np.asarray(model.memory_s)
-        past = np.tile(x, (len(taus), 1)) if self._memory is None else step_memory(self._memory, x, time_s - self._time_s, taus)
-        self._memory, self._time_s = past, time_s
+        past = np.tile(x, (len(taus), 1))
+        if self._memory is not None:
+            gap, longest = time_s - self._time_s, longest_gap(model.memory_s)
+            past = step_memory(self._memory, self._row, x, gap, taus)
+            if gap > longest:
+                outside += (Outside("time_s", "gap", gap, 0.0, longest, gap / longest - 1.0),)
+        self._memory, self._row, self._time_s = past, x, time_s
         inputs = np.concatenate([x, past.ravel()])[None]
         markers = model.network(inputs).reshape(-1, 3)
         bones = None

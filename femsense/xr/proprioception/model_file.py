@@ -27,6 +27,8 @@ from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, rea
 
 FORMAT = "femsense-proprioception-1"
 KEY = "femsense"
+FILTERS = "lines between rows"
+"""What `filtered` is of: see `memory`."""
 NUMBERS = ("centre", "scale", "B", "b", "A", "C", "d")
 TURNED = ("B", "A", "C")
 """Stored so that rows of inputs are multiplied from the left."""
@@ -68,6 +70,12 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
     document = json.loads(text.get(KEY, "{}"))
     if document.get("format") != FORMAT:
         raise InputError("not a model of femsense learn", where=path, found=document.get("format"), expected=FORMAT)
+    if document["memory_s"] and document.get("filters") != FILTERS:
+        raise InputError(
+            "a model of an older version, whose filters stepped from row to row",
+            where=path,
+            hint="learn it again: femsense learn",
+        )
     chain = document["chain"]
     return ProprioceptiveModel(
         tuple(document["channels"]),
@@ -112,6 +120,7 @@ def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[
         "markers": model.marker_names,
         "frame": model.frame,
         "memory_s": model.memory_s,
+        "filters": FILTERS,
         "networks": {name: network.kind for name, network in networks.items()},
         "domain": _domain_table(model.domain),
         "chain": None

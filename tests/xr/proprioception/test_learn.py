@@ -133,6 +133,33 @@ def test_a_lag_is_met_by_a_memory() -> None:
     assert learn(session(3), options=LearnOptions(kinds=("radial",))).memory_s == ()
 
 
+def seldom_seen(data: Labelled, every: int) -> Labelled:
+    """Return a recording whose sensors are read as often as before, and whose markers are seen in every so many rows."""
+    places = np.where((np.arange(len(data)) % every == 0)[:, None, None], data.markers, np.nan)
+    with pytest.warns(UserWarning, match="rows are left out"):
+        return labelled(data.time_s, data.readings, places, channels=data.channels)
+
+
+def test_filters_run_over_rows_without_markers_too() -> None:
+    data, taus = session(3, rows=200), (0.4,)
+    some = seldom_seen(data, 5)
+    assert len(some) == 40
+    np.testing.assert_allclose(some.inputs(taus), data.inputs(taus)[::5])
+    np.testing.assert_allclose(some.select(np.arange(40) > 9).inputs(taus), data.inputs(taus)[50::5])
+    np.testing.assert_allclose(joined([data, some]).inputs(taus), np.concatenate([data.inputs(taus), some.inputs(taus)]))
+
+
+def test_markers_that_are_seen_seldom_teach_as_much_as_often_ones() -> None:
+    data, fresh, options = session(3, lag_s=0.4), session(6, lag_s=0.4), LearnOptions(kinds=("radial",))
+    model, often = learn(seldom_seen(data, 3), options=options), learn(data, options=options)
+    off, off_often = (marker_rms(one.network(fresh.inputs(one.memory_s)) - fresh.targets) for one in (model, often))
+    assert model.memory_s and off < 1.1 * off_often and 1e3 * off < 1.3 * model.report["error_mm"]
+    assert drift(model, seldom_seen(fresh, 20)).verdict == "holds"
+    alone = fresh.select(np.arange(0, len(fresh), 20))  # readings as seldom as markers: their filters would be guesses
+    with pytest.raises(DataError, match="readings are 1 s apart"):
+        drift(model, labelled(alone.time_s, alone.readings, alone.markers, channels=alone.channels))
+
+
 def test_markers_in_millimetres_are_refused_also_against_a_model(model) -> None:
     data = session(3)
     wrong = replace(data, markers=1e3 * data.markers)

@@ -10,6 +10,7 @@ import pytest
 
 from femsense.core.errors import InputError
 from femsense.xr.armature import ArmatureOptions, make_armature
+from femsense.xr.proprioception import model_file
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.memory import with_memory
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers, bones_from_numbers
@@ -120,10 +121,38 @@ def test_a_stream_gives_what_the_whole_series_gives() -> None:
     assert np.isfinite(live.step(rows[0], time[-1] + 0.02).markers).all()
 
 
-def test_filters_follow_a_step_with_their_time_constant() -> None:
-    time = np.array([0.0, 0.1, 0.4, 1.0])
-    inputs = with_memory(time, np.array([[0.0], [1.0], [1.0], [1.0]]), (0.5,))
-    np.testing.assert_allclose(inputs[:, 1], 1.0 - np.exp(-time / 0.5), atol=1e-12)
+def test_filters_follow_lines_between_rows_with_their_time_constant() -> None:
+    time, tau = np.array([0.0, 0.1, 0.4, 1.0]), 0.5
+    inputs = with_memory(time, np.array([[0.0], [1.0], [1.0], [1.0]]), (tau,))
+    risen = 1.0 - tau / 0.1 * (np.exp(-(time[1:] - 0.1) / tau) - np.exp(-time[1:] / tau))
+    np.testing.assert_allclose(inputs[:, 1], [0.0, *risen], atol=1e-12)
+
+
+def test_filters_hardly_depend_on_how_often_sensors_are_read() -> None:
+    time = np.arange(0.0, 10.0, 0.02)
+    readings = np.sin(2.0 * time)[:, None]
+    often, seldom = with_memory(time, readings, (0.1, 1.0)), with_memory(time[::5], readings[::5], (0.1, 1.0))
+    np.testing.assert_allclose(seldom[20:], often[::5][20:], atol=5e-3)
+
+
+def test_a_model_with_a_memory_says_where_rows_come_too_seldom() -> None:
+    live = some_model("linear", memory=(0.1, 1.0)).live()
+    middle = live.model.domain.centre
+    for time_s, gaps in ((0.0, 0), (0.15, 0), (0.55, 1), (0.6, 0)):
+        said = [item.text for item in live.step(middle, time_s).outside]
+        assert len(said) == gaps and all(text.startswith("0.4 s after the row before") for text in said)
+    steady = some_model("linear").live()
+    assert not steady.step(middle, 0.0).outside and not steady.step(middle, 100.0).outside
+
+
+def test_a_model_whose_filters_were_others_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model_file, "FILTERS", "steps")
+    old = save_model(some_model("linear", memory=(0.1,)), tmp_path / "old.onnx")
+    none = save_model(some_model("linear"), tmp_path / "none.onnx")
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="older version"):
+        load_model(old)
+    assert load_model(none).memory_s == ()
 
 
 def test_a_reading_outside_what_was_learnt_names_its_channel_and_how_far() -> None:
