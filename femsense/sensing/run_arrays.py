@@ -69,11 +69,12 @@ def data_frame_of(run: RunLike) -> Any:
 
 
 def describe_run(run: RunLike) -> str:
-    """Return a run in one line."""
-    ok = sum(frame.status == "ok" for frame in run.frames)
-    sizes, count = [contact.force_n for contact in sensed(run.contacts)], count_of(run)
-    forces = f"{count} contact{'s' if count > 1 else ''}, up to {max(sizes):.3g} N" if sizes else "no contact"
-    return f"Run({run.robot.name}: {len(run.frames)} frames, {ok} ok; {forces})"
+    """Return a run in one line; its largest force is that of a frame that is ok."""
+    ok = {frame.frame for frame in run.frames if frame.status == "ok"}
+    count, sizes = count_of(run), [contact.force_n for contact in sensed(run.contacts) if contact.frame in ok]
+    forces = f"{count} contact{'s' if count > 1 else ''}" if count else "no contact"
+    largest = f", up to {max(sizes):.3g} N" if sizes else ", in frames that are not ok" if count else ""
+    return f"Run({run.robot.name}: {len(run.frames)} frames, {len(ok)} ok; {forces}{largest})"
 
 
 def _filled(run: RunLike, field: str) -> FloatArray:

@@ -149,3 +149,14 @@ def test_the_page_in_a_notebook(run: Run, tmp_path: Path) -> None:
         assert b"a page" in urlopen(shown.url).read() and urlopen(shown.url + "robot.glb").read()[:4] == b"glTF"
     finally:
         shown.stop()
+
+
+def test_the_largest_force_of_a_line_is_of_a_frame_that_is_ok(run: Run) -> None:
+    strong = replace(run.contacts[2], force_n=5.0, std_n=0.1)
+    spoiled = replace(run, contacts=(run.contacts[0], strong))
+    (bad,) = (frame.frame for frame in run.frames if frame.status != "ok")
+    assert "up to 5 N" in repr(spoiled)
+    assert "5 N" not in repr(replace(spoiled, contacts=(run.contacts[0], replace(strong, frame=bad))))
+    assert "1 contact, in frames that are not ok" in repr(replace(spoiled, contacts=(replace(strong, frame=bad),)))
+    (axes,) = replace(spoiled, contacts=(replace(strong, frame=bad),)).plot().axes
+    assert "frame not ok" in [text.get_text() for text in axes.get_legend().get_texts()]

@@ -22,7 +22,9 @@ import {
 } from "three";
 import { newtons, type Contact, type Vector } from "./data";
 
-const COLOR = 0xff9c33;
+const COLORS = { "": 0xff9c33, doubtful: 0xa08a70, stale: 0x7d838c };
+const COLOR = COLORS[""];
+type Doubt = keyof typeof COLORS;
 const UP = new Vector3(0, 1, 0);
 const LONGEST = 0.42; // arrow, of the body's size
 const NOISE = 3; // standard deviations: what may be noise gets no long arrow
@@ -37,14 +39,15 @@ export class ForceArrows {
   /** The force that gets the longest arrow now [N]. */
   full = 1e-9;
   private arrows: Arrow[] = [];
-  private stale = false;
+  private doubt: Doubt = "";
 
   /** size: of the body [m]. */
   constructor(private readonly size: number) {}
 
-  setStale(stale: boolean): void {
-    this.stale = stale;
-    for (const arrow of this.arrows) arrow.setStale(stale);
+  /** Takes colour away from what is old or may be wrong. */
+  tell(doubt: Doubt): void {
+    this.doubt = doubt;
+    for (const arrow of this.arrows) arrow.tell(doubt);
   }
 
   show(contacts: Contact[]): void {
@@ -53,7 +56,7 @@ export class ForceArrows {
     const placed = contacts.filter((c) => c.point_m && c.force_vector_n && c.force_n !== null && c.force_n > 0);
     while (this.arrows.length < placed.length) {
       const arrow = new Arrow(this.size);
-      arrow.setStale(this.stale);
+      arrow.tell(this.doubt);
       this.arrows.push(arrow);
       this.group.add(arrow.group);
     }
@@ -106,8 +109,8 @@ class Arrow {
     this.group.add(this.shaft, this.head, this.collar, this.cone, this.place, point, this.label.sprite);
   }
 
-  setStale(stale: boolean): void {
-    for (const paint of this.paints) paint.color.set(stale ? 0x7d838c : COLOR);
+  tell(doubt: Doubt): void {
+    for (const paint of this.paints) paint.color.set(COLORS[doubt]);
   }
 
   set(contact: Contact | undefined, metresPerNewton: number): void {

@@ -105,7 +105,6 @@ export class Body {
     if (stale === this.stale) return;
     this.stale = stale;
     this.fade();
-    this.arrows.setStale(stale);
   }
 
   /** Takes much of the body's colour away: what it shows may be wrong. */
@@ -120,6 +119,7 @@ export class Body {
   }
 
   private fade(): void {
+    this.arrows.tell(this.stale ? "stale" : this.doubtful ? "doubtful" : "");
     this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.6 : 0);
   }
 

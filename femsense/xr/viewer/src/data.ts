@@ -101,10 +101,10 @@ export function amount(value: number | null, unit: string): string {
 
 const DAY_S = 86400;
 
-/** A time of a source: of the day where it counts as clocks do, else since it began. */
-export function timeText(time: number, digits = 1): string {
+/** A time of a source: of the day where it counts as clocks do, else since it began, in seconds or with minutes. */
+export function timeText(time: number, digits = 1, withMinutes = Math.abs(time) >= 60): string {
   if (Math.abs(time - Date.now() / 1000) < DAY_S) return new Date(1000 * time).toLocaleTimeString();
-  if (Math.abs(time) < 60) return `${time.toFixed(digits)} s`;
+  if (!withMinutes) return `${time.toFixed(digits)} s`;
   const [minutes, seconds] = [Math.floor(time / 60), Math.floor(time % 60)];
   const two = (n: number): string => String(n).padStart(2, "0");
   return minutes < 60 ? `${minutes}:${two(seconds)}` : `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(seconds)}`;

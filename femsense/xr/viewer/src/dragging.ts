@@ -199,7 +199,7 @@ export class Dragging {
     this.heard = reach;
     if (!this.enabled || reach === this.shown) return;
     this.shown = reach;
-    this.tell(reach.text, reach.status, reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`).join(" · "));
+    this.tell(reach.text, reach.status, reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`.replaceAll(" ", "\u00a0")).join(" · "));
     element("arm").dataset.moving = String(reach.armed);
     if (ghost && this.subject) {
       poseBones(this.reachable().bones, ghost);

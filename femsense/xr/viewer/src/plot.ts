@@ -7,6 +7,11 @@ const LEFT = 54;
 const BOTTOM = 15;
 const TOP = 8;
 
+/** The colour of a contact over time. */
+export function trackColor(track: number): string {
+  return COLORS[Math.abs(track) % COLORS.length]!;
+}
+
 export class Plot {
   private readonly pen: CanvasRenderingContext2D;
 
@@ -59,14 +64,15 @@ export class Plot {
     }
     pen.textBaseline = "bottom";
     pen.textAlign = "left";
-    pen.fillText(timeText(from, 0), x(from), height);
+    const minutes = Math.abs(to) >= 60;
+    pen.fillText(timeText(from, 0, minutes), x(from), height);
     pen.textAlign = "right";
-    pen.fillText(timeText(to, 0), x(to), height);
+    pen.fillText(timeText(to, 0, minutes), x(to), height);
   }
 
   private track(frames: Frame[], track: number, x: (t: number) => number, y: (n: number) => number): void {
     const pen = this.pen;
-    const color = COLORS[Math.abs(track) % COLORS.length]!;
+    const color = trackColor(track);
     for (const run of runsOf(frames, track)) {
       pen.fillStyle = `${color}40`;
       pen.beginPath();

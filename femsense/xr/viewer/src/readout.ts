@@ -1,6 +1,7 @@
 // The panel beside the robot: contacts, what drives it, and what is known of the frame.
 
 import { amount, isDoubtful, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
+import { trackColor } from "./plot";
 
 export function element<T extends Element = HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -20,7 +21,7 @@ export function showFrame(frame: Frame, inputs: Input[], largest: number): void 
   if (frame.frame !== null) facts.push(["Frame", String(frame.frame)]);
   if (frame.status) facts.push(["Status", frame.status]);
   if (frame.rms_after_m !== null) facts.push(["Residual, rms", `${(1e3 * frame.rms_after_m).toFixed(2)} mm`]);
-  element("frame-facts").dataset.doubtful = String(isDoubtful(frame));
+  element("panel").dataset.doubtful = String(isDoubtful(frame));
   fill(element("frame-facts"), facts, ([name, value], row) => {
     part(row, "dt").textContent = name;
     part(row, "dd").textContent = value;
@@ -46,6 +47,7 @@ export function drawCurve(frames: Frame[], from: number, to: number): void {
 function showContact(contact: Contact, row: HTMLElement, largest: number): void {
   const name = part(row, "span", "name");
   name.textContent = `Contact ${contact.contact}`;
+  name.style.setProperty("--track", trackColor(contact.track)); // as in the plot
   part(row, "span", "value").textContent = newtons(contact.force_n, contact.std_n);
   const share = (value: number): string => `${Math.min(100, (100 * Math.max(0, value)) / largest).toFixed(1)}%`;
   const bar = part(row, "div", "bar");
@@ -58,9 +60,14 @@ function showContact(contact: Contact, row: HTMLElement, largest: number): void 
 /** Where a contact is and how well that is known, in words. */
 function place(contact: Contact): string {
   const said = [{ cloud: "seen", shape: "from the shape", given: "given" }[contact.source] ?? contact.source];
-  if (contact.point_m) said.push(`at ${contact.point_m.map((v) => (1000 * v).toFixed(0)).join(", ")} mm`);
-  if (contact.point_std_m) said.push(`± ${(1000 * Math.max(...contact.point_std_m)).toFixed(1)} mm`);
+  if (contact.point_m) said.push(`at ${contact.point_m.map(millimetres).join(", ")}\u00a0mm`);
+  if (contact.point_std_m) said.push(`± ${(1000 * Math.max(...contact.point_std_m)).toFixed(1)}\u00a0mm`);
   return said.filter(Boolean).join(" ");
+}
+
+function millimetres(metres: number): string {
+  const whole = Math.round(1000 * metres);
+  return whole < 0 ? `−${-whole}` : String(Math.abs(whole));
 }
 
 function showInput(input: Input, value: number | null, row: HTMLElement): void {

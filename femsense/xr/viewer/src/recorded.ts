@@ -3,7 +3,7 @@
 import { AnimationMixer, type AnimationAction, type Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { amount, frameAt, loadRun, type Run } from "./data";
+import { amount, frameAt, isDoubtful, loadRun, type Run } from "./data";
 import type { Field, Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
@@ -82,6 +82,7 @@ class Player {
     if (now !== this.shown && now >= 0) {
       this.body.show(frames[now]!.contacts);
       this.body.painter.frame(now);
+      this.body.setDoubtful(isDoubtful(frames[now]!));
       showFrame(frames[now]!, this.run!.inputs, this.body.arrows.full);
       this.plot.draw(frames, 0, this.duration, frames[now]!.time_s);
     }
