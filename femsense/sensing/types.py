@@ -91,8 +91,7 @@ class FrameReport:
     time_s: float
     status: str
     """"ok", or what is wrong with the result or why there is none."""
-    contacts: int
-    """Whose force is more than noise may make."""
+    contacts: int  # whose force is more than noise may make
     matched: int
     """Points or markers that were used."""
     rms_before_m: float
