@@ -125,15 +125,8 @@ def _draw_forces(axes: Any, before: Run, after: Run, truth: Sequence[TrueContact
     axes.set(xlabel="frame", ylabel="contact force [N]", title="force over the frames")
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.spines[["top", "right"]].set_visible(False)
-    largest = max(
-        (
-            _total([c.force_n_xyz for c in group if c.frame == k])
-            for group in (before.contacts, after.contacts, truth)
-            for k in frames
-        ),
-        default=1.0,
-    )
-    axes.set_ylim(0, 1.4 * max(largest, 1e-3))
+    axes.margins(y=0.2)
+    axes.set_ylim(bottom=0.0)
     if frames:
         axes.legend(frameon=False, fontsize=8)
 
