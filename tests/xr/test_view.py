@@ -288,6 +288,13 @@ const [url, shot, phone] = given;
     result.contact = { ...(await paint()), place: await page.evaluate(() => femsense.shown.body.painter.places.value[0].toArray()) };
     await page.waitForTimeout(200);
     await page.screenshot({ path: shot.replace('desk', 'contact') });
+    result.doubtful = await page.evaluate(() => ['not explained', 'ok'].map((status) => {
+      const { shown } = femsense;
+      shown.run.frames[shown.shown].status = status;
+      shown.shown = -1;
+      shown.seek(shown.time);
+      return shown.body.isDoubtful;
+    }));
     await page.selectOption('#paint', 'none');
     await page.setViewportSize({ width: 360, height: 740 });
     await page.waitForTimeout(300);
@@ -371,6 +378,7 @@ def test_page_in_a_browser(request: pytest.FixtureRequest, run: Path, built_page
     assert bent["said"] == f"{100 * strain.max():.2f} % strain"
     (touch,) = view.contacts_of_run(run)["frames"][6]["contacts"]
     assert contact["place"][:3] == pytest.approx(in_gltf(np.array(touch["point_m"])), abs=1e-6) and contact["place"][3] > 0
+    assert seen["doubtful"] == [True, False]  # a frame that is not ok is faded
     covered: list[dict[str, float]] = seen["covered"]  # type: ignore[assignment]
     assert len(covered) == 2 and all(one["under"] <= 0.5 and one["beyond"] == 0 for one in covered)
     assert covered[0]["off"] < 1e-6  # what is framed is where the arrow begins
