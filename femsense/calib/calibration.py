@@ -52,7 +52,7 @@ class Calibration:
     nothing was fitted to them, without what another law changes. It is not kept in a file."""
     law_step: FloatArray = field(default_factory=lambda: np.zeros(0))
     """By how much another law moves all poses (as joint_covariance, which holds its square) and what markers say of initial inputs, shape (6 v + a,);
-    empty where nobody knows. It is not kept in a file."""
+    empty where nobody knows."""
     is_corrected: bool = False
     """Whether the robot's empirical correction was used."""
 

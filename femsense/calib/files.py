@@ -42,6 +42,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         },
         "pose_covariance": c.pose_covariance,
         "joint_covariance": c.joint_covariance,
+        "law_step": c.law_step,
         "normal_rms_m": c.normal_rms_m,
         "noise_m": c.noise_m,
         "placements_m": c.placements_m,
@@ -99,6 +100,7 @@ def read_calibration(path: str | Path) -> Calibration:
             normal_rms_m=number_of(document.get("normal_rms_m")),
             noise_m=number_of(document.get("noise_m")),
             joint_covariance=_matrix(document.get("joint_covariance"), 6 * len(cameras)),
+            law_step=freeze(np.array([number_of(x) for x in document.get("law_step", [])])),
             is_corrected=bool(document.get("corrected", False)),
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:

@@ -85,6 +85,8 @@ def test_the_covariance_of_all_cameras_survives_its_file(free, tmp_path):
     calibration = calibrate(arm(), free)
     again = read_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
     np.testing.assert_allclose(again.joint_covariance, calibration.joint_covariance)
+    assert len(calibration.law_step) >= 6
+    np.testing.assert_allclose(again.law_step, calibration.law_step)
     assert again.normal_rms_m == pytest.approx(calibration.normal_rms_m)
 
 
