@@ -46,9 +46,7 @@ def softer(robot: Robot, factor: float) -> Robot:
 
 
 def every_camera(recording: Recording, scale: float) -> Recording:
-    for view in range(len(recording.camera_names)):
-        recording = scaled(recording, view, scale)
-    return recording
+    return scaled(recording, range(len(recording.camera_names)), scale)
 
 
 def real_recordings(out: Path, data: Path) -> Iterator[tuple[str, Path, Sequence[Path]]]:

@@ -170,8 +170,8 @@ def _fitted(
         check_declared_poses(scene.recording, poses, pairs, lambda other: _left_with(robot, other, scene.frames))
         check_inputs(scene.recording, pairs)
         said = check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
-        if initial is None and not said:
-            check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of)
+        if initial is None:
+            check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of, said=said)
         check_marker_scale(robot, scene, poses, initial, jet, _residual_of)
         check_camera_still(robot, scene.recording, pairs)
     check_reading(robot, pairs, strict=strict)

@@ -34,7 +34,7 @@ KNOWN = 4.48
 """The clouds know that a declared pose is off where it is so many deviations from the fitted one: six coordinates that err by chance
 stay below that in 99.7 of 100 cases (chi-squared)."""
 ALLOWED = 2.0
-"""… and it is said where turn or shift are so many of `DECLARED_STD`: `estimate` takes a declared pose to be off by that, and free frames tell it."""
+"""… and it is said where turn or shift are so many of `DECLARED_STD`: what is less, free frames tell `estimate`."""
 FRAMES = 4
 """Free frames that tell."""
 MODULUS = 3.0
@@ -78,7 +78,7 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
         if off < ALLOWED or (apart < KNOWN and not plain):
             continue
         middle = robot.body.mesh.nodes.mean(axis=0)
-        text = said(recording, view, found.poses[view], fitted.poses[view], middle, before, left)
+        text = said(recording, [view], found.poses, fitted.poses, [middle], before, left)
         text += f". That is {apart:.2g} times what the clouds leave open"
         factor, softer = _with_modulus(robot, recording, found, view, body)
         by_modulus = softer < 0.5 * before

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from femsense.calib.checks import EXPLAINED, SUSPICIOUS, Pairs, rigid_rms
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
 from femsense.model.recording import Recording
@@ -38,46 +38,99 @@ def check_declared_poses(
     Raises:
         DataError: says how far it is off.
     """
-    for view, (declared, one) in enumerate(zip(recording.T_robot_camera, pairs)):
-        rows = one.modelled.size
-        if declared is None or rows < 12 or len(np.unique(one.marker)) < 3:
-            continue
-        before = float(np.sqrt(((one.measured - one.modelled) ** 2).sum(axis=1).mean()))
-        freedom = float(np.sqrt(rows / (rows - 6.0)))
-        if before < TRIED * rigid_rms(one.modelled, one.measured):
-            continue
-        open_poses = tuple(None if v == view else T for v, T in enumerate(recording.T_robot_camera))
-        try:
-            left, fitted = refit(replace(recording, T_robot_camera=open_poses))
-        except DataError:
-            continue
-        if before < TRIED * freedom * left:
-            continue
-        text = said(recording, view, declared, fitted[view], one.modelled.mean(axis=0), before, left)
-        if before > max(EXPLAINED * freedom * left, SUSPICIOUS * one.spread):
-            raise DataError(text)
-        warnings.warn(f"{text}. Or the model errs by as much: femsense improve", stacklevel=5)
+    usable = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and _tells(pairs[v])]
+    found = [one for v in usable if (one := _fitted(recording, (v,), pairs, refit)) is not None]
+    best = min(found, key=lambda one: one.left, default=None)
+    together = _fitted(recording, tuple(usable), pairs, refit) if len(usable) > 1 else None
+    if together is not None and (best is None or best.left > TRIED * together.left):
+        best = together
+    if best is None or best.before < TRIED * best.left:
+        return
+    text = said(
+        recording, best.views, poses, best.poses, [pairs[v].modelled.mean(axis=0) for v in best.views], best.before, best.left
+    )
+    if best.before > max(EXPLAINED * best.left, SUSPICIOUS * max(pairs[v].spread for v in best.views)):
+        raise DataError(text)
+    warnings.warn(f"{text}. Or the model errs by as much: femsense improve", stacklevel=5)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fitted:
+    """What is left with some declared poses fitted: one camera's, or all, as where the robot's base is elsewhere."""
+
+    views: tuple[int, ...]
+    before: float
+    """Root mean square of their markers' distances as declared [m]."""
+    left: float
+    """The same of all markers, fitted [m]; the freedom of the poses is taken out."""
+    poses: Sequence[FloatArray]
+
+
+def _tells(one: Pairs) -> bool:
+    return one.modelled.size >= 12 and len(np.unique(one.marker)) >= 3
+
+
+def _fitted(
+    recording: Recording, views: tuple[int, ...], pairs: Sequence[Pairs], refit: Callable[[Recording], Fitted]
+) -> _Fitted | None:
+    """Return what is left with some poses fitted; None where nothing suggests it, or nothing fits.
+
+    With inputs as they are a rigid motion tells whether it may be worth it; inputs that are fitted have taken up a part of it.
+    """
+    mine = [pairs[v] for v in views]
+    counts = np.array([len(one.marker) for one in mine])
+    before = _rms(counts, [np.sqrt(((one.measured - one.modelled) ** 2).sum(axis=1).mean()) for one in mine])
+    rigid = _rms(counts, [rigid_rms(one.modelled, one.measured) for one in mine])
+    if recording.actuation_zero != "unknown" and before < TRIED * rigid:
+        return None
+    opened = tuple(None if v in views else T for v, T in enumerate(recording.T_robot_camera))
+    try:
+        left, fitted = refit(replace(recording, T_robot_camera=opened))
+    except DataError:
+        return None
+    rows = 3.0 * counts.sum()
+    return _Fitted(views, before, float(np.sqrt(rows / (rows - 6.0 * len(views)))) * left, fitted)
+
+
+def _rms(counts: IntArray, each: Sequence[float]) -> float:
+    """Return the root mean square over all rows of what it is in groups of so many."""
+    return float(np.sqrt(counts @ np.square(each) / counts.sum()))
 
 
 def said(
-    recording: Recording, view: int, declared: FloatArray, fitted: FloatArray, middle: FloatArray, before: float, left: float
+    recording: Recording,
+    views: Sequence[int],
+    declared: Sequence[FloatArray],
+    fitted: Sequence[FloatArray],
+    middles: Sequence[FloatArray],
+    before: float,
+    left: float,
 ) -> str:
-    """Return in words how far a declared pose is from a fitted one.
+    """Return in words how far declared poses are from fitted ones.
 
     Arguments:
-        recording: names the camera.
-        view: of the camera.
-        declared, fitted: T_robot_camera, shape (4, 4).
-        middle: where the shift is told [m], shape (3,).
-        before, left: residual with the one and the other [m].
+        recording: names the cameras.
+        views: of the cameras.
+        declared, fitted: T_robot_camera of all cameras, shape (4, 4) each.
+        middles: where the shifts are told, one a view [m], shape (3,).
+        before, left: residual with the ones and the others [m].
     """
+    names = [recording.camera_names[v] or "(only one)" for v in views]
+    one = len(views) == 1
+    off = "; ".join(
+        f"{'the declared one' if one else f'that of {name}'} is {_apart(declared[v], fitted[v], middle)}"
+        for v, name, middle in zip(views, names, middles)
+    )
+    which = f"the declared pose of camera {names[0]} leaves" if one else f"the declared poses of cameras {', '.join(names)} leave"
+    return (
+        f"{which} {1e3 * before:.3g} mm, {'one that is' if one else 'ones that are'} fitted {1e3 * left:.3g} mm: {off}. "
+        f"Leave T_robot_camera out of recording.toml to have it fitted, or declare it in the robot's frame"
+    )
+
+
+def _apart(declared: FloatArray, fitted: FloatArray, middle: FloatArray) -> str:
     apart = declared @ invert_pose(fitted)
     turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(apart[:3, :3]) - 1.0), -1.0, 1.0)))
     shift = transform_points(apart, middle[None])[0] - middle
     along = ", ".join(f"{1e3 * x:.2g}" for x in shift)
-    return (
-        f"the declared pose of camera {recording.camera_names[view] or '(only one)'} leaves {1e3 * before:.3g} mm, one that is "
-        f"fitted {1e3 * left:.3g} mm: the declared one is turned by {turn:.2g}° and shifted by {1e3 * np.linalg.norm(shift):.3g} mm "
-        f"({along}) at the body. Leave T_robot_camera out of recording.toml to have it fitted, or declare it "
-        f"in the robot's frame"
-    )
+    return f"turned by {turn:.2g}° and shifted by {1e3 * np.linalg.norm(shift):.3g} mm ({along}) at the body"

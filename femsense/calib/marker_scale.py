@@ -54,20 +54,23 @@ def check_marker_scale(
         jet: where the fit ended, with derivatives.
         refit: fits another reading.
     """
-    before = _rms(jet.residual)
-    for view, name in enumerate(scene.recording.camera_names):
-        best = marker_scale(scene, poses, jet, view)
+    before, names = _rms(jet.residual), scene.recording.camera_names
+    found: list[tuple[float, MarkerScale, tuple[int, ...]]] = []
+    for views in [*((v,) for v in range(len(names))), *([tuple(range(len(names)))] if len(names) > 1 else [])]:
+        best = marker_scale(scene, poses, jet, views)
         if not _tells(best):
             continue
-        best = marker_scale(scene, poses, jet, view, by_modulus(robot, scene, poses, initial, jet))
+        best = marker_scale(scene, poses, jet, views, by_modulus(robot, scene, poses, initial, jet))
         if best is None or not _tells(best):
             continue
         try:
-            left = _rms(refit(robot, scaled(scene.recording, view, 1.0 / best.scale), scene.frames))
+            found.append((_rms(refit(robot, scaled(scene.recording, views, 1.0 / best.scale), scene.frames)), best, views))
         except DataError:
             continue
-        if before > TOLD * left:
-            warnings.warn(_text(name, best, before, left), stacklevel=5)
+    left, best, views = min(found, key=lambda one: one[0], default=(before, None, ()))
+    if best is not None and before > TOLD * left:
+        which = f"camera {names[views[0]] or '(only one)'}" if len(views) == 1 else "all cameras"
+        warnings.warn(_text(which, best, before, left), stacklevel=5)
 
 
 def _tells(found: MarkerScale | None) -> bool:
@@ -75,24 +78,25 @@ def _tells(found: MarkerScale | None) -> bool:
 
 
 def marker_scale(
-    scene: Scene, poses: Sequence[FloatArray], jet: SceneJet, view: int, beside: FloatArray | None = None
+    scene: Scene, poses: Sequence[FloatArray], jet: SceneJet, views: Sequence[int], beside: FloatArray | None = None
 ) -> MarkerScale | None:
-    """Return how many times too large the markers of a camera are; None where they are too few to tell. Declared poses may be off, too:
+    """Return how many times too large the markers of some cameras are; None where they are too few to tell. Declared poses may be off, too:
     a scale about the camera shifts the body as they would.
 
     Arguments:
         scene, poses, jet: as of `check_marker_scale`.
-        view: the camera.
+        views: the cameras; all, where one motion capture speaks for several.
         beside: what else may be off, as the change of the residual with it, shape (k, 3).
     """
-    mine = scene.view == view
+    mine = np.isin(scene.view, views)
     if len(np.unique(scene.marker[mine])) < MARKERS or len(np.unique(scene.frame[mine])) < FRAMES:
         return None
     rows, frame, residual = jet.residual.size, np.repeat(scene.frame, 3), jet.residual.ravel()
     common = np.hstack([jet.by_pose.reshape(rows, -1), jet.by_initial.reshape(rows, -1)])
     if beside is not None:
         common = np.column_stack([common, beside.ravel()])
-    by_scale = -(mine[:, None] * scene.points) @ poses[view][:3, :3].T
+    turns = np.stack([T[:3, :3] for T in poses])[scene.view]
+    by_scale = -np.einsum("kij,kj->ki", turns, mine[:, None] * scene.points)
     plain = fit_by_frames(common, residual, frame)[2]
     x, std, left = fit_by_frames(np.column_stack([common, by_scale.ravel()]), residual, frame)
     share = float(np.linalg.norm(left)) / max(float(np.linalg.norm(plain)), 1e-300)
@@ -116,12 +120,12 @@ def by_modulus(robot: Robot, scene: Scene, poses: Sequence[FloatArray], initial:
     return np.asarray((there.residual - jet.residual) / STIFFER)
 
 
-def scaled(recording: Recording, view: int, scale: float) -> Recording:
-    """Return the recording with the markers of a camera scaled about it."""
-    factor = np.where(recording.marker_view == view, scale, 1.0)[:, None]
+def scaled(recording: Recording, views: Sequence[int], scale: float) -> Recording:
+    """Return the recording with the markers of some cameras scaled about these."""
+    factor = np.where(np.isin(recording.marker_view, views), scale, 1.0)[:, None]
     rest = recording.rest
     if rest is not None:
-        rest = replace(rest, positions=freeze(rest.positions * np.where(rest.view == view, scale, 1.0)[:, None]))
+        rest = replace(rest, positions=freeze(rest.positions * np.where(np.isin(rest.view, views), scale, 1.0)[:, None]))
     return replace(recording, marker_xyz=freeze(recording.marker_xyz * factor), rest=rest)
 
 
@@ -129,9 +133,9 @@ def _rms(residual: FloatArray) -> float:
     return float(np.sqrt((residual**2).sum(axis=1).mean()))
 
 
-def _text(name: str, best: MarkerScale, before: float, left: float) -> str:
+def _text(which: str, best: MarkerScale, before: float, left: float) -> str:
     return (
-        f"the markers of camera {name or '(only one)'} are {best.scale:.3f} ± {best.std:.1g} times too large: divided by that they fit to "
+        f"the markers of {which} are {best.scale:.3f} ± {best.std:.1g} times too large: divided by that they fit to "
         f"{1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm. Is the scale of the motion capture or of the camera's depth right, "
         f"and the size of the robot's mesh?"
     )

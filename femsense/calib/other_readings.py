@@ -1,8 +1,9 @@
 """Whether the same files fit far better if read otherwise: inputs with another sign, order or delay, gravity another way.
+Or is the body softer or stiffer?
 
 Each reading is first weighed with the poses free and all else held: inputs by the linear response of the markers, gravity, which
 may bend a body far, by the states of a few frames. The best is then fitted like the files themselves, and counts by what it
-leaves. Only another zero of the inputs has parameters of its own, and is only mentioned.
+leaves. Another zero of the inputs and another modulus have parameters of their own, and are only mentioned.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ PERMUTED = 5
 """Of more cables than this only pairs are exchanged: all orders would be too many."""
 FEW = 3
 """Frames by which directions of gravity are weighed."""
+
+MODULI = (0.4, 0.63, 1.6, 2.5)
+"""Other moduli, as shares of the declared one. An arm declared 1.67 times as stiff was refused for gravity that points elsewhere."""
 
 Refit = Callable[[Robot, Recording, IntArray], FloatArray]
 """Returns what a fit of a robot to frames of a recording leaves [m], shape (k, 3)."""
@@ -75,8 +79,10 @@ class Response:
 
 def check_other_readings(
     robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None, residual: FloatArray, refit: Refit
-) -> bool:
-    """Refuse files that fit far better if read otherwise; warn where they fit better. Return whether a warning was given.
+) -> float:
+    """Refuse files that fit far better if read otherwise; warn where they fit better.
+
+    Return what is left so [m]; infinite where nothing was said.
 
     Arguments:
         robot: the robot.
@@ -90,22 +96,23 @@ def check_other_readings(
         DataError: says what is wrong with the files if the better reading is right.
     """
     if all(_rms(residual[scene.view == v]) < SUSPICIOUS * one.spread for v, one in enumerate(pairs) if len(one.marker)):
-        return False
-    shares = [*_by_inputs(robot, scene, pairs, initial), *_by_gravity(robot, scene, pairs, initial)]
+        return np.inf
+    shares = [*_by_inputs(robot, scene, pairs, initial), *_by_body(robot, scene, pairs, initial)]
     share, best = min(shares, key=lambda one: one[0], default=(1.0, None))
     if best is None or share * TOLD > 1.0:
-        return False
+        return np.inf
     try:
         left = _rms(refit(best.robot, best.recording, best.frames))
     except DataError:
-        return False
+        return np.inf
     before = _rms(residual[np.isin(scene.frame, best.frames)])
     found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm"
     if before > REFUSED * left and not best.fitted:
         raise DataError(found)
-    if before > TOLD * left:
-        warnings.warn(f"{found}. Is it so?", stacklevel=5)
-    return before > TOLD * left
+    if before <= TOLD * left:
+        return np.inf
+    warnings.warn(f"{found}. Is it so?", stacklevel=5)
+    return left
 
 
 def readings(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
@@ -168,14 +175,13 @@ def _by_zero(
     return share, Reading(text, robot, shifted, scene.frames, fitted=True)
 
 
-def _by_gravity(
-    robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None
-) -> Iterator[tuple[float, Reading]]:
-    """Yield what other directions of gravity leave in a few frames, as a share of what is left now."""
+def _by_body(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None) -> Iterator[tuple[float, Reading]]:
+    """Yield what other directions of gravity, and other moduli, leave in a few frames, as a share of what is left now."""
     few = scene.frames[np.unique(np.linspace(0, len(scene.frames) - 1, FEW).round().astype(int))]
     rows = np.isin(scene.frame, few)
     now = _states(robot, scene.recording, few, initial) if rows.any() else None
-    for reading in _gravities(robot, scene.recording, scene.frames) if now is not None else ():
+    others = itertools.chain(_gravities(robot, scene.recording, scene.frames), _moduli(robot, scene.recording, scene.frames))
+    for reading in others if now is not None else ():
         other = _states(reading.robot, reading.recording, few, initial)
         if other is None or now is None:
             continue
@@ -256,6 +262,14 @@ def _gravities(robot: Robot, recording: Recording, frames: IntArray) -> Iterator
                 f"gravity seems to point along {'-' if sign < 0 else '+'}{'xyz'[j]} of the robot, not as gravity.vector_m_s2 says"
             )
             yield Reading(text, replace(robot, body=robot.body.with_gravity(other)), recording, frames)
+
+
+def _moduli(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    """Yield other moduli: a robot that is too soft or too stiff is no reason to refuse its files."""
+    for scale in MODULI:
+        body = robot.body.with_stiffness_scale(scale)
+        text = f"the body seems to have about {scale:g} times its declared modulus. femsense improve finds it"
+        yield Reading(text, replace(robot, body=body), recording, frames, fitted=True)
 
 
 def _inputs(robot: Robot, recording: Recording) -> tuple[tuple[str, ...], FloatArray]:

@@ -56,6 +56,8 @@ def check_single_inputs(
     residual: FloatArray,
     states: dict[int, Equilibrium],
     refit: Refit,
+    *,
+    said: float = np.inf,
 ) -> None:
     """Warn where the markers fit far better with another gain and offset of one cable's input.
 
@@ -66,6 +68,7 @@ def check_single_inputs(
         residual: what the fit leaves [m], shape (k, 3).
         states: the equilibrium of each frame.
         refit: fits another reading.
+        said: what is left by another reading that was named already [m].
     """
     best = min(single_inputs(robot, scene, poses, states), key=lambda one: one.share, default=None)
     if best is None or best.share * TOLD > 1.0 or not best.is_off:
@@ -77,7 +80,7 @@ def check_single_inputs(
     except DataError:
         return
     before = _rms(residual)
-    if before > TOLD * left:
+    if before > TOLD * left and left < said:
         warnings.warn(_text(recording, robot.body.cable_names[best.cable], best, before, left), stacklevel=5)
 
 

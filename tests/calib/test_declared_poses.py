@@ -11,6 +11,8 @@ from arm import NAMES, T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.calibration import Calibration
+from femsense.calib.checks import Pairs
+from femsense.calib.declared_poses import check_declared_poses
 from femsense.core.errors import DataError
 from femsense.core.pose import move_pose
 from femsense.model.recording import Recording
@@ -67,3 +69,45 @@ def test_deviations_of_inputs_hold_what_a_declared_pose_may_be_off() -> None:
     assert np.all(held > 0.7 * fitted) and np.all(held < 1.3 * fitted)
     found, std = bends(calibrate(arm(), declared(recording, [0.0, 0.0, np.radians(0.3), 0.0, 0.0, 0.0007])))
     assert np.all(np.abs(found - ACROSS @ INITIAL) < 3.0 * std)
+
+
+@pytest.mark.parametrize("zero", ["absolute", "unknown"])
+def test_poses_that_are_off_together_are_named_together(zero: str) -> None:
+    """Where the robot's base is elsewhere, each pose contradicts the others as soon as it alone is fitted."""
+    one = record(LEVELS, noise=2e-4, **({"zero": zero, "initial": INITIAL} if zero == "unknown" else {}))[0]
+    right = by_two_cameras(one, [0.0] * 6, [0.0] * 6)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        calibrate(arm(), right)
+    assert not any("declared" in str(item.message) for item in heard)
+    with pytest.raises(DataError, match=r"declared poses of cameras left, right leave .*that of left is .*; that of right is"):
+        calibrate(arm(), by_two_cameras(one, *[[0.0, 0.0, 0.0, 0.008, 0.0, 0.004]] * 2))
+    with pytest.raises(DataError, match=r"declared pose of camera right leaves"):
+        calibrate(arm(), by_two_cameras(one, [0.0] * 6, [0.0, 0.0, 0.0, 0.008, 0.0, 0.004]))
+
+
+def by_two_cameras(one: Recording, *steps: list[float]) -> Recording:
+    """Return a recording as two cameras at one place have it, whose declared poses are off by steps."""
+    return replace(
+        one,
+        camera_names=("left", "right"),
+        cameras=(None, None),
+        T_robot_camera=tuple(move_pose(T_ROBOT_CAMERA, step, pivot_a=[0.05, 0, 0]) for step in steps),
+        cloud_files=((None, None),) * one.frame_count,
+        color_files=((None, None),) * one.frame_count,
+        marker_frame=np.tile(one.marker_frame, 2),
+        marker_index=np.tile(one.marker_index, 2),
+        marker_view=np.repeat([0, 1], len(one.marker_frame)),
+        marker_xyz=np.vstack([one.marker_xyz, one.marker_xyz]),
+    )
+
+
+def test_inputs_that_are_fitted_may_have_taken_up_what_a_rigid_motion_would_tell() -> None:
+    """The markers lie off as no rigid motion has it, and yet a fit with another pose leaves nothing: it has other inputs."""
+    rng = np.random.default_rng(4)
+    places = rng.uniform(-0.05, 0.05, size=(24, 3))
+    bent = Pairs(places, places + 1e-3 * rng.normal(size=places.shape), np.arange(24) % 8, np.arange(24) // 8)
+    seen = declared(record(LEVELS, zero="unknown", initial=INITIAL)[0], [0.0] * 6)
+    away = move_pose(T_ROBOT_CAMERA, [0.0, np.radians(3.0), 0.0, 0.0, 0.0, 0.0], pivot_a=[0.05, 0, 0])
+    with pytest.warns(UserWarning, match=r"declared pose of camera .* turned by 3° .*Or the model errs by as much"):
+        check_declared_poses(seen, seen.T_robot_camera, [bent], lambda other: (5e-4, [away]))

@@ -41,7 +41,7 @@ def scales_said(seen: Recording, modulus: float = 300e3) -> list[float]:
 @pytest.mark.parametrize("zero", ["absolute", "unknown"])
 @pytest.mark.parametrize("scale", [1.03, 0.97])
 def test_a_scale_is_said_with_its_number(zero: str, scale: float) -> None:
-    (found,) = scales_said(scaled(recording(zero), 0, scale))
+    (found,) = scales_said(scaled(recording(zero), [0], scale))
     assert found == pytest.approx(scale, abs=0.003)
 
 
@@ -51,10 +51,10 @@ def test_right_markers_are_not_accused_whatever_the_modulus(zero: str, modulus: 
     assert scales_said(recording(zero), modulus) == []
 
 
-def test_the_camera_is_named_whose_markers_are_too_large() -> None:
+def by_two_cameras(*scale: float) -> Recording:
+    """Return the recording as two cameras at one place have it, each with its own scale."""
     one = recording()
-    count = len(one.marker_frame)
-    both = replace(
+    return replace(
         one,
         camera_names=("left", "right"),
         cameras=(None, None),
@@ -63,11 +63,17 @@ def test_the_camera_is_named_whose_markers_are_too_large() -> None:
         color_files=((None, None),) * one.frame_count,
         marker_frame=np.tile(one.marker_frame, 2),
         marker_index=np.tile(one.marker_index, 2),
-        marker_view=np.repeat([0, 1], count),
-        marker_xyz=np.vstack([one.marker_xyz, 1.04 * one.marker_xyz]),
+        marker_view=np.repeat([0, 1], len(one.marker_frame)),
+        marker_xyz=np.vstack([factor * one.marker_xyz for factor in scale]),
     )
-    with pytest.warns(UserWarning, match=r"the markers of camera right are 1\.0[34]\d ± \S+ times too large"):
-        calibrate(arm(), both)
+
+
+@pytest.mark.parametrize(
+    ("scale", "which"), [((1.0, 1.04), r"camera right are 1\.0[34]"), ((1.03, 1.03), r"all cameras are 1\.0(29|3)")]
+)
+def test_the_cameras_are_named_whose_markers_are_too_large(scale: tuple[float, float], which: str) -> None:
+    with pytest.warns(UserWarning, match=rf"the markers of {which}\d* ± \S+ times too large"):
+        calibrate(arm(), by_two_cameras(*scale))
 
 
 def test_a_declared_pose_that_is_off_is_no_scale() -> None:
@@ -77,5 +83,5 @@ def test_a_declared_pose_that_is_off_is_no_scale() -> None:
     assert scales_said(seen) == []
     scene = make_scene(arm(), seen, np.arange(len(PULLS)))
     _, poses, _, jet = fit_joint(arm(), scene, [away], None, [])
-    found = marker_scale(scene, poses, jet, 0)
+    found = marker_scale(scene, poses, jet, [0])
     assert found is not None and found.share > 0.9 and found.scale == pytest.approx(1.0, abs=0.002)

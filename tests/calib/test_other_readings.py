@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -88,3 +89,13 @@ def test_many_cables_are_exchanged_by_pairs_only() -> None:
     assert sum("exchanged" in text for text in said) == 23  # of four cables all orders but their own
     assert sum("wrong sign" in text for text in said) == 5
     assert sum("gravity" in text for text in said) == 5
+
+
+@pytest.mark.parametrize("modulus", [180e3, 500e3, 600e3])
+def test_a_body_that_is_softer_or_stiffer_is_not_refused_for_gravity(modulus: float) -> None:
+    recording = record(2.0 * (LEVELS[[0, 1, 3, 4, 5]] > 0), noise=2e-4, seed=3)[0]
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        calibrate(arm(modulus=modulus), recording)
+    said = " ".join(str(item.message) for item in heard)
+    assert "gravity" not in said and "times its declared modulus" in said
