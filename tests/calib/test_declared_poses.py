@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import NAMES, T_ROBOT_CAMERA, arm, record
+from arm import NAMES, T_ROBOT_CAMERA, arm, by_two_cameras, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.calibration import Calibration
@@ -75,31 +75,21 @@ def test_deviations_of_inputs_hold_what_a_declared_pose_may_be_off() -> None:
 def test_poses_that_are_off_together_are_named_together(zero: str) -> None:
     """Where the robot's base is elsewhere, each pose contradicts the others as soon as it alone is fitted."""
     one = record(LEVELS, noise=2e-4, **({"zero": zero, "initial": INITIAL} if zero == "unknown" else {}))[0]
-    right = by_two_cameras(one, [0.0] * 6, [0.0] * 6)
+    right = off(one, [0.0] * 6, [0.0] * 6)
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         calibrate(arm(), right)
     assert not any("declared" in str(item.message) for item in heard)
     with pytest.raises(DataError, match=r"declared poses of cameras left, right leave .*that of left is .*; that of right is"):
-        calibrate(arm(), by_two_cameras(one, *[[0.0, 0.0, 0.0, 0.008, 0.0, 0.004]] * 2))
+        calibrate(arm(), off(one, *[[0.0, 0.0, 0.0, 0.008, 0.0, 0.004]] * 2))
     with pytest.raises(DataError, match=r"declared pose of camera right leaves"):
-        calibrate(arm(), by_two_cameras(one, [0.0] * 6, [0.0, 0.0, 0.0, 0.008, 0.0, 0.004]))
+        calibrate(arm(), off(one, [0.0] * 6, [0.0, 0.0, 0.0, 0.008, 0.0, 0.004]))
 
 
-def by_two_cameras(one: Recording, *steps: list[float]) -> Recording:
-    """Return a recording as two cameras at one place have it, whose declared poses are off by steps."""
-    return replace(
-        one,
-        camera_names=("left", "right"),
-        cameras=(None, None),
-        T_robot_camera=tuple(move_pose(T_ROBOT_CAMERA, step, pivot_a=[0.05, 0, 0]) for step in steps),
-        cloud_files=((None, None),) * one.frame_count,
-        color_files=((None, None),) * one.frame_count,
-        marker_frame=np.tile(one.marker_frame, 2),
-        marker_index=np.tile(one.marker_index, 2),
-        marker_view=np.repeat([0, 1], len(one.marker_frame)),
-        marker_xyz=np.vstack([one.marker_xyz, one.marker_xyz]),
-    )
+def off(one: Recording, *steps: list[float]) -> Recording:
+    """Return a recording as two cameras have it, whose declared poses are off by steps."""
+    poses = tuple(move_pose(T_ROBOT_CAMERA, step, pivot_a=[0.05, 0, 0]) for step in steps)
+    return replace(by_two_cameras(one), T_robot_camera=poses)
 
 
 def test_inputs_that_are_fitted_may_have_taken_up_what_a_rigid_motion_would_tell() -> None:

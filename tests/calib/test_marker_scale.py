@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from arm import T_ROBOT_CAMERA, arm, record
+from arm import T_ROBOT_CAMERA, arm, by_two_cameras, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.joint import fit_joint
@@ -51,29 +51,12 @@ def test_right_markers_are_not_accused_whatever_the_modulus(zero: str, modulus: 
     assert scales_said(recording(zero), modulus) == []
 
 
-def by_two_cameras(*scale: float) -> Recording:
-    """Return the recording as two cameras at one place have it, each with its own scale."""
-    one = recording()
-    return replace(
-        one,
-        camera_names=("left", "right"),
-        cameras=(None, None),
-        T_robot_camera=(None, None),
-        cloud_files=((None, None),) * one.frame_count,
-        color_files=((None, None),) * one.frame_count,
-        marker_frame=np.tile(one.marker_frame, 2),
-        marker_index=np.tile(one.marker_index, 2),
-        marker_view=np.repeat([0, 1], len(one.marker_frame)),
-        marker_xyz=np.vstack([factor * one.marker_xyz for factor in scale]),
-    )
-
-
 @pytest.mark.parametrize(
     ("scale", "which"), [((1.0, 1.04), r"camera right are 1\.0[34]"), ((1.03, 1.03), r"all cameras are 1\.0(29|3)")]
 )
 def test_the_cameras_are_named_whose_markers_are_too_large(scale: tuple[float, float], which: str) -> None:
     with pytest.warns(UserWarning, match=rf"the markers of {which}\d* ± \S+ times too large"):
-        calibrate(arm(), by_two_cameras(*scale))
+        calibrate(arm(), by_two_cameras(recording(), scale=scale))
 
 
 def test_a_declared_pose_that_is_off_is_no_scale() -> None:

@@ -142,3 +142,19 @@ def record(
 
 
 __all__ = ["NAMES", "T_ROBOT_CAMERA", "arm", "frame_loads", "record", "replace", "sweeps"]
+
+
+def by_two_cameras(one: Recording, *, scale: tuple[float, float] = (1.0, 1.0)) -> Recording:
+    """Return a recording as two cameras at one place have it, each with a scale of its own and no declared pose."""
+    return replace(
+        one,
+        camera_names=("left", "right"),
+        cameras=(None, None),
+        T_robot_camera=(None, None),
+        cloud_files=((None, None),) * one.frame_count,
+        color_files=((None, None),) * one.frame_count,
+        marker_frame=np.tile(one.marker_frame, 2),
+        marker_index=np.tile(one.marker_index, 2),
+        marker_view=np.repeat([0, 1], len(one.marker_frame)),
+        marker_xyz=np.vstack([factor * one.marker_xyz for factor in scale]),
+    )
