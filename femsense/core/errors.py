@@ -41,6 +41,12 @@ class InputError(FemsenseError):
         super().__init__("\n".join(parts))
 
 
+class UnitError(InputError):
+    """Numbers in another unit than the format's: well formed, but the data do not allow a result (exit status 1)."""
+
+    exit_status = 1
+
+
 class DataError(FemsenseError):
     """The input is well formed, but the data do not allow a result (exit status 1)."""
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.core.errors import InputError
+from femsense.core.errors import InputError, UnitError
 from femsense.core.text import did_you_mean
 from femsense.io.files import write_csv
 from femsense.io.lost_markers import is_a_place
@@ -307,7 +307,8 @@ def _check_metres(table: Table, xyz: FloatArray) -> None:
     most = len(far) > 0.2 * len(xyz)
     what = "coordinates of this size look like millimetres" if most else "a marker this far away is not plausible"
     hint = "divide x, y and z by 1000" if most else "leave the row out where the marker was lost"
-    raise InputError(
+    kind = UnitError if most else InputError
+    raise kind(
         what,
         where=table.place(int(far[0])),
         found=xyz[far[0]].tolist(),

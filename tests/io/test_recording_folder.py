@@ -808,6 +808,13 @@ def test_one_clear_error(tmp_path: Path, files: dict[str, str | None], place: st
         assert text in message
 
 
+@pytest.mark.parametrize(("rows", "status"), [("0,tip,105.2,33,512\n1,tip,100,30,511\n", 1), ("0,tip,0,0,1,2\n", 2)])
+def test_another_unit_ends_as_data_that_allow_no_result(tmp_path: Path, rows: str, status: int) -> None:
+    with pytest.raises(InputError) as error:
+        load_recording(write_small_recording(tmp_path, markers_csv=MARKERS + rows))
+    assert error.value.exit_status == status
+
+
 def test_no_such_recording(tmp_path: Path) -> None:
     write_small_recording(tmp_path / "push")
     with pytest.raises(InputError, match="no such recording") as error:
