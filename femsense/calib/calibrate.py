@@ -160,8 +160,10 @@ def _fitted(
         DataError: markers that cannot be the robot's as they are written (`check_reading`).
     """
     scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
-    pairs = pairs_of(robot, scene, poses, jet.residual)
-    check_reading(robot, pairs, strict=False)  # first: a mirrored body that is symmetric fits under other labels in single frames
+    pairs, names = pairs_of(robot, scene, poses, jet.residual), recording.camera_names
+    check_reading(
+        robot, pairs, cameras=names, strict=False
+    )  # first: a mirrored body that is symmetric fits under other labels in single frames
     better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0, strict=strict)
     if changed:
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
@@ -174,7 +176,7 @@ def _fitted(
             check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of, said=said)
         check_marker_scale(robot, scene, poses, initial, jet, _residual_of)
         check_camera_still(robot, scene.recording, pairs)
-    check_reading(robot, pairs, strict=strict)
+    check_reading(robot, pairs, cameras=names, strict=strict)
     return scene, fit, poses, initial, jet
 
 

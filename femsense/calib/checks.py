@@ -85,25 +85,27 @@ def pairs_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray], residual: 
     return [Pairs(measured[m] - residual[m], measured[m], scene.marker[m], scene.frame[m]) for m in views]
 
 
-def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) -> None:
+def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str] = ("",), strict: bool = True) -> None:
     """Refuse markers that are in another unit, mirrored, or have swapped labels in all frames.
 
     Arguments:
         robot: for the names of its markers.
         pairs: the markers of each camera.
+        cameras: their names.
         strict: also refuse what does not fit for a reason that is not found.
 
     Raises:
         DataError: says what was found and what it looks like.
     """
-    for one in pairs:
+    for one, camera in zip(pairs, cameras):
+        which = f" of camera {camera}" if len(pairs) > 1 else ""
         if len(np.unique(one.marker)) < 4 or one.spread <= 0:
             continue
         plain = rigid_rms(one.modelled, one.measured)
         if plain < SUSPICIOUS * one.spread:
             continue
         found = (
-            f"the markers do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
+            f"the markers{which} do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
             f"mm is left"
         )
         most_fit = float(np.median(np.linalg.norm(one.measured - one.modelled, axis=1))) < SUSPICIOUS * one.spread
@@ -118,7 +120,11 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             raise DataError(f"{found}. {LEFT_HANDED}")
         swapped = _swapped(one, plain)
         if swapped:
-            raise DataError(f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv. {UNNAMED}")
+            alike = [name for name, p in zip(cameras, pairs) if _swapped(p, rigid_rms(p.modelled, p.measured)) == swapped]
+            rows = f", in the rows of camera {' and '.join(alike)}" if which else ""
+            raise DataError(
+                f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv{rows}. {UNNAMED}"
+            )
         if strict and plain > HOPELESS * one.spread:
             raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names? {UNNAMED}")
 

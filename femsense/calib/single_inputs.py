@@ -1,8 +1,9 @@
 """Whether the input of one cable alone is off: its gain and offset, fitted beside poses and a gain of all cables.
 
 To first order about the fit of the files as they stand, for each cable in turn. What the model lacks, a modulus above all, moves
-all cables alike, so that the gain they have in common is fitted with it. The cable that explains most is put right, and counts by
-what a fit then leaves: intervals alone accuse the model's own error (0.985 ± 0.003 for a gain of 1 on the arm of the tests).
+all cables alike, so that the gain they have in common is fitted with it. Of two cables one too weak is then one too strong: each that
+explains much is put right, and the one counts with which a fit leaves least. Intervals alone accuse the model's own error
+(0.985 ± 0.003 for a gain of 1 on the arm of the tests).
 """
 
 from __future__ import annotations
@@ -70,17 +71,17 @@ def check_single_inputs(
         refit: fits another reading.
         said: what is left by another reading that was named already [m].
     """
-    best = min(single_inputs(robot, scene, poses, states), key=lambda one: one.share, default=None)
-    if best is None or best.share * TOLD > 1.0 or not best.is_off:
-        return
-    recording = scene.recording
-    better = replace(recording, inputs=freeze(best.read(recording.inputs)))
-    try:
-        left = _rms(refit(robot, better, scene.frames))
-    except DataError:
-        return
-    before = _rms(residual)
-    if before > TOLD * left and left < said:
+    recording, before = scene.recording, _rms(residual)
+    left, best = np.inf, None
+    for one in single_inputs(robot, scene, poses, states):
+        if one.share * TOLD > 1.0 or not one.is_off:
+            continue
+        better = replace(recording, inputs=freeze(one.read(recording.inputs)))
+        try:
+            left, best = min((left, best), (_rms(refit(robot, better, scene.frames)), one), key=lambda pair: pair[0])
+        except DataError:
+            continue
+    if best is not None and before > TOLD * left and left < said:
         warnings.warn(_text(recording, robot.body.cable_names[best.cable], best, before, left), stacklevel=5)
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from arm import arm, record
+from arm import arm, by_two_cameras, record
 from helpers import DATA, write_block_robot
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.checks import true_labels
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.pose import make_pose, transform_points
 from femsense.io.recording_folder import load_recording
@@ -79,6 +80,16 @@ def test_labels_swapped_in_all_frames_are_named(robot: Robot) -> None:
     with pytest.raises(DataError, match="labels seem swapped") as error:
         calibrate(robot, recorded(robot, seen(robot)[:, [3, 4, 2, 0, 1, 5]]))
     assert "m0 and m3" in str(error.value) and "m1 and m4" in str(error.value)
+
+
+@pytest.mark.parametrize(("swapped", "rows"), [((1,), "camera right"), ((0, 1), "camera left and right")])
+def test_the_cameras_are_named_in_whose_rows_labels_are_swapped(swapped: tuple[int, ...], rows: str) -> None:
+    both = by_two_cameras(record(np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0)]), noise=2e-4)[0])
+    other = np.arange(len(both.marker_names))
+    other[[0, 11]] = other[[11, 0]]
+    index = np.where(np.isin(both.marker_view, swapped), other[both.marker_index], both.marker_index)
+    with pytest.raises(DataError, match=rf"Swap them in markers.csv, in the rows of {rows}\."):
+        calibrate(arm(), replace(both, marker_index=freeze(index, np.int64)))
 
 
 def test_labels_swapped_in_one_frame_are_put_right(robot: Robot) -> None:

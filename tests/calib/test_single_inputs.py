@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -37,6 +38,20 @@ def test_an_offset_of_half_the_range_of_one_cable_is_named_though_little_is_left
 def test_a_gain_of_one_cable_is_named() -> None:
     with pytest.warns(UserWarning, match=r"the input of left alone seems off: times 0\.82 ± "):
         calibrate(arm(), with_inputs(recording().inputs * [1.0, 1.0, 1.25, 1.0]))
+
+
+@pytest.mark.parametrize("gain", [0.6, 0.75, 1.25])
+@pytest.mark.parametrize("which", [0, 2])
+def test_of_two_cables_the_one_is_named_whose_input_is_off(gain: float, which: int) -> None:
+    """Beside the gain in common, one that is too weak is the other that is too strong; a fit with it tells."""
+    pulls = np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0.4, 0, 0.3, 0), (0, 0, 0.9, 0), (0.7, 0, 0.7, 0), (0.2, 0, 0.5, 0)])
+    two = record(pulls, noise=2e-4)[0]
+    spoiled = two.inputs.copy()
+    spoiled[:, which] *= gain
+    with pytest.warns(UserWarning, match=rf"the input of {('up', '', 'left')[which]} alone seems off") as heard:
+        calibrate(arm(), replace(two, inputs=freeze(spoiled)))
+    (read,) = (float(found[1]) for item in heard if (found := re.search(r"off: times (\S+) ±", str(item.message))))
+    assert read == pytest.approx(1.0 / gain, rel=0.12)
 
 
 @pytest.mark.parametrize("modulus", [300e3, 450e3])
