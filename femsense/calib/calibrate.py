@@ -161,9 +161,8 @@ def _fitted(
     """
     scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
     pairs, names = pairs_of(robot, scene, poses, jet.residual), recording.camera_names
-    check_reading(
-        robot, pairs, cameras=names, strict=False
-    )  # first: a mirrored body that is symmetric fits under other labels in single frames
+    # first: a mirrored body that is symmetric fits under other labels in single frames
+    check_reading(robot, pairs, cameras=names, strict=False)
     better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0, strict=strict)
     if changed:
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
