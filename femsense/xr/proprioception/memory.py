@@ -14,7 +14,7 @@ from femsense.core.arrays import FloatArray
 
 SPARSE = 2.0
 """Rows farther apart than so many of the shortest time constant tell its filter too little: errors of an arm were 1.2 times as large at two,
-1.9 times at four."""
+1.9 times at four (a trial)."""
 
 
 def longest_gap(taus: tuple[float, ...]) -> float:
