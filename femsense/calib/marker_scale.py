@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from femsense.calib.joint import root_mean_square
 from femsense.calib.other_readings import TOLD, Refit
 from femsense.calib.single_inputs import fit_by_frames
 from femsense.core.arrays import FloatArray, freeze
@@ -54,7 +55,7 @@ def check_marker_scale(
         jet: where the fit ended, with derivatives.
         refit: fits another reading.
     """
-    before, names = _rms(jet.residual), scene.recording.camera_names
+    before, names = root_mean_square(jet.residual), scene.recording.camera_names
     found: list[tuple[float, MarkerScale, tuple[int, ...]]] = []
     for views in [*((v,) for v in range(len(names))), *([tuple(range(len(names)))] if len(names) > 1 else [])]:
         best = marker_scale(scene, poses, jet, views)
@@ -64,7 +65,9 @@ def check_marker_scale(
         if best is None or not _tells(best):
             continue
         try:
-            found.append((_rms(refit(robot, scaled(scene.recording, views, 1.0 / best.scale), scene.frames)), best, views))
+            found.append(
+                (root_mean_square(refit(robot, scaled(scene.recording, views, 1.0 / best.scale), scene.frames)), best, views)
+            )
         except DataError:
             continue
     left, best, views = min(found, key=lambda one: one[0], default=(before, None, ()))
@@ -127,10 +130,6 @@ def scaled(recording: Recording, views: Sequence[int], scale: float) -> Recordin
     if rest is not None:
         rest = replace(rest, positions=freeze(rest.positions * np.where(np.isin(rest.view, views), scale, 1.0)[:, None]))
     return replace(recording, marker_xyz=freeze(recording.marker_xyz * factor), rest=rest)
-
-
-def _rms(residual: FloatArray) -> float:
-    return float(np.sqrt((residual**2).sum(axis=1).mean()))
 
 
 def _text(which: str, best: MarkerScale, before: float, left: float) -> str:
