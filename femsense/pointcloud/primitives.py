@@ -17,6 +17,8 @@ from femsense.pointcloud.objects import euclidean_clusters
 from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
 
+LONGER = {"cylinder": (True, False, False), "plate": (True, True, False)}
+"""Along which of its axes a shape may go on beyond what was seen of it."""
 Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
 FITS = 4.0
@@ -107,10 +109,10 @@ class Shape:
         return (reach**2 - drop**2) / (2.0 * drop) if drop > FLAT * reach else np.inf
 
     def holds(self, points: FloatArray, std: FloatArray) -> bool:
-        """Return whether points (k, 3) lie on its surface, or on that of a rod that is longer than what was seen of it."""
-        if self.kind != "cylinder":
+        """Return whether points (k, 3) lie on its surface, or on that of a rod or plate that goes on beyond what was seen of it."""
+        if self.kind not in ("cylinder", "plate"):
             return self.kind in ("sphere", "known") and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
-        longer = replace(self, half=np.array([np.inf, self.radius, self.radius]))
+        longer = replace(self, half=np.where(LONGER[self.kind], np.inf, self.half))
         return bool((np.abs(longer.distance(points)) < 3.0 * std + self.std_m).mean() > 0.8)
 
 
@@ -137,7 +139,9 @@ def find_shapes(
         if len(close) < 3:
             continue
         shape = fit(points[close], std[close], origins[close])
-        more = [g for g in left if shape.holds(points[g], std[g])]  # the other end of a rod that passes behind
+        more = [
+            g for g in left if shape.holds(points[g], std[g])
+        ]  # the other end of a rod that passes behind, the table in pieces
         if more:
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])
@@ -146,20 +150,15 @@ def find_shapes(
     return result
 
 
-def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radius_m: float | None = None) -> Shape:
-    """Return the simplest shape that explains points with their noise; "points" where none does.
-
-    Arguments as for `find_shapes`; `radius_m` of a ball that is known.
-    """
+def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
+    """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if len(points) < FEWEST:
         return _raw(points, std)
     thin = slice(None, None, max(1, len(points) // MOST_POINTS))
     points, std, ray = points[thin], std[thin], ray[thin]
-    tried = [_sphere(points, std, ray, radius_m)]
-    if radius_m is None:
-        tried += [_plate(points, std, ray), _cylinder(points, std, ray)]
+    tried = [_sphere(points, std, ray, None), _plate(points, std, ray), _cylinder(points, std, ray)]
     good = [(cost, shape) for cost, shape in tried if shape is not None and cost < FITS]
     if not good:
         return _raw(points, std)

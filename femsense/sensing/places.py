@@ -91,8 +91,6 @@ def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins
         std: noise of each along its ray [m], shape (k,).
         origins: where its ray begins [m], shape (k, 3).
     """
-    if len(tools) == 1 and tools[0].kind == "ball":
-        return fit_shape(points, std, origins, radius_m=tools[0].radius)
     if len(points) < FEWEST:
         return fit_shape(points, std, origins)
     tried = [_fit_of(tool, points, std, origins) for tool in tools]

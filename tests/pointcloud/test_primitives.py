@@ -70,6 +70,18 @@ def test_a_rod_that_passes_behind_something_is_one_object():
     assert shapes[0].kind == "cylinder"
 
 
+def test_a_table_in_pieces_is_one_plate_and_what_stands_over_it_is_not():
+    rng = np.random.default_rng(9)
+    points = np.column_stack([rng.uniform(-0.06, 0.06, (2500, 2)), np.zeros(2500)])
+    points = points[(np.abs(points[:, 0]) > 0.012) & ((np.abs(points[:, 1]) > 0.012) | (points[:, 0] < 0.0))]
+    small = np.column_stack([rng.uniform(-0.004, 0.004, (60, 2)), np.full(60, 0.02)])
+    points, std, origins = seen(np.vstack([points, small]), np.tile([0.0, 0, 1], (len(points) + 60, 1)), rng)
+    shapes = find_shapes(points, std, origins, points[:, 2] + 0.05, local_m=0.2)
+    assert [shape.kind for shape in shapes] == ["plate", "plate"]
+    assert (shapes[0].half[:2] > 0.055).all()  # it reaches from end to end
+    assert abs(shapes[1].center[2] - 0.02) < 1e-3
+
+
 def test_a_plate_that_is_pressed_from_the_side_of_the_camera_touches_with_its_back():
     rng = np.random.default_rng(8)
     points = np.column_stack([rng.uniform(-0.02, 0.02, (400, 2)), np.zeros(400)])

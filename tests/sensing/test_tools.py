@@ -18,6 +18,7 @@ from femsense.model.recording_parts import Tool
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.pipeline import estimate
+from femsense.sensing.places import fit_tool
 
 PLACE = np.array([0.085, 0.0, 0.01])
 INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.5, 0, 0.3, 0]])
@@ -82,3 +83,20 @@ def test_the_mesh_of_a_tool_says_where_it_touches(tmp_path: Path) -> None:
     assert off[0] < 3 * np.linalg.norm(known.position_std_m)
     assert known.force_n == pytest.approx(0.15, rel=0.1)
     assert known.radius_m < unknown.radius_m  # a tip presses on less than what looks like a ball
+
+
+def test_a_table_beside_a_known_ball_is_a_plate():
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([rng.uniform(-0.03, 0.03, (300, 2)), np.zeros(300)])
+    normals = rng.normal(size=(300, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.5]
+    ball = 0.008 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    tools, camera = (Tool("ball", "ball", 0.008),), np.array([0.0, 0.0, 0.4])
+    kinds = []
+    for points in (flat, ball):
+        ray = points - camera
+        noisy = points + NOISE * rng.normal(size=(300, 1)) * ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        shape = fit_tool(tools, noisy, np.full(300, NOISE), np.tile(camera, (300, 1)))
+        kinds.append(shape.kind)
+        off = shape.distance(np.array([[0.0, 0.0, 0.023]])) - (0.023 if points is flat else 0.015)
+        assert abs(float(off[0])) < 3e-4  # what is not completed is known to 6 mm: a body far above it would be touched
+    assert kinds == ["plate", "sphere"]
