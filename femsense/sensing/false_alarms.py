@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.sensing.nuisance import weighed
 from femsense.sensing.prepare import FreeFrame, Prepared
+from femsense.sensing.row_noise import weighed
 from femsense.sensing.search import evidence_of
 from femsense.sensing.types import Sensor
 

@@ -14,6 +14,7 @@ from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera_frame import in_robot_frame
 from femsense.pointcloud.rays import Surface
+from femsense.sensing.row_noise import scattered
 from femsense.sensing.types import Rows, Sensor
 
 FEWEST = 30
@@ -47,11 +48,12 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium, caught: bool) -> R
     missed = np.ones(len(measured), dtype=bool)
     missed[rows.hits.index] = False
     scatter = None if scan.scatter is None else scan.scatter[rows.hits.index]
+    cosine = np.maximum(rows.hits.cosine, 1e-3)
     square = rows.residual**2 + (0.0 if scatter is None else scatter)
     return Rows(
         functional=lambda u: np.asarray(move @ u.reshape(len(u), -1).T),
         residual=rows.residual,
-        std=sensor.knowledge.rough * rows.std,
+        std=scattered(sensor.knowledge, cosine) * rows.std,
         by_pose=rows.by_pose(sensor.pivot, len(poses)),
         place=rest,
         way=np.linalg.norm(rows.hits.place(state.positions) - rest, axis=1),
@@ -64,6 +66,7 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium, caught: bool) -> R
         number=None if scan.count is None else number,
         scatter=scatter,
         facing=facing_of(nodes[rows.hits.nodes]),
+        cosine=cosine,
         missed_number=None if scan.count is None else measured[missed],
     )
 

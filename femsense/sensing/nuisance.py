@@ -16,6 +16,7 @@ from femsense.fem.compliance import Tangent, drive_rows
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera import CameraNoise
 from femsense.model.robot import spread_points
+from femsense.sensing.row_noise import Left, err_together, scatter, slant_of, weighed
 from femsense.sensing.types import Knowledge, Rows, Sensor
 
 CENTRES = 24
@@ -24,8 +25,6 @@ HUBER = 2.5
 """Whitened residuals beyond this count linearly."""
 ASIDE = 2.0
 """Opposite faces count as so many times twice the length of shared errors apart: across an edge nearly nothing is shared."""
-CELL = 0.5
-"""Points within this share of the length of shared errors may err together."""
 OUTLIER = 5.0
 """Where states are compared and a frame is judged, whitened residuals of points beyond this count as this."""
 BIAS_STEPS = 5e-6 * 2.0 ** np.arange(10)
@@ -158,8 +157,9 @@ def learn(
 ) -> Knowledge:
     """Return what free frames teach.
 
-    How many neighbouring points err together and how rough they are; pose, modulus and pulls, and the shared errors: what all frames have of
-    them alike, and the sizes of both, by maximum likelihood over a grid; then how large misfit and nuisance are that free frames leave.
+    How noise grows with incidence, how many neighbouring points err together and how rough they are; pose, modulus and pulls, and the shared errors:
+    what all frames have of them alike, and the sizes of both, by maximum likelihood over a grid; then how large misfit and nuisance are that free
+    frames leave.
 
     Arguments:
         knowledge: what was known before.
@@ -169,13 +169,14 @@ def learn(
     if not frames:
         return knowledge
     first = Prior.of(knowledge, frames[0][1])
-    shown = frames
+    knowledge = replace(knowledge, slant=slant_of(_left(knowledge, frames)))
     for _ in range(2):  # the second time with what the first left
         shown = [(weighed(knowledge, rows), sag) for rows, sag in frames]
         grams = [gram_of(knowledge, rows, sag) for rows, sag in shown]
         knowledge = first.posterior(_fit_field(knowledge, grams, first), grams)
-        rough = knowledge.rough * max(1.0, _scatter(knowledge, shown))
-        knowledge = replace(knowledge, together=_together(knowledge, shown), rough=rough)
+        left = _left(knowledge, shown)
+        rough, together = knowledge.rough * max(1.0, scatter(left)), err_together(left, knowledge.length, HUBER)
+        knowledge = replace(knowledge, together=together, rough=rough)
     knowledge = _alike(knowledge, [gram_of(knowledge, weighed(knowledge, rows), sag) for rows, sag in frames])
     clouds = [(weighed(knowledge, rows), sag) for rows, sag in judged or frames if rows.of_clouds]
     if not clouds:
@@ -254,16 +255,9 @@ def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[fl
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> float:
-    """Return how many points count as one, since a camera matches windows: variance of sums over cells beside that of points that err alone."""
-    sums, squares = 0.0, 0.0
-    for rows, sag in (frame for frame in frames if frame[0].of_clouds):
-        z = np.clip(whitened_rest(knowledge, rows, sag), -HUBER, HUBER)
-        cells = np.floor(rows.place / (CELL * knowledge.length)).astype(np.int64)
-        cells -= cells.min(axis=0)
-        sums += float((np.bincount(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), z) ** 2).sum())
-        squares += float((z**2).sum())
-    return max(1.0, sums / max(squares, 1e-12))
+def _left(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Left:
+    """Return the rows of clouds with what the nuisance leaves of them."""
+    return [(rows, whitened_rest(knowledge, rows, sag)) for rows, sag in frames if rows.of_clouds]
 
 
 def _kernel(knowledge: Knowledge, rows: Rows) -> FloatArray:
@@ -277,17 +271,6 @@ def _kernel(knowledge: Knowledge, rows: Rows) -> FloatArray:
         squared += (ASIDE * knowledge.length * (rows.facing[:, None, i] - knowledge.facing[None, :, i])) ** 2
     weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / knowledge.length**2)
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
-
-
-def weighed(knowledge: Knowledge, rows: Rows) -> Rows:
-    """Return rows as they are to be weighed: rough, and together."""
-    return replace(rows, std=knowledge.rough * rows.std, together=knowledge.together) if rows.of_clouds else rows
-
-
-def _scatter(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> float:
-    """Return how the points of the clouds scatter about what the nuisance fits, in standard deviations (median)."""
-    left = [np.abs(whitened_rest(knowledge, rows, sag)) for rows, sag in frames if rows.of_clouds]
-    return 1.483 * float(np.median(np.concatenate(left))) if left else 1.0
 
 
 def gram_of(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:

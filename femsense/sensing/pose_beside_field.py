@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.sensing.nuisance import Prior, commons, gram_of, weighed
+from femsense.sensing.nuisance import Prior, commons, gram_of
+from femsense.sensing.row_noise import weighed
 from femsense.sensing.types import Knowledge, Rows
 
 

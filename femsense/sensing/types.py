@@ -302,8 +302,8 @@ class Rows:
     """Mean square of the residuals of these about their mean [m²], shape (r,)."""
     facing: FloatArray = field(default_factory=lambda: np.zeros((1, 3)))
     """Outward unit normal of the body at rest there, shape (r, 3); zero for markers."""
-    missed_number: FloatArray | None = None
-    """How many points each of `missed` is, shape (q,); None: each is one."""
+    cosine: FloatArray = field(default_factory=lambda: np.ones(1))  # between ray and face, shape (r,); of clouds
+    missed_number: FloatArray | None = None  # how many points each of `missed` is, shape (q,); None: each is one
 
     @property
     def weight(self) -> FloatArray:
@@ -355,8 +355,8 @@ class Knowledge:
     """χ² of the fitted nuisance over what is expected of it, above which a frame is not explained: a smooth error swallows what touches."""
     through_limit: float = 1.0
     """Share of the points that may lie behind the body on their ray, where colour does not tell the robot's from others."""
-    together: float = 1.0
-    """How many points of a cloud count as one, since neighbours err together."""
+    together: float = 1.0  # how many points of a cloud count as one, since neighbours err together
+    slant: float = 0.0  # power of one over the cosine of incidence with which noise grows beyond what is stated
     alike: float = 0.0
     """Share of the variance of the shared errors that all frames have alike [1]."""
     rough: float = 1.0

@@ -30,6 +30,7 @@ from femsense.sensing.nuisance import (
 )
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import POSE_STD, make_sensor, prepare
+from femsense.sensing.row_noise import weighed
 from femsense.sensing.types import Knowledge, Rows
 
 STD = 3e-4
@@ -98,6 +99,18 @@ def test_outliers_tell_nothing_near_the_answer_but_pull_before():
 def test_points_of_one_window_count_as_one(window):
     learned = learn(knowledge(), [(plate_rows(window, seed), SAG) for seed in range(3)])
     assert learned.together == pytest.approx(window**2, rel=0.25)
+
+
+@pytest.mark.parametrize("grows", [0.0, 1.0])
+def test_noise_that_grows_on_faces_seen_obliquely_is_no_shared_error(grows: float) -> None:
+    slanted = np.where(plate_rows(1).place[:, 0] > 0.13, 0.3, 0.95)  # a side face, and one that looks at the camera
+    frames = [replace(plate_rows(1, seed), std=STD * slanted, cosine=slanted) for seed in range(3)]
+    frames = [replace(rows, residual=rows.residual * slanted ** (1.0 - grows)) for rows in frames]
+    learned = learn(knowledge(), [(rows, SAG) for rows in frames])
+    assert learned.slant == grows
+    np.testing.assert_allclose(weighed(learned, frames[0]).std, STD * slanted ** (1.0 - grows), rtol=0.03)
+    assert learned.bias_m < 2e-5
+    assert misfit(learned, weighed(learned, frames[0]), SAG) == pytest.approx(1.0, abs=0.1)
 
 
 def test_flying_pixels_do_not_say_that_a_frame_is_not_explained():
