@@ -223,14 +223,20 @@ def _moved(pose: np.ndarray, true: np.ndarray, points: np.ndarray) -> np.ndarray
     return np.asarray(local @ pose[:3, :3].T + pose[:3, 3] - points)
 
 
-def summary(rows: list[Row]) -> str:
-    """All cases in one row."""
+def summed(rows: list[Row]) -> Row:
+    """All cases as one."""
     total = Row("all")
     for row in rows:
-        for name in ("true", "resolvable", "missed", "missed_quietly", "extra", "false", "calm"):
+        for name in ("true", "resolvable", "missed", "missed_quietly", "wrong_quietly", "extra", "false", "calm"):
             setattr(total, name, getattr(total, name) + getattr(row, name))
         for name in ("size_error", "vector_error", "place_m", "covered", "over_std", "place_over_std", "over_bound", "bound"):
             getattr(total, name).extend(getattr(row, name))
         total.status.update(row.status)
         total.largest_false_n = max(total.largest_false_n, row.largest_false_n)
+    return total
+
+
+def summary(rows: list[Row]) -> str:
+    """All cases in one row."""
+    total = summed(rows)
     return f"{total.line()}\n{total.deviations()}"

@@ -47,6 +47,9 @@ class Take:
     contacts: list[dict[str, object]] = field(default_factory=list)
     certificates: list[dict[str, float]] = field(default_factory=list)
     marker_rows: list[str] = field(default_factory=list)
+    markers: list[Array] = field(default_factory=list)
+    """Where the markers are in each frame [m]."""
+    object_color: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, plain: bool = False) -> dict[str, object]:
@@ -90,6 +93,9 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
             "least_energy_curvature_j": min((c["energy_curvature_j"] for c in take.certificates), default=0.0),
         },
         "markers_m": {k: listed(v) for k, v in markers.items()},
+        "ground_m": body.ground,
+        "object_rgb": listed(take.object_color),
+        "marker_positions_m": [listed(places) for places in take.markers],
         "made_in_s": round(time.perf_counter() - begin, 1),
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
@@ -198,7 +204,7 @@ def _film(
     rng: np.random.Generator,
 ) -> None:
     """Clouds or images, markers, the places on the deformed body and what the camera could tell of the forces."""
-    color = COLORS[OBJECT][rng.integers(len(COLORS[OBJECT]))]
+    color = take.object_color = COLORS[OBJECT][rng.integers(len(COLORS[OBJECT]))]
     where = problem.solid.rows(np.stack(list(markers.values())))
     for frame, state in enumerate(take.states):
         here = [c for c in take.contacts if c["frame"] == frame]
@@ -215,8 +221,9 @@ def _film(
             write_images(folder, frame, z, picture, 1e-4)
         else:
             write_cloud(folder / "clouds" / f"{frame:06d}.ply", z, picture, (shot.kind != 2) | (rng.random(z.size) < TABLE_SHARE))
+        places = np.asarray(where @ state.x)
+        take.markers.append(places)
         if frame < FREE:
-            places = np.asarray(where @ state.x)
             visible = seen(camera, places, shot)
             visible |= visible.sum() < 4
             noisy = camera.to_camera(places) + rng.normal(scale=MARKER_STD_M, size=places.shape)
@@ -233,6 +240,8 @@ def _film(
             "kind": one.item.kind,
             "hidden": one.touch.hidden,
             "patch_radius_m": one.radius,
+            "object_radius_m": one.item.radius,
+            "along": listed(one.along),
         }
 
 

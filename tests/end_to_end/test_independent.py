@@ -18,8 +18,12 @@ from independent.equilibrium import Problem  # noqa: E402
 from independent.grade import grade  # noqa: E402
 from independent.make import make  # noqa: E402
 from independent.solid import Cable, Load, Solid  # noqa: E402
+from independent.twin import apart, inputs_apart, script_of, truth_of  # noqa: E402
+
+from femsense import load_robot, simulate  # noqa: E402
 
 YOUNG, SIDE, LENGTH = 450e3, 0.02, 0.1
+SLIDE = Case("slide", "arm", (Touch(tangent=0.3, slide_m=0.02),), camera="tof", images=True)
 
 
 def _cantilever(kind: str, *, poisson: float = 0.0) -> Solid:
@@ -95,8 +99,7 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy() -> None:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple:
     folder = tmp_path_factory.mktemp("independent")
-    case = Case("slide", "arm", (Touch(tangent=0.3, slide_m=0.02),), camera="tof", images=True)
-    return folder, make(case, folder, 5)
+    return folder, make(SLIDE, folder, 5)
 
 
 def _inspect(path) -> dict:
@@ -122,6 +125,21 @@ def test_what_it_says_of_a_case_is_whole(made: tuple) -> None:
     first, last = truth["contacts"][0], truth["contacts"][-1]
     assert np.linalg.norm(np.subtract(first["rest"], last["rest"])) == pytest.approx(0.02, rel=0.1)
     assert np.dot(first["force"], first["normal"]) < 0
+
+
+def test_the_rig_makes_the_same_scene(made: tuple, tmp_path) -> None:
+    folder, truth = made
+    script = script_of(SLIDE, folder)
+    script["truth"]["refinements"], script["clouds"] = 0, {"kind": "none"}
+    simulate(load_robot(folder / "robot"), script, tmp_path / "recording")
+    there = truth_of(tmp_path, truth)
+    assert inputs_apart(folder / "recording", tmp_path / "recording") < 1e-6
+    free, touched = apart(truth, there)
+    assert free.max() < 2e-4 and touched.max() < 2e-4  # it moves by 10 mm, on meshes that differ
+    for mine, yours in zip(truth["contacts"], there["contacts"], strict=True):
+        assert mine["force"] == pytest.approx(yours["force"], abs=1e-6)
+        assert np.linalg.norm(np.subtract(mine["point"], yours["point"])) < 1e-3
+        assert np.dot(mine["normal"], yours["normal"]) > 0.995
 
 
 def test_the_grader_sees_an_error_a_miss_and_a_false_contact(tmp_path) -> None:
