@@ -49,6 +49,9 @@ def main() -> None:
     ask.add_argument("out", type=Path)
     ask.add_argument("--seed", type=int, default=1)
     ask.add_argument("--case", action="append", default=[], metavar="NAME", help=f"may be repeated; else {', '.join(ASKED)}")
+    ask.add_argument(
+        "--by-length", action="store_true", help="of cases by lengths of cables, give these to the rig in place of the tensions"
+    )
     given = ask.parse_args()
     print(
         "| case | made by | bound | error of force, median | 95th percentile | place | missed (quiet) | false | within 95 % | ok | markers apart |"
@@ -58,21 +61,21 @@ def main() -> None:
         if case.name in (given.case or ASKED):
             if not {touch.kind for touch in case.touches} <= KINDS:
                 ask.error(f"{case.name}: an object that one of them has not")
-            _both(case, given.out / case.name, given.seed)
+            _both(case, given.out / case.name, given.seed, given.by_length and case.control == "displacement")
 
 
-def _both(case: Case, folder: Path, seed: int) -> None:
+def _both(case: Case, folder: Path, seed: int, by_length: bool) -> None:
     """Make a case twice where it is not there yet, run and grade both, and print their rows."""
-    other, rig = folder / "independent", folder / "rig"
+    other, rig = folder / "independent", folder / ("rig-by-length" if by_length else "rig")
     if not (other / "truth.json").exists():
         make(case, other, seed, diamond=DIAMOND)
     truth = json.loads((other / "truth.json").read_text(encoding="utf-8"))
     if not (rig / "truth.json").exists():
-        _simulated(case, other, rig)
+        _simulated(case, other, rig, by_length)
         (rig / "truth.json").write_text(json.dumps(truth_of(rig, truth)), encoding="utf-8")
     free, touched = apart(truth, json.loads((rig / "truth.json").read_text(encoding="utf-8")))
     assert inputs_apart(other / "recording", rig / "recording") < 1e-6
-    for made, name in ((other, "independent"), (rig, "rig")):
+    for made, name in ((other, "independent"), (rig, "rig, by lengths" if by_length else "rig")):
         note = run(made, timeout=1800.0) if not (made / "run" / "frames.csv").exists() else ""
         row = grade(made / "run", made / "truth.json", note=note)
         bound = f"{100 * np.median(row.bound):.1f} %" if row.bound else "–"
@@ -81,17 +84,17 @@ def _both(case: Case, folder: Path, seed: int) -> None:
         print(f"| `{case.name}` | {name} | {bound} | {row.cells()} | {ok} | {surfaces} |", flush=True)
 
 
-def _simulated(case: Case, other: Path, rig: Path) -> None:
+def _simulated(case: Case, other: Path, rig: Path, by_length: bool) -> None:
     """Make the recording of a case by the rig."""
     shutil.rmtree(rig, ignore_errors=True)
     rig.mkdir(parents=True)
     shutil.copytree(other / "robot", rig / "robot")
-    script = script_of(case, other)
+    script = script_of(case, other, by_length=by_length)
     began = time.perf_counter()
     simulate(load_robot(rig / "robot"), script, rig / "recording")
     (rig / "script.json").write_text(json.dumps(script | {"made_in_s": time.perf_counter() - began}), encoding="utf-8")
     _seen_alike(
-        case, rig / "recording", np.array(script["camera"]["T_robot_camera"]), script["scene"]["floor_z_m"], script["seed"]
+        case, other, rig / "recording", np.array(script["camera"]["T_robot_camera"]), script["scene"]["floor_z_m"], script["seed"]
     )
 
 

@@ -176,9 +176,10 @@ def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str)
         row.vector_error.append(float(np.linalg.norm(_vector(answer, "fx_n", "fy_n", "fz_n") - one["force"])) / size)
         row.place_m.append(float(far[i, pairs[i]]))
         row.over_bound.append(abs(error) / size / one["bound_rel"])
-        if answer.get("std_n"):
-            row.covered.append(abs(error) <= 1.96 * float(answer["std_n"]))
-            row.over_std.append(error / float(answer["std_n"]))
+        std = float(answer.get("std_n") or 0.0)
+        if std > 0.0:  # none is said where it is not known
+            row.covered.append(abs(error) <= 1.96 * std)
+            row.over_std.append(error / std)
             spread = float(np.linalg.norm([float(answer.get(name) or 0.0) for name in ("x_std_m", "y_std_m", "z_std_m")]))
             row.place_over_std.append(float(far[i, pairs[i]]) / max(spread, 1e-9))
             row.wrong_quietly += abs(error) > WRONG * size and not row.covered[-1] and status == "ok"

@@ -22,21 +22,24 @@ KINDS = {"ball", "rod"}
 """What both programs have: a plate is round there and a box here."""
 
 
-def script_of(case: Case, folder: Path) -> dict[str, Any]:
+def script_of(case: Case, folder: Path, *, by_length: bool = False) -> dict[str, Any]:
     """Return the script of the scene of a case that lies in a folder: tensions, camera, objects, and each force as it was, frame by frame.
 
     Where the case gives lengths of cables, the scene is that of its tensions: the end of a cable sinks deeper into a finer mesh, so that the same length
-    pulls less there.
+    pulls less there. `by_length`: it is that of the lengths.
     """
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     names = list(truth["initial_tension_n"])
     zero = truth["initial_tension_n"] if case.zero == "unknown" else dict.fromkeys(names, 0.0)
     inputs = {name: (np.array(truth["tension_n"])[:, i] - zero[name]).tolist() for i, name in enumerate(names)}
+    if by_length:
+        frames = _rows(folder / "recording" / "frames.csv")
+        inputs = {name: [float(row[f"cable_{name}"]) for row in frames] for name in names}
     first = {c["contact"]: c for c in reversed(truth["contacts"])}
     return {
         "format": "femsense-script-1",
         "seed": truth["seed"],
-        "actuation": "tension",
+        "actuation": "displacement" if by_length else "tension",
         "actuation_zero": case.zero,
         "initial": zero,
         "dt_s": RATE_S,
