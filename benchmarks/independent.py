@@ -1,6 +1,6 @@
 """Recordings of touched soft robots by an independent generator, and how far the program's forces are from their truth.
 
-    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--diamond FOLDER]
+    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--law] [--diamond FOLDER]
     python benchmarks/independent.py --list
 
 Below OUT, each case has `robot/`, `recording/` and `truth.json`; with `--run` the installed `femsense` calibrates and estimates
@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 
 from independent.cases import CASES
+from independent.declared import declare_law
 from independent.grade import grade, heading, run, summary
 from independent.make import make
 
@@ -35,6 +36,7 @@ def main() -> int:
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
     ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest")
+    ask.add_argument("--law", action="store_true", help="with --run: the robot declares the law of the truth")
     ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
     ask.add_argument("--list", action="store_true", help="name the cases")
     given = ask.parse_args()
@@ -61,8 +63,9 @@ def main() -> int:
                 flush=True,
             )
         if given.run:
-            note = run(folder, at=given.at, timeout=given.timeout)
-            row = grade(folder / ("run-at" if given.at else "run"), folder / "truth.json", note=note)
+            asked = declare_law(folder, folder / "law") if given.law else folder
+            note = run(asked, at=given.at, timeout=given.timeout)
+            row = grade(asked / ("run-at" if given.at else "run"), folder / "truth.json", note=note)
             rows.append(row)
             print(heading() if len(rows) == 1 else "", end="\n" if len(rows) == 1 else "")
             print(row.line(), flush=True)

@@ -1,4 +1,4 @@
-"""A recording whose camera's pose is declared, and somewhat off, in place of one that markers tell."""
+"""The same recording with more declared: its camera's pose, somewhat off, in place of what markers tell; or the law of its truth."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .bodies import listed
+
+
+def declare_law(case: Path, folder: Path) -> Path:
+    """Write a case again whose robot declares the law of the truth, neo-Hookean; return its folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(case / "robot", folder / "robot")
+    with (folder / "robot" / "robot.toml").open("a", encoding="utf-8") as text:
+        text.write('\n[[effects]]\nname = "hyperelastic"\nlaw = "neo_hookean"\n')
+    (folder / "recording").symlink_to((case / "recording").resolve())
+    shutil.copy(case / "truth.json", folder)
+    return folder
 
 
 def declare(case: Path, folder: Path, turn_deg: float, shift_m: float, seed: int) -> None:
