@@ -141,12 +141,15 @@ def arm(rng: np.random.Generator) -> Body:
 
 
 def diamond(rng: np.random.Generator, folder: Path) -> Body:
-    """The four-leg robot of `folder`; truth: the same surface, P2, some tetrahedra bisected, inner nodes moved."""
+    """The four-leg robot of `folder`; truth: the same surface, P2, each tetrahedron in eight, some bisected before, inner nodes moved.
+
+    On its legs a tetrahedron or two are all there is across: in its own mesh this truth was 6 % stiffer to its weight.
+    """
     mesh = meshio.read(folder / "diamond.vtu")
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     points = mesh.points * 1e-3 @ turn.T + np.array([0, 0, 0.035])
     tets = _upright(points, mesh.cells_dict["tetra"].astype(np.int64))
-    truth = _other(points, tets, rng, share=0.003)
+    truth = _other(points, tets, rng, share=0.003).refined()
     tendons = []
     surface = _surface(points, tets)
     for name, x, y in (("north", 0, 1), ("west", -1, 0), ("south", 0, -1), ("east", 1, 0)):

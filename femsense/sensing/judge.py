@@ -58,7 +58,8 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     carrying = np.unique([node for touch in fit.touches for node in touch.patch.nodes])
     squeezed = least_stretch(sensor.robot.body.mesh, fit.state.positions, carrying)
     if squeezed < SQUEEZED:
-        return f"squeezed to {100 * max(squeezed, 0.0):.0f} % under a contact, beyond what law and mesh hold: finer mesh, effect hyperelastic"
+        other = ", effect hyperelastic" if sensor.robot.body.material.law == "corotational" else ""
+        return f"squeezed to {100 * max(squeezed, 0.0):.0f} % under a contact, beyond what law and mesh hold: finer mesh{other}"
     left = left_over(sensor, fit)
     if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
