@@ -206,7 +206,7 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
         done.states.append(frame.state.positions)
         named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
         done.last = replace(frame, contacts=named) if trusted(frame) else _under_inputs(frame)
-    except FemsenseError as error:
+    except (FemsenseError, np.linalg.LinAlgError) as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)
 
@@ -250,14 +250,15 @@ def _named(done: Done, contacts: Sequence[ContactForce]) -> list[ContactForce]:
     return result
 
 
-def _failed(sensor: Sensor, k: int, error: FemsenseError) -> FrameReport:
+def _failed(sensor: Sensor, k: int, error: Exception) -> FrameReport:
+    what = f"its equations have no solution: {error}" if isinstance(error, np.linalg.LinAlgError) else str(error)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     nan = float("nan")
     body = sensor.robot.body
     return FrameReport(
         number,
         stamp,
-        " ".join(str(error).split()),
+        " ".join(what.split()),
         0,
         0,
         nan,

@@ -6,13 +6,14 @@ from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import MissingDependency
 
 AXES = "xyz"
 NOISE = 3.0
-"""A force of less than so many standard deviations noise may make: no contact is counted for it, and the page draws it no long arrow."""
+"""What is less than so many standard deviations noise may make."""
 
 
 class RunLike(Protocol):
@@ -38,7 +39,18 @@ def positions_of(run: RunLike) -> FloatArray:
 
 def sensed(contacts: Iterable[Any]) -> list[Any]:
     """Return the contacts whose force is more than noise may make: a given place without a force is no contact."""
-    return [contact for contact in contacts if contact.force_n > 0.0 and not contact.force_n < NOISE * contact.std_n]
+    return [c for c in contacts if more_than_noise(c.force_n, c.std_n, c.force_n_xyz, c.force_std_n_xyz)]
+
+
+def more_than_noise(size_n: npt.ArrayLike, std_n: npt.ArrayLike, force_n: FloatArray, force_std_n: FloatArray) -> BoolArray:
+    """Return whether forces are away from zero by NOISE deviations: their sizes (k,), or one of their components (k, 3).
+
+    A slender body tells well what bends it and hardly what acts along it. Its contacts may be sure while their sizes are not. Components
+    without a deviation (0 or nan) say nothing.
+    """
+    size_n = np.asarray(size_n)
+    component = (np.abs(force_n) >= NOISE * force_std_n) & (force_std_n > 0.0)
+    return np.asarray((size_n > 0.0) & (~(size_n < NOISE * np.asarray(std_n)) | component.any(axis=-1)))
 
 
 def count_of(run: RunLike) -> int:

@@ -839,7 +839,8 @@ def test_a_run_in_which_every_frame_failed(tmp_path: Path) -> None:
 def test_rows_that_noise_may_make_are_not_listed_as_contacts_but_counted(tmp_path: Path) -> None:
     write_run_folder(tmp_path, frames=3)
     rows = "".join(
-        f"{k},{0.1 * k},0,0,0,0,0,0,1,0,0,{size},{size},0.1,given,0,,,,,,,\n" for k, size in enumerate((0.0, 0.2, 1.5))
+        f"{k},{0.1 * k},0,0,0,0,0,0,1,0,0,{size},{size},0.1,given,0,,,,,,,{std}\n"
+        for k, (size, std) in enumerate(((0.0, ""), (0.2, 0.07), (1.5, "")))
     )
     (tmp_path / "contacts.csv").write_text(f"{CONTACT_HEADER}\n{rows}", encoding="utf-8")
     text = report(tmp_path).text

@@ -213,6 +213,22 @@ def test_a_cloud_that_is_no_cloud_is_reported(seen, tmp_path):
     assert run.frames[3].status == "ok"
 
 
+class _Singular(type(Path())):
+    """A cloud in whose frame a system of equations is singular."""
+
+    @property
+    def suffix(self):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+
+def test_a_frame_whose_equations_have_no_solution_is_reported_and_the_rest_goes_on(seen):
+    files = (*seen.cloud_files[:2], (_Singular(seen.cloud_files[2][0]),), seen.cloud_files[3])
+    touched_there = replace(seen, cloud_files=files, free=np.array([True, True, False, False]))
+    run = estimate(arm(), touched_there, calibrate(arm(), seen))
+    assert run.frames[2].status == "its equations have no solution: Singular matrix"
+    assert run.frames[3].status == "ok"
+
+
 def test_the_motor_tensions_are_reported(seen):
     run = estimate(arm(), seen, calibrate(arm(), seen))
     assert run.frames[3].tension_n == pytest.approx(dict(zip(NAMES, INPUTS[3])))

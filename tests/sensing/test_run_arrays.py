@@ -16,7 +16,7 @@ from femsense.core.errors import InputError
 from femsense.report.text import run_document, run_text
 from femsense.rig.truth_files import CONTACT_COLUMNS
 from femsense.sensing.comparison import TrueContact, read_truth
-from femsense.sensing.run_arrays import tracks_of
+from femsense.sensing.run_arrays import sensed, tracks_of
 from femsense.sensing.types import Run
 
 
@@ -101,6 +101,14 @@ def test_forces_that_noise_may_make_are_no_contacts(run: Run) -> None:
     assert np.isfinite(found.force_shares).all()
     assert "1 contact, up to 1 N" in repr(ramp) and "no contact" in repr(replace(run, contacts=tuple(felt[:2])))
     assert (run_document(ramp)["contacts"], run_document(ramp)["frames_with_contact"]) == (1, 1)
+
+
+def test_a_contact_that_one_component_tells_surely_is_one(run: Run) -> None:
+    """What bends a finger is known well, what pulls along it hardly: its size is 2.3 deviations, one component 14."""
+    bent = {"force_n_xyz": np.array([-0.14, 0.0, 0.02]), "force_n": 0.141, "std_n": 0.06}
+    sure = replace(run.contacts[0], **bent, force_std_n_xyz=np.array([0.01, 0.01, 0.4]))
+    unsure, untold = replace(sure, force_std_n_xyz=np.array([0.06, 0.06, 0.4])), replace(sure, force_std_n_xyz=np.zeros(3))
+    assert sensed([sure, unsure, untold]) == [sure]
 
 
 def test_a_truth_of_another_recording_or_robot_is_refused(run: Run, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.io.tables import Table, read_csv
-from femsense.sensing.run_arrays import NOISE
+from femsense.sensing.run_arrays import more_than_noise
 from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS
 
 
@@ -28,12 +28,14 @@ class ContactTable:
     """shape (k, 3)."""
     size_n: FloatArray
     std_n: FloatArray
+    force_std_n: FloatArray
+    """shape (k, 3), nan where it is not there."""
     source: tuple[str, ...]
 
     @property
     def sensed(self) -> npt.NDArray[np.bool_]:
         """Whose force is more than noise may make."""
-        return np.asarray((self.size_n > 0.0) & ~(self.size_n < NOISE * self.std_n))
+        return more_than_noise(self.size_n, self.std_n, self.force_n, self.force_std_n)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -67,6 +69,8 @@ def read_contacts(file: Path) -> ContactTable:
     table_ = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
     values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
     frames = table_.integers("frame")
+    told = [name for name in MORE_CONTACT_COLUMNS[-3:] if name in table_.columns]
+    deviations = table_.numbers(told, empty_is_nan=True) if len(told) == 3 else np.full((len(frames), 3), np.nan)
     return ContactTable(
         frames,
         _identities(table_, frames),
@@ -75,6 +79,7 @@ def read_contacts(file: Path) -> ContactTable:
         values[:, 7:10],
         values[:, 10],
         values[:, 11],
+        deviations,
         table_.text("source"),
     )
 
