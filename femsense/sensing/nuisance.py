@@ -169,7 +169,7 @@ def learn(
     if not frames:
         return knowledge
     first = Prior.of(knowledge, frames[0][1])
-    knowledge = replace(knowledge, slant=slant_of(_left(knowledge, frames)))
+    knowledge = replace(knowledge, slant=slant_of(knowledge, _left(knowledge, frames)))
     for _ in range(2):  # the second time with what the first left
         shown = [(weighed(knowledge, rows), sag) for rows, sag in frames]
         grams = [gram_of(knowledge, rows, sag) for rows, sag in shown]

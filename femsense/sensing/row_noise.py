@@ -33,15 +33,17 @@ def weighed(knowledge: Knowledge, rows: Rows) -> Rows:
     return replace(rows, std=scattered(knowledge, rows.cosine) * rows.std, together=knowledge.together)
 
 
-def slant_of(left: Left) -> float:
+def slant_of(knowledge: Knowledge, left: Left) -> float:
     """Return the power of one over the cosine that is likeliest for how points scatter, each with its own size of the noise (Laplace's likelihood, which
     heavy tails hardly move: n log Σ |z| cosᵖ − p Σ log cos).
 
     Where noise is larger than stated on faces that are seen obliquely, it looks like shared errors of millimetres: as it is stated alone, forces on
     an arm before a time-of-flight camera were 12.5 % off in place of 2.1 % (median; `arm-slide` of `benchmarks/twins.py`).
     """
-    if not left:
-        return SLANTS[0]
+    if not left or any(noise.kind != "tof" for noise in knowledge.noises):
+        return SLANTS[
+            0
+        ]  # by stereo, what grows there is an error of the model: taken for noise, forces on `diamond-normal` became 2.3 % off from 1.2 %
     z = np.abs(np.concatenate([rest for _, rest in left]))
     cosine = np.concatenate([np.broadcast_to(rows.cosine, rest.shape) for rows, rest in left])
 
