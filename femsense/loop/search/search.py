@@ -20,7 +20,7 @@ from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import hinted, select_next
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
-from femsense.loop.search.swaps import instead_of_offsets, swapped
+from femsense.loop.search.swaps import instead_of_offsets, predicting_best, swapped
 from femsense.model.recording import state_key
 
 
@@ -41,7 +41,10 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
         _seek(course, checkpoint, say)
     data, history, noise = course.data, course.history, course.noise
     assert noise is not None
-    fitted, refits, before = course.fitted, course.refits, course.before
+    refits, before = course.refits, course.before
+    if course.holds_error:
+        history, refits = predicting_best(data, history, refits, course.table, noise, course.n_effective, say)
+    fitted = history[-1][1]
     most = _most_effects(data)
     swap = instead_of_offsets(data, fitted, course.names, noise, course.n_effective, say) if most else None
     if swap is not None:

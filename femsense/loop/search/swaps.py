@@ -1,6 +1,6 @@
 """What is named is asked again: of each effect, when another one was found, whether it is still needed, and whether another one, or it itself elsewhere,
-is better in its place; of the input offsets, at the end, what explains better what they took. What is named first, or fitted along with everything, may have
-won by what it took of what was still missing.
+is better in its place; at the end, of the input offsets what explains better what they took, and of effects that may stand for one another beside an error of
+the model which predicts better. What is named first, or fitted along with everything, may have won by what it took of what was still missing.
 """
 
 from __future__ import annotations
@@ -42,19 +42,71 @@ def swapped(
         alternatives = _alternatives(data, fitted, refits, name)
         if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
-        say(f"refitting {' or '.join(alternatives)} in the place of {name}")
-        try:
-            without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-            best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, say)
-            if best is not None:
-                history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
-        except FemsenseError:
-            continue
-        if best is not None:
-            refits = [replace(r, verdict=PASSES) if r.name == name and r.is_named else r for r in refits]
-            records = [replace(r, verdict=NAMED) if r is best.record else r for r in records]
-        refits = [*refits, *at_step(records, len(history) - 1)]
+        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, say)
     return history, refits
+
+
+def stand_ins(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequence[Candidate]) -> list[RefitRecord]:
+    """Return the refits that pass on top of the same model as a named one's, and for which nothing is left beside what is named, by the last screening."""
+    left = {c.effect.name for c in table if c.score > 0.0}
+    return [r for r in refits if r.passes and r.answers_as(own) and r.name not in left]
+
+
+def predicting_best(
+    data: Data,
+    history: History,
+    refits: list[RefitRecord],
+    table: Sequence[Candidate],
+    noise: Noise,
+    n_effective: float,
+    say: Progress,
+) -> tuple[History, list[RefitRecord]]:
+    """Return a history and its refits with each effect replaced by one that may stand for it and predicts held-out data better.
+
+    This is for weights that hold the error of the model: how far an effect is ahead then says how well it makes up for that error where fitted, too.
+    """
+    for name in [name for name, _ in history[1:]]:
+        named = history[-1][1].fit.hypothesis.names
+        own = next((r for r in reversed(refits) if r.name == name and r.is_named), None)
+        others = [] if own is None else sorted(stand_ins(own, refits, table), key=_held_rms)
+        better = [r.name for r in others if r.name not in named and own is not None and _held_rms(r) < _held_rms(own)]
+        if better:
+            best = list(dict.fromkeys(better))[: data.effort.alternatives]
+            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, say, by_held_out=True)
+    return history, refits
+
+
+def _held_rms(r: RefitRecord) -> float:
+    """Return the held-out error of a refit [m]; inf where it has none."""
+    return np.inf if r.validation_rms_m is None else r.validation_rms_m
+
+
+def _exchanged(
+    data: Data,
+    history: History,
+    refits: list[RefitRecord],
+    name: str,
+    alternatives: list[str],
+    noise: Noise,
+    n_effective: float,
+    say: Progress,
+    *,
+    by_held_out: bool = False,
+) -> tuple[History, list[RefitRecord]]:
+    """Return a history with the best alternative in the place of an effect where it is better, by evidence or on held-out data; and the refits."""
+    fitted = history[-1][1]
+    say(f"refitting {' or '.join(alternatives)} in the place of {name}")
+    try:
+        without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
+        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, say, by_held_out)
+        if best is not None:
+            history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
+    except FemsenseError:
+        return history, refits
+    if best is not None:
+        refits = [replace(r, verdict=PASSES) if r.name == name and r.is_named else r for r in refits]
+        records = [replace(r, verdict=NAMED) if r is best.record else r for r in records]
+    return history, [*refits, *at_step(records, len(history) - 1)]
 
 
 def _if_needless(
@@ -108,6 +160,7 @@ def _better(
     noise: Noise,
     n_effective: float,
     say: Progress,
+    by_held_out: bool,
 ) -> tuple[Refit | None, list[RefitRecord]]:
     """Return the best alternative if it is better than what is named, and what became of each."""
     table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *alternatives]), n_effective)
@@ -119,6 +172,9 @@ def _better(
     asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, say)
     passing = [r for r in asked if r.record.passes]
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
+    if by_held_out:
+        best = min(passing, key=lambda r: r.fitted.held_rms, default=None)
+        return (best if best is not None and best.fitted.held_rms < fitted.held_rms else None), records
     best = max(passing, key=lambda r: r.score, default=None)
     return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
 

@@ -13,6 +13,7 @@ from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.search.input_offset import OFFSETS
 from femsense.loop.search.screening import confounding, one_each
 from femsense.loop.search.search_state import Search
+from femsense.loop.search.swaps import stand_ins
 from femsense.loop.thresholds import Thresholds
 
 
@@ -63,7 +64,7 @@ def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> It
     for own in ours:
         for r in search.refits:
             if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - decides.evidence:
-                yield ConfoundedPair((own.name, r.name), dbic_gap=own.evidence - r.evidence)
+                yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
     for name in (n for n in names if n in NUISANCE):
         for r in (r for r in search.refits if name in (r.takes_over or ()) and r.name not in names):
             ahead = max((own.evidence for own in ours if own.answers_as(r)), default=0.0)
@@ -79,11 +80,10 @@ def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresho
     one is ahead then says how well it makes up for that error, too."""
     if search.noise.assumed is None:
         return
-    left = {c.effect.name for c in search.last if c.score > 0.0}
     for own in _named(search, names):
-        for r in search.refits:
-            if r.passes and r.answers_as(own) and r.name not in left and r.name not in names:
-                yield ConfoundedPair((own.name, r.name), dbic_gap=own.evidence - r.evidence)
+        for r in stand_ins(own, search.refits, search.last):
+            if r.name not in names:
+                yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
 
 
 def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:

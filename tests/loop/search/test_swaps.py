@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
+from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
@@ -19,8 +20,8 @@ from femsense.loop.search.forward_selection import polished, richer_fit, select_
 from femsense.loop.search.location_search import closer, without_last
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
-from femsense.loop.search.search import scored
-from femsense.loop.search.search_state import Refit
+from femsense.loop.search.search import scored, search_effects
+from femsense.loop.search.search_state import Refit, SearchProgress
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import find_effect
@@ -79,6 +80,53 @@ def test_what_is_right_keeps_its_place():
     assert {name for name, _ in history} == {"", "payload", "cable_gain"}  # perhaps at a better place
     assert history[-1][1].fit.chi2 <= second.fit.chi2
     assert not any(r.is_named for r in refits if r.name == "gravity")
+
+
+LARGE_GAIN = {"name": "cable_gain", "scale": {"up": 1.5}}
+ERROR = {"name": "payload", "point_m": [0.05, 0.0, 0.01], "force_n": [0.02, 0.05, 0.04]}
+
+
+def beside_an_error(*, held_out_too: bool) -> tuple[Data, FittedModel]:
+    """Return data with a gain, and an error of the model that a payload makes up for: where they are fitted, or held out too."""
+    robot, (inputs, labels) = arm((4, 1, 1)), sweeps(each=1)
+    fitted, plain = (
+        record(inputs, labels=labels, truth=robot, effects=effects)[0] for effects in ([ERROR, LARGE_GAIN], [LARGE_GAIN])
+    )
+    data = replace(prepare(robot, [fitted], [fitted if held_out_too else plain]), thresholds=LENIENT)
+    hypothesis, prior = with_nuisance(data)
+    return data, fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+
+
+@pytest.mark.parametrize("held_out_too", [False, True])
+def test_beside_an_error_of_the_model_what_predicts_held_out_data_takes_the_place_of_what_explains_more(held_out_too: bool):
+    data, base = beside_an_error(held_out_too=held_out_too)
+    named, own = added(data, base, "payload", 1)
+    _, other = added(data, base, "cable_gain", 1)
+    other = replace(other, verdict=PASSES)
+    assert own.evidence > other.evidence + 10.0
+    history = [("", base), ("payload", named)]
+    course = SearchProgress(
+        data,
+        data,
+        base,
+        history,
+        1,
+        named,
+        base,
+        [],
+        False,
+        [own, other],
+        noise=NOISE,
+        n_effective=COUNT,
+        over=True,
+        holds_error=True,
+    )
+    _, search = search_effects(course, Checkpoint(None), lambda text: None)
+    assert [name for name, _ in search.history] == ["", "payload" if held_out_too else "cable_gain"]
+    assert search.final.held_rms <= named.held_rms and search.final.fit is search.history[-1][1].fit
+    said = {(r.name, r.in_place_of): r.verdict for r in search.refits}
+    if not held_out_too:
+        assert said["cable_gain", "payload"] == NAMED and said["payload", None] == said["payload", "payload"] == PASSES
 
 
 def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_are():

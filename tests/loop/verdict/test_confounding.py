@@ -71,6 +71,14 @@ def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_
     assert not confounded(searched(refits), ["payload"], DEFAULTS)  # by the noise, evidence tells them apart
 
 
+def test_what_took_the_place_of_more_evidence_is_not_told_from_it() -> None:
+    payload = refit("payload", 200.0, in_place_of="payload")  # ahead, but it predicts held-out data worse
+    density = refit("density", 80.0, "named", in_place_of="payload")
+    pairs = confounded(searched([refit("payload", 200.0), payload, density], errs=True), ["density"], DEFAULTS)
+    assert [(p.pair, p.dbic_gap) for p in pairs] == [(("density", "payload"), 0.0)]
+    assert in_words(pairs, ["density"], DEFAULTS) == " These data do not tell density from payload."
+
+
 def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> None:
     fields = [
         candidate(name, *f)
