@@ -100,9 +100,14 @@ def beam_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
 
 
 def arm_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
-    """Return the two days of the arm."""
-    days = [(i, day) for i, day in enumerate(arm.MIDDLES_MM, 1) if not ways or i in ways]
-    return [Asked(day, *arm.make(out / f"way-{i}", data, day)) for i, day in days]
+    """Return the two days of the arm, without other laws of the material, and then with them: under these its chambers blow up,
+    and each state takes many steps."""
+    asked = [(day, options) for options in (["--without", "hyperelastic"], []) for day in arm.MIDDLES_MM]
+    chosen = [(i, *one) for i, one in enumerate(asked, 1) if not ways or i in ways]
+    return [
+        Asked(day + (", the declared law" if options else ""), *arm.make(out / f"way-{i}", data, day), options)
+        for i, day, options in chosen
+    ]
 
 
 SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] = {

@@ -14,7 +14,7 @@ class Work:
     """How much was done, in states."""
 
     equilibria: int = 0
-    """Equilibria that were solved."""
+    """Equilibria that were solved, those on the way to a load included."""
     responses: int = 0
     """Linear responses of states to whatever was asked of them at once."""
     refined: int = 0

@@ -18,11 +18,12 @@ import numpy.typing as npt
 
 from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.core.errors import InputError
+from femsense.core.work import count
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.linalg.factorization import Factorization
-from femsense.fem.newton import MOST_STEPS, settle
+from femsense.fem.newton import settle
 from femsense.fem.newton_state import (
     CONVERGED,
     Loads,
@@ -355,10 +356,11 @@ def _step_loads(
         there, state = loads.part_way(first, part), _copied(good)
         state.T = np.where(loads.controlled, good.T, there.effort)
         status = settle(body, there, state, max_iterations)
+        count(equilibria=1)
         spent += state.iterations - good.iterations
         if status == CONVERGED:
             good, done, step = state, part, 1.5 * step
-        elif 0.4 * step >= SMALLEST_PART and spent < MOST_STEPS:
+        elif 0.4 * step >= SMALLEST_PART and spent < good.options.most_steps:
             status, step = CONVERGED, 0.4 * step
         else:
             status = status if status in ("singular", "cables") else "overload"

@@ -27,8 +27,6 @@ from femsense.fem.newton_state import (
 )
 from femsense.fem.slack_and_friction import let_go, update_friction, update_slack
 
-MOST_STEPS = 1500
-"""Newton steps in all, load steps included."""
 SURE = 0.1
 """Where a step left less than this share, the next one is likely to leave less than `NewtonOptions.chord`:
 no tangent is made for the state it leads to."""
@@ -62,7 +60,7 @@ def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
         if status == "cables" and let_go(body, loads, state) and state.taut.tobytes() not in seen:
             seen.add(state.taut.tobytes())
             continue
-        if status != CONVERGED or state.iterations > MOST_STEPS:
+        if status != CONVERGED or state.iterations > state.options.most_steps:
             return status if status != CONVERGED else "iterations"
         changed = update_slack(body, loads, state)
         if changed:

@@ -35,6 +35,8 @@ class NewtonOptions:
     """Stiffnesses of such a state that are indefinite: it is too far off where it meets more.
     Bodies that fold meet 8 to 11 of these in their 30 steps,
     those that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
+    most_steps: int = 1500
+    """Newton steps of a state in all, load steps included."""
     watch: Callable[[float], None] | None = None
     """Called with the largest unbalanced nodal force of every iterate [N]."""
 

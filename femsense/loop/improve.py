@@ -85,7 +85,8 @@ def improve(
         validation: data to judge on; by default whole sweeps of the recordings are held out.
         effects: names to try; by default all.
         without: names to leave out.
-        progress: told what is going on, how much of the work is done, and about how long the rest takes; again every few seconds.
+        progress: told what is going on, how much of the work is done, and about how long the rest takes; again every few seconds, perhaps
+            by another thread.
         options: effects of one's own, what is used of a recording, and how it is computed.
 
     Raises:

@@ -22,6 +22,7 @@ from femsense.model.drive import DrivenRobot, drive_of, has_history, inputs_want
 from femsense.model.effects import Effect, Entry, InRecording, Parameter, build_entry
 from femsense.model.effects.base import part_in
 from femsense.model.linear_answers import AtPoints
+from femsense.model.path_solver import PathSolver
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -244,6 +245,7 @@ def evaluate_scene(
     vary_inputs: bool = False,
     moves: FloatArray | None = None,
     answers: dict[int, AtPoints] | None = None,
+    solver: PathSolver | None = None,
 ) -> SceneJet:
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
@@ -255,6 +257,7 @@ def evaluate_scene(
     moves the body; they serve where no derivative by what moves it is wanted.
     `answers` of an earlier evaluation at this very point serve derivatives by other parameters, and are brought up to date. With
     `vary_inputs` come derivatives by the tension of each frame (where the robot has a past, by that of all frames).
+    `solver` is what states are solved with.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -283,7 +286,9 @@ def evaluate_scene(
     if known is not None and not variants:
         states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in solve_path(base, frames, ties, variants, starts=starts, rough=rough, answers=answers):
+    for k, state, seen, varied in solve_path(
+        base, frames, ties, variants, starts=starts, rough=rough, answers=answers, solver=solver
+    ):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

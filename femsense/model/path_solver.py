@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from femsense.fem.compliance import Tangent, tangent_at
-from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.model.drive import DrivenRobot
 from femsense.model.frame_state import solve_frame
+
+LOOKED_AT = 60
+"""Newton steps of a state that is only looked at, load steps included. Where walls of chambers blow up, many more lead nowhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,3 +22,8 @@ class PathSolver:
     """As `solve_frame`."""
     tangent: Callable[..., Tangent] = tangent_at
     """As `tangent_at`."""
+
+
+def look_at(driven: DrivenRobot, frame: int, *, start: Equilibrium | None, options: SolveOptions) -> Equilibrium:
+    """Return the state of a frame as `solve_frame` does, or how far few steps lead."""
+    return solve_frame(driven, frame, start=start, options=replace(options, newton=replace(options.newton, most_steps=LOOKED_AT)))

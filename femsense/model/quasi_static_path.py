@@ -77,10 +77,7 @@ def solve_path(
     todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (driven, *variants)) else wanted
     alike = _alike(driven, todo, past)
     unique = [k for k in todo if alike[k] == k]
-    bases: dict[int, Equilibrium] = {}
-    for k, state in zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)):
-        bases[k] = state
-        count(equilibria=1)
+    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)))
     seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
@@ -157,17 +154,9 @@ def _base_states(
 
     def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
         start, tried = near[k] if start is None else start, rough and k in known
-        return require_converged(
-            solve(
-                driven,
-                k,
-                start=start,
-                options=SolveOptions(
-                    before=before, reuse_factor=True, relative_tolerance=TRIED if tried else 1e-09, rough=tried, single=True
-                ),
-            ),
-            k,
-        )
+        tolerance = TRIED if tried else 1e-09
+        options = SolveOptions(before=before, reuse_factor=True, relative_tolerance=tolerance, rough=tried, single=True)
+        return _counted(solve, driven, k, start, options)
 
     if near:
         with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not converge: then from rest
@@ -180,13 +169,20 @@ def _base_states(
         for k in part:
             last = states[-1] if states else None
             before = last.segment_tensions if past and last is not None else None
-            states.append(
-                keep(k, require_converged(solve(driven, k, start=last, options=SolveOptions(before=before, single=True)), k))
-            )
+            states.append(keep(k, _counted(solve, driven, k, last, SolveOptions(before=before, single=True))))
         return states
 
     for states in each(along, [frames] if past else _parts(frames)):
         yield from states
+
+
+def _counted(
+    solve: Callable[..., Equilibrium], driven: DrivenRobot, k: int, start: Equilibrium | None, options: SolveOptions
+) -> Equilibrium:
+    """Return the state of a frame; the work counts as soon as it is done, also where there is no state. Raises DataError."""
+    state = solve(driven, k, start=start, options=options)
+    count(equilibria=1)
+    return require_converged(state, k)
 
 
 def _parts(frames: list[int]) -> list[list[int]]:

@@ -20,6 +20,7 @@ from helpers import block_mesh
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
+from femsense.core.work import counting
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
@@ -27,7 +28,7 @@ from femsense.model.drive import DrivenRobot, drive_of, has_history
 from femsense.model.effects import apply_effects
 from femsense.model.frame_state import solve_frame
 from femsense.model.linear_answers import AtPoints
-from femsense.model.path_solver import PathSolver
+from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import Drives, LoadRows, Timeline
@@ -101,6 +102,28 @@ def test_initial_inputs_are_added_before_gain() -> None:
 def test_columns_are_taken_by_name() -> None:
     rec = make_recording(Timeline([0.0]), drives=Drives(("side", "top"), [[1.0, 2.0]]))
     np.testing.assert_array_equal(drive_of(robot(), rec).inputs, [[2.0, 1.0]])
+
+
+# Work
+
+
+def test_work_counts_as_soon_as_it_is_done_and_where_there_is_no_state() -> None:
+    r, rec, done = robot(), recording([[0.0, 0.0], [1.0, 0.0], [1e6, 0.0]]), list[int]()
+
+    def solved(driven: DrivenRobot, frame: int, **given: Any) -> Equilibrium:
+        done.append(work.equilibria)
+        return solve_frame(driven, frame, **given)
+
+    with counting() as work, pytest.raises(DataError, match="frame 2"):
+        states_along(r, rec, solver=PathSolver(equilibrium=solved))
+    assert done == [0, 1, 2] and work.equilibria > 3
+
+
+def test_a_state_that_is_only_looked_at_takes_few_steps() -> None:
+    driven = DrivenRobot(robot(), drive_of(robot(), recording([[1.0, 0.0], [1e6, 0.0]])))
+    near, blown_up = (look_at(driven, k, start=None, options=SolveOptions()) for k in (0, 1))
+    assert near.converged and not blown_up.converged
+    assert blown_up.iterations < solve_frame(driven, 1).iterations
 
 
 # Creep

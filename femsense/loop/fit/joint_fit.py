@@ -19,6 +19,7 @@ from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothn
 from femsense.model.effects.base import known_length
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
+from femsense.model.path_solver import PathSolver
 from femsense.model.quasi_static_path import has_given
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
@@ -228,9 +229,10 @@ class JointProblem:
         known: States | None = None,
         vary_inputs: bool = False,
         answers: dict[int, AtPoints] | None = None,
+        solver: PathSolver | None = None,
     ) -> SceneJet:
         """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`, or whose
-        `answers` are."""
+        `answers` are, solved with a `solver`."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         _, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
@@ -249,6 +251,7 @@ class JointProblem:
             vary_inputs=vary_inputs,
             moves=own[: 6 * len(trial.poses)],
             answers=answers,
+            solver=solver,
         )
 
     def _scene_rows(

@@ -17,6 +17,7 @@ from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.model.effects import Effect, Entry, InRecording, Parameter
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis
+from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.robot import Robot
 
 Answers = dict[int, AtPoints]
@@ -151,7 +152,7 @@ def _whole_change(
             try:
                 moved = probe.jet(trial, own, np.zeros(0), False, starts, rough=True)
             except DataError:
-                moved = probe.jet(trial, own, np.zeros(0), False, starts)
+                moved = probe.jet(trial, own, np.zeros(0), False, starts, solver=PathSolver(look_at))
             changes.append(moved.residual - jet.residual)
             near[i] = starts if robot.body.mesh is fixed.body.mesh else near[i]
     except FemsenseError:
