@@ -249,15 +249,12 @@ def evaluate_scene(
 ) -> SceneJet:
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
-    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these;
-    without them by a first move. `starts` holds states of earlier evaluations near by and is brought up to date;
-    states that are only tried may be
-    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point,
-        as far as it
-    moves the body; they serve where no derivative by what moves it is wanted.
-    `answers` of an earlier evaluation at this very point serve derivatives by other parameters, and are brought up to date. With
-    `vary_inputs` come derivatives by the tension of each frame (where the robot has a past, by that of all frames).
-    `solver` is what states are solved with.
+    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a
+    first move. `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
+    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as
+    far as it moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at
+    this very point serve derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the
+    tension of each frame (where the robot has a past, by that of all frames). `solver` is what states are solved with.
 
     Raises:
         DataError: a frame has no equilibrium.
