@@ -240,7 +240,6 @@ def evaluate_scene(
     vary_initial: bool,
     pivot: FloatArray,
     starts: dict[int, Equilibrium] | None = None,
-    rough: bool = False,
     known: dict[int, Equilibrium] | None = None,
     vary_inputs: bool = False,
     moves: FloatArray | None = None,
@@ -250,11 +249,11 @@ def evaluate_scene(
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
     Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a
-    first move. `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
-    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as
+    first move. `starts` holds states of earlier evaluations near by and is brought up to date; where the `solver` is rough,
+    a frame that Newton does not reach from there has no equilibrium. `known` are the states at this very point, as
     far as it moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at
     this very point serve derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the
-    tension of each frame (where the robot has a past, by that of all frames). `solver` is what states are solved with.
+    tension of each frame (where the robot has a past, by that of all frames).
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -283,9 +282,7 @@ def evaluate_scene(
     if known is not None and not variants:
         states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in solve_path(
-        base, frames, ties, variants, starts=starts, rough=rough, answers=answers, solver=solver
-    ):
+    for k, state, seen, varied in solve_path(base, frames, ties, variants, starts=starts, answers=answers, solver=solver):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

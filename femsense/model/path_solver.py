@@ -22,6 +22,8 @@ class PathSolver:
     """As `solve_frame`."""
     tangent: Callable[..., Tangent] = tangent_at
     """As `tangent_at`."""
+    rough: bool = False
+    """States are only tried, where one near by is known."""
 
 
 def look_at(driven: DrivenRobot, frame: int, *, start: Equilibrium | None, options: SolveOptions) -> Equilibrium:

@@ -47,7 +47,6 @@ def solve_path(
     variants: Sequence[DrivenRobot] = (),
     *,
     starts: dict[int, Equilibrium] | None = None,
-    rough: bool = False,
     answers: dict[int, AtPoints] | None = None,
     solver: PathSolver | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:
@@ -64,7 +63,6 @@ def solve_path(
         variants: other robots or drives.
         starts: frame → a state near by, such as that of an earlier path; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
-        rough: states are only tried, where one near by is known.
         answers: frame → what its points answer to, from an earlier path along these very states with other variants;
             what is missing is added where the points are few.
         solver: what it is solved with.
@@ -77,7 +75,7 @@ def solve_path(
     todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (driven, *variants)) else wanted
     alike = _alike(driven, todo, past)
     unique = [k for k in todo if alike[k] == k]
-    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)))
+    bases = dict(zip(unique, _base_states(driven, unique, starts, past, solver)))
     seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
@@ -133,11 +131,10 @@ def _base_states(
     frames: list[int],
     starts: dict[int, Equilibrium] | None,
     past: bool,
-    rough: bool,
-    solve: Callable[..., Equilibrium],
+    solver: PathSolver,
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
-    room = room_for_factor(len(frames))
+    room, solve, rough = room_for_factor(len(frames)), solver.equilibrium, solver.rough
     near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(driven.robot.body, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:

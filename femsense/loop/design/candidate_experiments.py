@@ -17,9 +17,11 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.parallel import each
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.fem.newton_state import NewtonOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects.loads import STANDARD_GRAVITY
 from femsense.model.frame_state import solve_frame
+from femsense.model.path_solver import LOOKED_AT
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, LoadRows, Timeline
 from femsense.model.robot import Robot, spread_features
@@ -344,11 +346,12 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
 
 
 def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> float:
-    """Return a height at which the robot still finds its equilibrium."""
+    """Return a height at which the robot still finds its equilibrium, in few steps."""
+    soon = SolveOptions(single=True, newton=NewtonOptions(most_steps=LOOKED_AT))
     for _ in range(5):
         inputs = np.zeros((1, count))
         inputs[0, i] = height
-        if solve_frame(_still(robot, control, inputs), 0, options=SolveOptions(single=True)).converged:
+        if solve_frame(_still(robot, control, inputs), 0, options=soon).converged:
             return height
         height = float(f"{0.6 * height:.2g}")
     raise DataError(f"no equilibrium at {height:g} of pull {i}: the declared robot is too soft for its cables")

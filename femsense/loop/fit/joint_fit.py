@@ -246,12 +246,11 @@ class JointProblem:
             vary_initial=trial.initial is not None,
             pivot=pivot,
             starts=starts,
-            rough=rough,
             known=known,
             vary_inputs=vary_inputs,
             moves=own[: 6 * len(trial.poses)],
             answers=answers,
-            solver=solver,
+            solver=PathSolver(rough=rough) if solver is None else solver,
         )
 
     def _scene_rows(
