@@ -72,6 +72,11 @@ def as_it_is(data: Any, fitted: Any, refitted: Any, *given: Any) -> Any:
     return refitted
 
 
+def as_found(data: Any, history: Any, refits: Any, *given: Any) -> Any:
+    """A rule that swaps nothing."""
+    return history, refits
+
+
 def no_spread(data: Any, fitted: Any, *given: Any) -> Any:
     """A rule that adds nothing to standard deviations."""
     return np.zeros(len(fitted.fit.coordinates))
@@ -144,6 +149,7 @@ SEARCH = (
     Switch("surely predicts", {}, {}, {"search.acceptance.surely_predicts": zero}),
     Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
     Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
+    Switch("what predicts best", {}, {}, {"search.swaps.predicting_best": as_found}),
     Switch("weights with the error", {}, {}, {"search.search.nothing_explains": nothing}),
 )
 """Rules of the search, each with a search of its own."""
