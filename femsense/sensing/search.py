@@ -79,8 +79,6 @@ def with_hidden(
         more = fit
         for found in find_hidden(sensor, fit):
             more = better(more, attempt(sensor, k, scan, [*fit.touches, found], free, start, before))
-            if more is not fit and left_over(sensor, more) <= sensor.knowledge.misfit_limit:
-                break
         more = _significant(sensor, k, scan, more, free, before)
         if more.cost > fit.cost - 2.0 * sensor.knowledge.gain_limit:
             break
