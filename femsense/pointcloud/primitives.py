@@ -139,9 +139,8 @@ def find_shapes(
         if len(close) < 3:
             continue
         shape = fit(points[close], std[close], origins[close])
-        more = [
-            g for g in left if shape.holds(points[g], std[g])
-        ]  # the other end of a rod that passes behind, the table in pieces
+        # the other end of a rod that passes behind, the table in pieces
+        more = [g for g in left if shape.holds(points[g], std[g])]
         if more:
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])

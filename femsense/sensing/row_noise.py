@@ -38,12 +38,11 @@ def slant_of(knowledge: Knowledge, left: Left) -> float:
     heavy tails hardly move: n log Σ |z| cosᵖ − p Σ log cos).
 
     Where noise is larger than stated on faces that are seen obliquely, it looks like shared errors of millimetres: as it is stated alone, forces on
-    an arm before a time-of-flight camera were 12.5 % off in place of 2.1 % (median; `arm-slide` of `benchmarks/twins.py`).
+    an arm before a time-of-flight camera were 12.5 % off in place of 2.1 % (median; `arm-slide` of `benchmarks/twins.py`). By stereo, what grows there is
+    an error of the model: taken for noise, forces on `diamond-normal` became 2.3 % off from 1.2 %.
     """
     if not left or any(noise.kind != "tof" for noise in knowledge.noises):
-        return SLANTS[
-            0
-        ]  # by stereo, what grows there is an error of the model: taken for noise, forces on `diamond-normal` became 2.3 % off from 1.2 %
+        return SLANTS[0]
     z = np.abs(np.concatenate([rest for _, rest in left]))
     cosine = np.concatenate([np.broadcast_to(rows.cosine, rest.shape) for rows, rest in left])
 
