@@ -10,6 +10,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, as_points, freeze
 from femsense.core.errors import InputError
 from femsense.pointcloud.grid import positive
+from femsense.pointcloud.rays import GRAZING
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,6 +85,27 @@ def cloud_from_depth(
     z = image[row, column].astype(np.float64) * unit
     colors = None if color is None else _pixel_colors(color, image.shape)[row, column]
     return PointCloud(np.column_stack([rays * z[:, None], z]), colors)
+
+
+def without_mixed_pixels(depth: npt.ArrayLike, fx: float, fy: float) -> FloatArray:
+    """Return a depth image without pixels that saw two surfaces at once: they lie between both, and look like small objects beside an edge.
+
+    Such a pixel is farther than its neighbour on one side and nearer than that on the other, along a row or a column, each by more than on a
+    surface that is seen at a cosine of GRAZING. Thin objects are nearer than both neighbours, and stay.
+
+    Arguments:
+        depth: distances along z, shape (H, W); 0 where there is none.
+        fx, fy: focal lengths [px].
+    """
+    image = np.array(depth, dtype=np.float64)
+    mixed = np.zeros(image.shape, dtype=bool)
+    for lines, marked, focal in ((image, mixed, fx), (image.T, mixed.T, fy)):
+        middle, before, after = lines[:, 1:-1], lines[:, :-2], lines[:, 2:]
+        step = middle / focal * np.sqrt(1.0 / GRAZING**2 - 1.0)
+        rises, falls = (middle - before > step) & (after - middle > step), (before - middle > step) & (middle - after > step)
+        marked[:, 1:-1] |= (rises | falls) & (before > 0) & (middle > 0) & (after > 0)
+    image[mixed] = 0.0
+    return image
 
 
 def straight_rays(rays: FloatArray, distortion: FloatArray, model: str) -> FloatArray:

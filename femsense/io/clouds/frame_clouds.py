@@ -55,7 +55,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointClo
 
 
 def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera | None) -> PointCloud:
-    from femsense.pointcloud.cloud import cloud_from_depth
+    from femsense.pointcloud.cloud import cloud_from_depth, without_mixed_pixels
 
     if camera is None:
         raise InputError("a depth image without a camera", where=depth_file, expected="a table [camera] in recording.toml")
@@ -71,7 +71,8 @@ def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera |
         check_image_size(color.shape[1], color.shape[0], camera, color_file)
     c = camera
     lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
-    return cloud_from_depth(depth, *lens, color=color, distortion_model=c.distortion_model)
+    seen = without_mixed_pixels(depth, c.fx, c.fy)
+    return cloud_from_depth(seen, *lens, color=color, distortion_model=c.distortion_model)
 
 
 def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.io.clouds.pcd import read_pcd_fields
 from femsense.pointcloud import PointCloud, cloud_from_depth
+from femsense.pointcloud.cloud import without_mixed_pixels
 
 
 def some_cloud(count: int = 50, *, colors: bool = True, seed: int = 0) -> PointCloud:
@@ -217,6 +218,20 @@ def test_depth_image_of_a_plane_gives_that_plane() -> None:
     assert len(cloud) == depth.size - 1
     np.testing.assert_allclose(cloud.points @ normal, offset, atol=1e-4)
     np.testing.assert_allclose(cloud.points[0], depth[0, 0] * 1e-4 * np.array([-31 / 50, -18 / 55, 1.0]), rtol=1e-12)
+
+
+def test_pixels_between_two_surfaces_are_no_points() -> None:
+    """A step from 0.4 to 0.5 m with mixed pixels on it, along columns as along rows; a stick before it, and a face seen obliquely, stay."""
+    depth = np.full((20, 30), 500.0)
+    depth[:, :10] = 400.0
+    depth[:, 10] = np.linspace(410.0, 490.0, 20)
+    depth[:, 20] = 350.0
+    for image in (depth, depth.T):
+        left = without_mixed_pixels(image, 500.0, 500.0)
+        assert not left[image == depth[3, 10]].any()
+        assert (left == 0).sum() == 20 and (left[image == 350.0] == 350.0).all()
+    oblique = 500.0 + 3.0 * np.arange(30) * np.ones((20, 1))  # tan 3, where 3.87 are grazing
+    np.testing.assert_array_equal(without_mixed_pixels(oblique, 500.0, 500.0), oblique)
 
 
 def test_depth_image_is_projected_back_to_its_pixels_through_the_lens() -> None:
