@@ -130,7 +130,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
     own, own_view, rest, rest_view = [], [], [], []
     segmented = True
     for view, T in enumerate(poses):
-        cloud = read_frame_cloud(recording, k, view=view)
+        cloud = read_frame_cloud(recording, k, view=view, mixed=False)
         if cloud is None:
             continue
         points = undo_depth(cloud.points, robot.observation)

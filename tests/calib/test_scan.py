@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.scan import Scan, read_scan
 from femsense.core.arrays import FloatArray
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.clouds.cloud_files import write_cloud
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
 BLUE, GRAY, TINTED = [0.2, 0.4, 0.8], [0.12, 0.12, 0.13], [0.05, 0.09, 0.19]
@@ -49,3 +51,18 @@ def test_a_dark_point_is_of_the_robot_where_those_around_it_are(tmp_path, shadow
     assert scan.segmented
     assert len(scan.view) == len(arm_points)
     assert scan.points((T_ROBOT_CAMERA,))[:, 2].max() < 0.011
+
+
+def test_pixels_that_saw_two_surfaces_are_no_points_of_a_scan(tmp_path):
+    """A step of 20 mm seen from above, with a column of pixels half way between."""
+    depth = np.full((16, 40), 2900, dtype=np.uint16)
+    depth[:, 20], depth[:, 21:] = 3000, 3100
+    cv2.imwrite(str(tmp_path / "0.png"), depth)
+    above = make_pose(rotation_from_vector([np.pi, 0.0, 0.0]), [0.05, 0.0, 0.3])
+    recording, _ = record(np.zeros((1, 4)), noise=0.0)
+    camera = Camera("", 40, 16, 300.0, 300.0, 19.5, 7.5, np.zeros(5), 1e-4)
+    recording = replace(recording, cameras=(camera,), cloud_files=((tmp_path / "0.png",),), color_files=((None,),))
+    scan = read_scan(arm(), recording, 0, (above,), arm().body.mesh.nodes)
+    assert scan is not None
+    heights = np.unique(scan.points((above,))[:, 2].round(6))
+    assert heights.tolist() == [-0.01, 0.01] and len(scan.view) == 16 * 39

@@ -26,13 +26,14 @@ BESIDE = (".txt", ".md", ".json", ".toml", ".csv", ".yaml", ".yml")
 """Endings of notes that may lie beside clouds and images."""
 
 
-def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointCloud | None:
+def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool = True) -> PointCloud | None:
     """Return the cloud of frame k (an index 0 … F − 1) in the frame of its camera; None where the frame has none.
 
     Arguments:
         recording: the recording.
         k: index of the frame.
         view: index of the camera.
+        mixed: whether pixels of depth images count that saw two surfaces at once (see `without_mixed_pixels`).
 
     Raises:
         InputError: a file that is broken, or of another size than the camera table says.
@@ -41,7 +42,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointClo
     if file is None:
         return None
     if file.suffix.lower() == ".png":
-        return _cloud_of_images(file, recording.color_files[k][view], recording.cameras[view])
+        return _cloud_of_images(file, recording.color_files[k][view], recording.cameras[view], mixed)
     from femsense.io.clouds.cloud_files import read_cloud
 
     try:
@@ -54,7 +55,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointClo
         ) from None
 
 
-def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera | None) -> PointCloud:
+def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera | None, mixed: bool) -> PointCloud:
     from femsense.pointcloud.cloud import cloud_from_depth, without_mixed_pixels
 
     if camera is None:
@@ -71,7 +72,7 @@ def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera |
         check_image_size(color.shape[1], color.shape[0], camera, color_file)
     c = camera
     lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
-    seen = without_mixed_pixels(depth, c.fx, c.fy)
+    seen = depth if mixed else without_mixed_pixels(depth, c.fx, c.fy)
     return cloud_from_depth(seen, *lens, color=color, distortion_model=c.distortion_model)
 
 
