@@ -19,6 +19,8 @@ from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
 
 LONGER = {"cylinder": (True, False, False), "plate": (True, True, False)}
 """Along which of its axes a shape may go on beyond what was seen of it."""
+OUTLIERS = 0.05
+"""Share of the points of an edge that may lie farther off."""
 Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
 FITS = 4.0
@@ -117,7 +119,14 @@ class Shape:
 
 
 def find_shapes(
-    points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, fit: Fit | None = None
+    points: FloatArray,
+    std: FloatArray,
+    origins: FloatArray,
+    near: FloatArray,
+    *,
+    local_m: float,
+    fit: Fit | None = None,
+    edge: FloatArray | None = None,
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -128,6 +137,7 @@ def find_shapes(
         near: distance of each from the surface that may be touched [m], shape (o,).
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
         fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
+        edge: how far off the surface a camera may have put points of its edge [m], shape (o,): what lies within that is no object.
     """
     fit = fit or fit_shape
     result: list[Shape] = []
@@ -136,7 +146,7 @@ def find_shapes(
         group, left = left[0], left[1:]
         own = near[group]
         close = group[own <= own.min() + local_m]
-        if len(close) < 3:
+        if len(close) < 3 or (edge is not None and (own > edge[group]).mean() < OUTLIERS):
             continue
         shape = fit(points[close], std[close], origins[close])
         # the other end of a rod that passes behind, the table in pieces

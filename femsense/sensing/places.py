@@ -34,6 +34,8 @@ CONE = float(np.sqrt(10.0 / 3.0))
 """Radius of a cone of pressure over its root mean square radius."""
 AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
+BLEEDING = 3.0
+"""Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -79,7 +81,14 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else fit_shape,
+        edge=_edge_of(sensor, points - origins, view) + 3.0 * std,
     )
+
+
+def _edge_of(sensor: Sensor, rays: FloatArray, view: IntArray) -> FloatArray:
+    """Return how far beside the body a camera may show points of its edge [m], shape (o,); 0 where it is not known how large pixels are."""
+    pixel = np.array([0.0 if camera is None else 1.0 / camera.fx for camera in sensor.recording.cameras])
+    return np.asarray(BLEEDING * pixel[view] * np.linalg.norm(rays, axis=1))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

@@ -94,3 +94,17 @@ def test_a_plate_that_is_pressed_from_the_side_of_the_camera_touches_with_its_ba
     assert back.behind_m == 2 * shape.half[:2].min()
     assert front is shape and front.behind_m == 0.0
     assert front.distance(places)[2] > 0.07  # beside it nothing is pressed
+
+
+def test_what_lies_within_the_edge_of_a_body_is_no_object():
+    """A strip of 1 mm beside a face, as a camera widens what it sees, and a ball that stands on it."""
+    rng = np.random.default_rng(2)
+    strip = rng.uniform([0.0, 0.0, 0.0], [0.04, 0.002, 0.001], size=(60, 3))
+    ways = rng.normal((0.0, 0.0, 1.0), size=(200, 3))
+    ball = np.array([0.08, 0.0, 0.006]) + 0.006 * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    points = np.vstack([strip, ball])
+    std, origins = np.full(len(points), 1e-4), np.tile([0.05, 0.0, 0.3], (len(points), 1))
+    asked = {"points": points, "std": std, "origins": origins, "near": points[:, 2], "local_m": 0.1}
+    assert sorted(shape.kind for shape in find_shapes(**asked)) == ["points", "sphere"]
+    kept = find_shapes(**asked, edge=np.full(len(points), 0.0015))
+    assert [shape.kind for shape in kept] == ["sphere"]
