@@ -146,7 +146,7 @@ def find_shapes(
         group, left = left[0], left[1:]
         own = near[group]
         close = group[own <= own.min() + local_m]
-        if len(close) < 3 or (edge is not None and (own > edge[group]).mean() < OUTLIERS):
+        if len(close) < 3 or (edge is not None and (np.abs(own) > edge[group]).mean() < OUTLIERS):
             continue
         shape = fit(points[close], std[close], origins[close])
         # the other end of a rod that passes behind, the table in pieces
