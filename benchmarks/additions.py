@@ -14,11 +14,12 @@ import json
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from independent.cases import CASES
@@ -126,7 +127,9 @@ def _rows_of(name: str, folder: Path, seed: int) -> Iterator[tuple[Way, Row, flo
         if not (into / "ms.json").exists():
             calibration = calibration or calibrate(robot, recording)
             spent = _Clock()
-            with _patched(way.patches):
+            with ExitStack() as patched:
+                for patch in way.patches:
+                    patched.enter_context(mock.patch.object(*patch))
                 run = estimate(
                     robot, recording, calibration, at=places if way.given else None, options=way.options, progress=spent.tick
                 )
@@ -146,18 +149,6 @@ class _Clock:
             self.first = time.process_time()
         elif done == count:
             self.ms = 1e3 * (time.process_time() - self.first) / (count - 1)
-
-
-@contextmanager
-def _patched(patches: Patches) -> Iterator[None]:
-    kept: list[tuple[ModuleType, str, Any]] = [(module, name, getattr(module, name)) for module, name, _ in patches]
-    for module, name, instead in patches:
-        setattr(module, name, instead)
-    try:
-        yield
-    finally:
-        for module, name, before in kept:
-            setattr(module, name, before)
 
 
 if __name__ == "__main__":
