@@ -18,6 +18,7 @@ from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import file_hash
+from femsense.io.folder_lock import only_writer
 from femsense.io.provenance import finished, recording_input
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
@@ -58,7 +59,7 @@ def estimate_into(
         progress: called with (frames done, frames in all).
 
     Raises:
-        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+        FemsenseError: bad input, a folder that holds something else or that another command is writing into, or data that allow no result.
     """
     from femsense.calib.calibrate import calibrate
     from femsense.calib.given import check_given
@@ -74,16 +75,17 @@ def estimate_into(
         return read_run(folder, robot=body)
     if given is None:
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
-    used = calibrate(body, frames, correct=bool(options and options.correct)) if given is None else given
-    if not used.settled:
-        raise DataError(f"the calibration is not to be used: {used.status}")
-    if given is not None:
-        check_given(body, frames, given)
-    elif said := model_error(used):
-        say(f"residual of the calibration {1e3 * used.rms_m:.3f} mm, error of the model {said}")
-    began = time.perf_counter()
-    run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
-    write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
+    with only_writer(folder):
+        used = calibrate(body, frames, correct=bool(options and options.correct)) if given is None else given
+        if not used.settled:
+            raise DataError(f"the calibration is not to be used: {used.status}")
+        if given is not None:
+            check_given(body, frames, given)
+        elif said := model_error(used):
+            say(f"residual of the calibration {1e3 * used.rms_m:.3f} mm, error of the model {said}")
+        began = time.perf_counter()
+        run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
+        write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
     return run
 
 
@@ -116,7 +118,7 @@ def improve_into(
         the content of loop.json.
 
     Raises:
-        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+        FemsenseError: bad input, a folder that holds something else or that another command is writing into, or data that allow no result.
     """
     from femsense.loop.improve import ImproveOptions, improve
 
@@ -142,17 +144,18 @@ def improve_into(
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return read_loop(folder)
-    with beside(load_pages):
-        loop = improve(
-            body,
-            train,
-            validation=test,
-            effects=effects,
-            without=without,
-            progress=progress,
-            options=replace(how, keep=_kept(folder, inputs)),
-        )
-    write_loop(loop, folder, inputs=inputs)
+    with only_writer(folder):
+        with beside(load_pages):
+            loop = improve(
+                body,
+                train,
+                validation=test,
+                effects=effects,
+                without=without,
+                progress=progress,
+                options=replace(how, keep=_kept(folder, inputs)),
+            )
+        write_loop(loop, folder, inputs=inputs)
     return read_loop(folder)
 
 
@@ -207,7 +210,7 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, 
     """Write the recording of a script; return its folder. A run that was stopped goes on where it stopped.
 
     Raises:
-        InputError: where the folder holds anything but a simulated recording. FemsenseError: as `simulate`.
+        InputError: where the folder holds anything but a simulated recording, or another command is writing into it. FemsenseError: as `simulate`.
     """
     from femsense.io.provenance import robot_input
     from femsense.rig.script import read_script
@@ -223,7 +226,8 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, 
         "script": table.model_dump(),
         "meshes": [file_hash(file) for file in meshes if file.is_file()],
     }
-    return simulate(body, script, target, progress=progress, keep=_kept(target, inputs))
+    with only_writer(target):
+        return simulate(body, script, target, progress=progress, keep=_kept(target, inputs))
 
 
 def script_plan(

@@ -20,8 +20,10 @@ from typing import Annotated, Any
 
 import numpy as np
 import pytest
+import tomli_w
 import typer
 from helpers import write_block_robot, write_small_recording
+from rig_scripts import SCRIPT
 from small_run import make_run
 
 import femsense
@@ -31,6 +33,7 @@ from femsense.app.command_line.parameters import split_names
 from femsense.app.commands import loop_page
 from femsense.core.errors import DataError, InputError
 from femsense.io.files import PART_PREFIX
+from femsense.io.folder_lock import lock_of, only_writer
 from femsense.io.robot_toml import load_robot
 from femsense.sensing.run_files import write_run
 from femsense.xr.view import PAGE
@@ -380,6 +383,23 @@ def test_results_are_not_written_over_the_input(run: Any, robot: Path, recording
     assert {path: path.read_bytes() for path in (*robot.iterdir(), *recording.iterdir())} == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such locks")
+def test_two_commands_never_write_one_folder_at_once(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "script.toml").write_text(tomli_w.dumps({**SCRIPT, "contacts": []}), encoding="utf-8")
+    (tmp_path / "table.csv").write_text("time,tip_x,tip_y,tip_z\n0.0,0,0,90\n0.1,1,0,90\n", encoding="utf-8")
+    with only_writer(tmp_path / "out"):
+        for words in (
+            ("estimate", robot, recording, "--at", "0.1,0.015,0.015"),
+            ("improve", robot, recording),
+            ("simulate", write_block_robot(tmp_path / "pulled"), tmp_path / "script.toml"),
+            ("import", tmp_path / "table.csv", "--unit", "mm", "--inputs", "tension"),
+        ):
+            said = run(*words, "-o", tmp_path / "out")
+            assert said.status == 2 and "another command is writing into this folder" in said.err, said.err
+        assert not (tmp_path / "out").exists()
+    assert run("estimate", robot, recording, "--at", "0.1,0.015,0.015", "-o", tmp_path / "out").status == 0
+
+
 def test_unknown_effects_are_refused_with_a_hint(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
     said = run("improve", robot, recording, "-o", tmp_path / "out", "--effects", "frction,creep")
     assert said.status == 2 and "unknown effect" in said.err and not (tmp_path / "out").exists()
@@ -463,7 +483,7 @@ def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recor
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
     def half_written() -> list[Path]:
-        return [path for path in tmp_path.iterdir() if PART_PREFIX in path.name]
+        return [path for path in tmp_path.iterdir() if PART_PREFIX in path.name and path != lock_of(tmp_path / "run")]
 
     for _ in range(5):  # it writes for a few milliseconds, and may be done before it is halted
         with subprocess.Popen(

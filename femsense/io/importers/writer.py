@@ -17,6 +17,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_csv, write_json, write_toml
+from femsense.io.folder_lock import only_writer
 from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.input_samples import spans
@@ -68,7 +69,8 @@ def write_recording(
         what was found and written, as in import.json.
 
     Raises:
-        InputError: no frames, none of the pictures readable, columns whose meaning nobody said, tables that were changed since.
+        InputError: no frames, none of the pictures readable, columns whose meaning nobody said, tables that were changed since,
+            another import at work there.
     """
     if replace:
         check_unchanged(followed(folder))
@@ -78,14 +80,15 @@ def write_recording(
         _actuation(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
-    _prepare(part, identity)
-    with Journal(part, identity) as journal:
-        counts = _write_frames(source, part, journal, progress)
-    found = _finish(source, part, journal, counts, actuation, zero, log, offset)
-    tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
-    write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
-    (part / JOURNAL).unlink()
-    _give_name(part, final, replace)
+    with only_writer(final):
+        _prepare(part, identity)
+        with Journal(part, identity) as journal:
+            counts = _write_frames(source, part, journal, progress)
+        found = _finish(source, part, journal, counts, actuation, zero, log, offset)
+        tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
+        write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
+        (part / JOURNAL).unlink()
+        _give_name(part, final, replace)
     return found
 
 
