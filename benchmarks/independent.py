@@ -35,7 +35,7 @@ def main() -> int:
     ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
-    ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest")
+    ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest, whose forces push")
     ask.add_argument("--law", action="store_true", help="with --run: the robot declares the law of the truth")
     ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
     ask.add_argument("--list", action="store_true", help="name the cases")

@@ -193,7 +193,7 @@ def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:
     if at:
         truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         last = {c["contact"]: c["rest"] for c in truth["contacts"]}
-        places = [word for rest in last.values() for word in ("--at", ",".join(f"{v:.6f}" for v in rest))]
+        places = ["--push", *(word for rest in last.values() for word in ("--at", ",".join(f"{v:.6f}" for v in rest)))]
     begin = time.perf_counter()
     for words in (
         ["calibrate", robot, recording, "-o", calibration, "--json"],

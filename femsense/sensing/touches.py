@@ -131,14 +131,14 @@ def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, for
 
 
 def friction_cone(sensor: Sensor, touches: Sequence[Touch], normals: FloatArray) -> FrictionCone | None:
-    """Return the cone about normals (m, 3) that holds the forces; None where nothing does: given places push and pull as they like."""
-    if sensor.options.friction is None or any(touch.source == "given" for touch in touches):
+    """Return the cone about normals (m, 3) that holds the forces; None where nothing does."""
+    if sensor.options.friction is None or any(_may_pull(sensor, touch) for touch in touches):
         return None
     return FrictionCone(normals=normals, mu=sensor.options.friction)
 
 
 def within_cones(sensor: Sensor, touches: Sequence[Touch], forces: FloatArray, state: Equilibrium) -> FloatArray:
-    """Return forces (m, 3) moved to the nearest ones within their friction cones; given places push and pull as they like."""
+    """Return forces (m, 3) moved to the nearest ones within their friction cones, where there are any."""
     mu, result = sensor.options.friction, np.array(forces, dtype=np.float64)
     if mu is None:
         return result
@@ -147,8 +147,13 @@ def within_cones(sensor: Sensor, touches: Sequence[Touch], forces: FloatArray, s
         along = float(result[i] @ inward)
         across = result[i] - along * inward
         size = float(np.linalg.norm(across))
-        if touch.source == "given" or size <= mu * along:
+        if _may_pull(sensor, touch) or size <= mu * along:
             continue
         kept = max(along + mu * size, 0.0) / (1.0 + mu**2)
         result[i] = kept * (inward + mu * across / max(size, 1e-12))
     return result
+
+
+def _may_pull(sensor: Sensor, touch: Touch) -> bool:
+    """Return whether what acts there may pull, as a weight does that hangs from a given place."""
+    return touch.source == "given" and not sensor.options.push

@@ -36,6 +36,7 @@ class SensingOptions:
     """"rays": every point a measurement; "paper": feature points, Algorithms 2 and 3, normals only, one linear step."""
     friction: float | None = 1.0
     """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
+    push: bool = False  # what acts at a given place keeps to its cone, too
     smooth_s: float = 0.0
     """Time constant over which the forces of one track are averaged [s]; they lag by so much. 0: each frame speaks for itself."""
     modulus_std: float = 0.03
@@ -46,8 +47,7 @@ class SensingOptions:
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
     marker_model_std: float = 0.015
     """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
-    iterations: int = 10
-    """Gauss–Newton steps a frame at most."""
+    iterations: int = 10  # Gauss–Newton steps a frame at most
     correct: bool = False
     """Use the robot's empirical correction of its markers, with its standard deviation."""
 

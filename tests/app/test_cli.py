@@ -154,6 +154,7 @@ def test_version(run: Any) -> None:
         (["inspect", "--nonsense", "x"], "No such option: --nonsense"),
         (["estimate", "a", "b", "-o", "c", "--at", "1,2"], "'1,2' is not a place: three numbers in metres are"),
         (["estimate", "a", "b", "-o", "c", "--at", "x,y,z"], "'x,y,z' is not a place"),
+        (["estimate", "a", "b", "-o", "c", "--push"], "--push is of the places of --at, and none is given"),
         (["view", "x", "--port", "-1"], "'--port': Input should be greater than or equal to 0"),
     ],
 )

@@ -51,6 +51,20 @@ def test_a_force_at_a_given_place_comes_out_of_markers(touched):
     assert [report.contacts for report in run.frames] == [int(k in felt) for k in range(4)]
 
 
+def test_what_is_said_to_push_at_given_places_does_not_pull():
+    """A force that lifts the arm may pull at its upper face; where both places push, it is the lower one that carries it."""
+    upper, lift = np.array([0.08, 0.0, 0.01]), np.array([0.0, 0.03, 0.15])
+    recording, _ = record(INPUTS, noise=1e-4, forces={2: (upper, lift)})
+    recording, at = replace(recording, free=np.array([True, True, False, True])), [upper, upper * [1.0, 0.0, -1.0]]
+    calibration = calibrate(arm(), recording)
+    pulled, pushed = (estimate(arm(), recording, calibration, at=at, options=SensingOptions(push=push)) for push in (False, True))
+    assert [contact.track for contact in sensed(pulled.contacts)] == [0]
+    assert [contact.track for contact in pushed.contacts if contact.force_n_xyz[2] > 0.1] == [1]
+    for contact in pushed.contacts:
+        along = -contact.force_n_xyz @ contact.normal
+        assert np.linalg.norm(contact.force_n_xyz + along * contact.normal) <= along + 1e-4
+
+
 def test_a_contact_at_a_given_place_is_the_same_one_after_a_frame_that_is_not_trusted():
     recording, _ = record(INPUTS, noise=1e-4, forces={1: (TIP, FORCE), 3: (TIP, FORCE)})
     recording = replace(recording, free=np.array([True, False, False, False]))

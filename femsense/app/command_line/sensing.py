@@ -74,6 +74,9 @@ def estimate(
     friction: Annotated[
         float, typer.Option("--friction", metavar="MU", help="The cone about the normal in which contact forces lie.")
     ] = 1.0,
+    push: Annotated[
+        bool, typer.Option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
+    ] = False,
     smooth: Annotated[
         float, typer.Option("--smooth", metavar="SECONDS", help="Average forces over so long; they lag by as much.")
     ] = 0.0,
@@ -86,7 +89,9 @@ def estimate(
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
-    options = SensingOptions(method=method.value, friction=friction, smooth_s=smooth, correct=correct)
+    if push and not at:
+        raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
+    options = SensingOptions(method=method.value, friction=friction, push=push, smooth_s=smooth, correct=correct)
     if smooth > 0:
         say(f"forces are averaged over {smooth:g} s and lag by as much")
     with progress_bar("estimate") as progress:
