@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from femsense.core.arrays import FloatArray
 from femsense.io.files import write_csv, write_toml
@@ -24,8 +25,9 @@ PRESSURES = (10, 11, 12, 4, 5, 6)
 BODIES = {"base": 17, "mid": 24, "tip": 31}
 ARM_MM = 40.0
 """A second marker of each rigid body lies so far along its x."""
-TURNED = {"base": 1.0, "mid": 1.0, "tip": -1.0}
-"""The rigid body of the tip is turned by half a turn about the vertical."""
+HALF_TURNS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+"""Signs of the axes of a rigid body: motion capture takes the tip for itself turned by half a turn, and back, up to ten times a second, the middle
+for a while: their balls are symmetric."""
 RADIUS_MM, END_MM = 25.0, 8.0
 INNER_MM, OUTER_MM, SPAN_DEG = 7.0, 22.0, 76.0
 """Of a chamber: as large as four have room for, so that a body that is stiff enough not to be blown up bends as far as the arm does."""
@@ -45,9 +47,7 @@ def description(day: str) -> dict[str, object]:
     markers = []
     for name, along in (("base", 0.0), ("mid", middle), ("tip", tip)):
         markers.append({"name": name, "along_mm": along})
-        markers.append(
-            {"name": f"{name}-x", "along_mm": along, "distance_mm": ARM_MM, "angle_deg": 0.0 if TURNED[name] > 0 else 180.0}
-        )
+        markers.append({"name": f"{name}-x", "along_mm": along, "distance_mm": ARM_MM, "angle_deg": 0.0})
     return {
         "format": "femsense-line-1",
         "name": "arm",
@@ -89,17 +89,28 @@ def read_states(data: Path, name: str, *, ends: tuple[float, ...] = (0.6, 1.0)) 
     for hold in range(round((rows[-1, 0] - began) / HOLD_S)):
         for share in ends:
             at = began + HOLD_S * (hold + share) - 0.05
-            window = np.median(rows[(rows[:, 0] > at - 0.25) & (rows[:, 0] <= at)], axis=0)
-            points = [p for first in BODIES.values() for p in (window[first : first + 3], _arm(window[first : first + 7]))]
-            states.append(State(at - began, PSI_PA * window[list(PRESSURES)], np.array(points), hold))
+            window = rows[(rows[:, 0] > at - 0.25) & (rows[:, 0] <= at)]
+            points = [
+                np.median(p, axis=0) for first in BODIES.values() for p in (window[:, first : first + 3], along_x(window, first))
+            ]
+            states.append(State(at - began, PSI_PA * np.median(window[:, list(PRESSURES)], axis=0), np.array(points), hold))
     return states
 
 
-def _arm(body: FloatArray) -> FloatArray:
-    """Return the second marker of a rigid body: along its x."""
-    x, y, z, w = body[3:] / np.linalg.norm(body[3:])
-    axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
-    return np.asarray(body[:3] + 1e-3 * ARM_MM * axis)
+def along_x(rows: FloatArray, first: int) -> FloatArray:
+    """Return the second marker of a rigid body [m], shape (k, 3): along its x, without the half turns of motion capture.
+
+    Of the four ways in which it may be turned the one is taken that is nearest to the base: none bends by a right angle.
+    """
+    axes, base = _axes(rows, first), _axes(rows, BODIES["base"])
+    along = np.einsum("kij,kij->kj", base, axes)
+    turn = HALF_TURNS[np.argmax(along @ HALF_TURNS.T, axis=1)]
+    return np.asarray(rows[:, first : first + 3] + 1e-3 * ARM_MM * turn[:, :1] * axes[:, :, 0])
+
+
+def _axes(rows: FloatArray, first: int) -> FloatArray:
+    """Return the axes of a rigid body, the columns of (k, 3, 3)."""
+    return np.asarray(Rotation.from_quat(rows[:, first + 3 : first + 7]).as_matrix())
 
 
 def write_recording(folder: Path, states: list[State]) -> Path:

@@ -41,6 +41,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera_frame import in_robot_frame
 from femsense.model.marker_correction import corrected
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene
+from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against, how_to_free
 from femsense.model.repeats import marker_repeatability
@@ -180,18 +181,18 @@ def _fitted(
 
 
 def _residual_of(robot: Robot, recording: Recording, frames: IntArray) -> FloatArray:
-    """Return what a fit to some frames leaves [m], shape (k, 3)."""
-    return _fitted_as_named(robot, recording, frames, [])[-1].residual
+    """Return what a fit to some frames leaves [m], shape (k, 3); as all other readings they are only looked at."""
+    return _fitted_as_named(robot, recording, frames, [], PathSolver(look_at))[-1].residual
 
 
 def _left_with(robot: Robot, recording: Recording, frames: IntArray) -> Fitted:
     """Return what a fit to some frames leaves [m], and its poses."""
-    _, _, poses, _, jet = _fitted_as_named(robot, recording, frames, [])
+    _, _, poses, _, jet = _fitted_as_named(robot, recording, frames, [], PathSolver(look_at))
     return root_mean_square(jet.residual), poses
 
 
 def _fitted_as_named(
-    robot: Robot, recording: Recording, chosen: IntArray, history: list[float]
+    robot: Robot, recording: Recording, chosen: IntArray, history: list[float], solver: PathSolver | None = None
 ) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
     seen = _thinned(chosen[np.isin(chosen, recording.marker_frame)])
     scene = make_scene(robot, recording, seen)
@@ -200,7 +201,7 @@ def _fitted_as_named(
     if recording.actuation_zero == "unknown" and robot.body.cables:
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
         poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
-    return scene, *fit_joint(robot, scene, poses, initial, history)
+    return scene, *fit_joint(robot, scene, poses, initial, history, solver=solver)
 
 
 def _thinned(frames: IntArray) -> IntArray:

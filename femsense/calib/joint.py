@@ -15,6 +15,7 @@ from femsense.core.least_squares import FitResult, covariance_of, gauss_newton
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
+from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.recording import state_key
 from femsense.model.robot import Robot
 
@@ -34,12 +35,13 @@ def fit_joint(
     history: list[float],
     *,
     free_inputs: bool = True,
+    solver: PathSolver | None = None,
 ) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:
     """Finish over poses and initial inputs together; noise and outliers are weighed anew from the residual until they stay.
 
-    Poses that the recording declares stay as they are.
+    Poses that the recording declares stay as they are. States are solved with the `solver`.
     """
-    problem = _Problem(robot, scene, poses, initial, free_inputs=free_inputs)
+    problem = _Problem(robot, scene, poses, initial, free_inputs=free_inputs, solver=solver)
     low, high = problem.bounds()
     theta, huber = problem.start(), np.ones(len(scene.points))
     for again in range(MAX_REWEIGHTINGS):
@@ -70,7 +72,7 @@ def moved_by_law(
     other, nothing = with_other_law(robot), np.zeros(len(fit.theta))
     if other is None or not np.isfinite(fit.covariance).all():
         return nothing
-    there = _Problem(other, scene, poses, initial, free_inputs=True)
+    there = _Problem(other, scene, poses, initial, free_inputs=True, solver=PathSolver(look_at))
     there.starts = dict(jet.states)
     there.weigh(jet, _huber_weights(jet.residual), len(fit.theta))
     row = (there.weights / there.std)[:, None, None]
@@ -87,9 +89,16 @@ class _Problem:
     """Whitened residuals of markers and rest placements over moves of the free poses and the initial inputs."""
 
     def __init__(
-        self, robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, *, free_inputs: bool
+        self,
+        robot: Robot,
+        scene: Scene,
+        poses: list[FloatArray],
+        initial: FloatArray | None,
+        *,
+        free_inputs: bool,
+        solver: PathSolver | None,
     ) -> None:
-        self.plain, self.scene = Hypothesis(robot), scene
+        self.plain, self.scene, self.solver = Hypothesis(robot), scene, solver
         self.base_poses, self.initial = list(poses), initial
         self.pivot = robot.marker_points.mean(axis=0)
         self.moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
@@ -131,6 +140,7 @@ class _Problem:
             pivot=self.pivot,
             starts=self.starts,
             known=known,
+            solver=self.solver,
         )
         return self.jet
 

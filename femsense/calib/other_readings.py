@@ -20,8 +20,8 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.frame_state import solve_frame
 from femsense.model.observation import Scene
+from femsense.model.path_solver import look_at
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import in_frames
 from femsense.model.robot import Robot
@@ -194,7 +194,7 @@ def _states(robot: Robot, recording: Recording, frames: IntArray, initial: Float
     """Return where the markers are in some frames [m], shape (markers, 3) each; None where a state is missing."""
     driven, found = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), dict[int, FloatArray]()
     for k in frames.tolist():
-        state = solve_frame(driven, k, options=SolveOptions(single=True))
+        state = look_at(driven, k, start=None, options=SolveOptions(single=True))
         if not state.converged:
             return None
         found[k] = robot.markers.positions(state.positions)
@@ -299,6 +299,8 @@ def _response(robot: Robot, scene: Scene, initial: FloatArray | None) -> Respons
         initial = np.maximum(initial, np.abs(table[:, :a] - table[scene.frames, :a].mean(axis=0)).max(axis=0))
     base = table[scene.frames].mean(axis=0) if initial is not None else np.abs(table).mean(axis=0)
     steps = 0.5 * np.ptp(table, axis=0)
+    pressed = (np.arange(len(steps)) >= a) & (base + steps > table.max(axis=0))
+    steps[pressed] *= -1.0  # no chamber is pressed harder than it was: it may blow up
 
     def places(at: FloatArray) -> FloatArray | None:
         held = _with_inputs(recording, np.broadcast_to(at, table.shape))

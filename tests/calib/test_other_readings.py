@@ -9,13 +9,21 @@ from functools import cache
 
 import numpy as np
 import pytest
-from arm import arm, record
+from arm import T_ROBOT_CAMERA, arm, record
+from hollow_bar_cable import hollow
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.other_readings import readings
 from femsense.core.arrays import freeze
 from femsense.core.errors import DataError
-from femsense.model.recording import Recording
+from femsense.core.pose import invert_pose, transform_points
+from femsense.core.work import counting
+from femsense.fem.mesh import embed_points
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.frame_state import solve_frame
+from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
+from femsense.model.robot import Observation, Robot, plain_actuation
 
 LEVELS = np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0.4, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0), (0, 0, 0, 0.5), (0, 0, 0.3, 0)])
 
@@ -99,3 +107,40 @@ def test_a_body_that_is_softer_or_stiffer_is_not_refused_for_gravity(modulus: fl
         calibrate(arm(modulus=modulus), recording)
     said = " ".join(str(item.message) for item in heard)
     assert "gravity" not in said and "times its declared modulus" in said
+
+
+# Chambers that other readings blow up
+
+POINTS = np.array([[x, y, z] for x in (0.03, 0.06, 0.09) for y, z in ((0.0, 0.0), (0.0, 0.03), (0.03, 0.0), (0.03, 0.03))])
+NAMES = tuple(f"m{i}" for i in range(len(POINTS)))
+
+
+@cache
+def bar(stiffness: float) -> Robot:
+    body = hollow(gravity=(0.0, 0.0, 0.0)).with_stiffness_scale(stiffness)
+    markers = embed_points(body.mesh, POINTS)
+    return Robot("bar", body, NAMES, POINTS, markers, np.zeros(0, np.int64), None, plain_actuation(1), Observation())
+
+
+def pressed(pressures: list[float], stiffness: float, *, late: int = 0) -> Recording:
+    """A bar; what is logged comes so many frames late."""
+    n, true, table = len(pressures), bar(stiffness), np.array(pressures)[:, None]
+    time = Timeline(np.arange(float(n)), free=np.ones(n, dtype=bool))
+    drives = Drives(("top",), np.zeros((n, 1)), chamber_names=("core",), pressures=table)
+    driven = DrivenRobot(true, drive_of(true, make_recording(time, drives=drives)))
+    places = np.vstack([true.markers.positions(solve_frame(driven, k).positions) for k in range(n)])
+    seen = transform_points(invert_pose(T_ROBOT_CAMERA), places) + 2e-4 * np.random.default_rng(1).normal(size=places.shape)
+    rows = MarkerRows(NAMES, np.repeat(np.arange(n), len(NAMES)), np.tile(np.arange(len(NAMES)), n), seen)
+    return make_recording(time, drives=replace(drives, pressures=np.roll(table, late, axis=0)), markers=rows)
+
+
+def test_a_reading_that_blows_a_chamber_up_is_left_after_few_steps() -> None:
+    with counting() as work:
+        assert calibrate(bar(0.15), pressed([0.0, 9e3, 18e3, 14e3, 16e3], 0.2)).rms_m > 5e-4
+    assert work.equilibria < 50  # 82 with all the steps on the way to half the modulus, and to the other law
+
+
+def test_no_chamber_is_pressed_harder_than_it_was() -> None:
+    pressures = [0.0, 10e3, 22e3, 5e3, 22e3, 15e3, 20e3]  # at their mean and half their range more it blows up
+    with pytest.raises(DataError, match=r"1 frames late"):
+        calibrate(bar(0.15), pressed(pressures, 0.155, late=-1))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import DATA, ROOT
+from scipy.spatial.transform import Rotation
 
 from femsense.core.pose import transform_points
 from femsense.fem.equilibrium import solve_equilibrium
@@ -17,7 +18,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.model.tie_spacing import tie_spacing
 
 sys.path.append(str(ROOT / "benchmarks"))
-from real import tentacle, trunk
+from real import arm, tentacle, trunk
 
 
 @pytest.fixture
@@ -57,3 +58,21 @@ def test_the_trunk_has_the_same_frames_with_and_without_its_weight(tmp_path: Pat
     assert len(recording.time_s) == 12 and len(recording.cable_names) == 12
     pairs = recording.inputs.reshape(12, 6, 2)
     np.testing.assert_allclose(pairs[..., 0], -pairs[..., 1])  # what one tendon is drawn, the other is paid out
+
+
+def test_a_rigid_body_of_the_arm_that_is_turned_by_half_a_turn_is_where_it_was() -> None:
+    rows = np.zeros((2, 38))
+    rows[:, 20:24] = rows[:, 27:31] = 0.0, 0.0, 0.0, 1.0
+    bent = Rotation.from_euler("y", 66.0, degrees=True)
+    rows[:, 34:38] = [(bent * Rotation.from_euler("z", turn, degrees=True)).as_quat() for turn in (0.0, 180.0)]
+    once, turned = arm.along_x(rows, arm.BODIES["tip"])
+    np.testing.assert_allclose(once, turned, atol=1e-12)
+    np.testing.assert_allclose(once, 1e-3 * arm.ARM_MM * bent.as_matrix()[:, 0], atol=1e-12)
+
+
+def test_states_of_the_arm_that_are_held_repeat() -> None:
+    if not (DATA / "arm").is_dir():
+        pytest.skip("data/arm is not here")
+    states = arm.read_states(DATA / "arm", "apr_4_1")
+    held = np.array([s.markers for s in states[:4]])  # two holds at the same pressures
+    assert np.linalg.norm(held - held.mean(axis=0), axis=2).max() < 1e-3
