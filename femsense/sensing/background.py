@@ -12,6 +12,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.model.camera_frame import undo_depth
 from femsense.pointcloud.local_planes import LocalPlanes, local_planes
+from femsense.pointcloud.rays import GRAZING
 from femsense.sensing.measurement_rows import depth_std
 from femsense.sensing.types import Sensor
 
@@ -70,6 +71,9 @@ def off_background(
 ) -> tuple[FloatArray, FloatArray]:
     """Return how far points lie off the background, in standard deviations, shape (g,), and how that moves with pose steps, shape (g, 6 v).
 
+    Where the background's plane is seen at a grazing angle, a point says nothing, as on the body: both are 0. There depth hardly moves a point off
+    the plane, so that it seemed infinitely sure, and the equations of a frame had no solution.
+
     Arguments:
         poses: of the cameras, as the points are to be placed.
     """
@@ -80,6 +84,7 @@ def off_background(
     depth = np.linalg.norm(ray, axis=1)
     slant = np.abs(np.einsum("gc,gc->g", ray, normal)) / depth
     std = np.hypot(depth_std(sensor, depth, glance.view) * slant, background.rough[nearest])
+    std[slant < GRAZING] = np.inf
     by_pose = np.zeros((len(points), len(poses), 6))
     by_pose[np.arange(len(points)), glance.view] = np.hstack([np.cross(points - sensor.pivot, normal), normal])
     off = np.einsum("gc,gc->g", points - background.middles[nearest], normal)

@@ -11,7 +11,8 @@ from touched_arm import PLACE, touched
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.pose import moved_poses
-from femsense.sensing.background import look, off_background
+from femsense.pointcloud.local_planes import local_planes
+from femsense.sensing.background import Glance, look, off_background
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import FrameReport
@@ -70,3 +71,18 @@ def test_points_off_the_background_move_with_the_pose_as_their_derivative_says(t
     there, _ = off_background(sensor, sensor.background, glance, moved_poses(sensor.calibration.poses, step, sensor.pivot))
     assert np.median(np.abs(here)) < 1.0
     assert np.quantile(np.abs(there - here - by_pose @ step), 0.9) < 0.05 * np.abs(by_pose @ step).max()
+
+
+def test_a_plane_that_is_seen_edge_on_says_nothing(tmp_path):
+    """Depth does not move points off it: they were known without bound, and the equations of the pose had no solution."""
+    seen = touched(tmp_path, np.zeros(3), ball=False, wall=True)
+    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    T = sensor.calibration.poses[0]
+    y, z = np.meshgrid(np.linspace(-0.1, 0.1, 12), np.linspace(0.4, 0.6, 12))
+    across = np.stack([y.ravel(), 0.3 * z.ravel(), z.ravel()], axis=1)  # contains the camera's ray, as y = 0.3 z holds its centre
+    facing = np.stack([y.ravel(), z.ravel() - 0.5, np.full(144, 0.5)], axis=1)
+    for points, said in ((across, False), (facing, True)):
+        planes = local_planes(points @ T[:3, :3].T + T[:3, 3])
+        glance = Glance(points + np.array([0.0, 1e-3, 1e-3]), np.zeros(144, dtype=np.int64))
+        off, by_pose = off_background(sensor, planes, glance, sensor.calibration.poses)
+        assert (np.abs(off) > 0).any() == said and (np.abs(by_pose) > 0).any() == said
