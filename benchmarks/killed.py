@@ -1,9 +1,10 @@
 """`kill -9` in the middle of `simulate` and of `estimate`, and run again: is the result the same?
 
     python benchmarks/killed.py ROBOT SCRIPT [--after SECONDS]
+    python benchmarks/killed.py ROBOT --recording RECORDING [--calibration FILE]
 
-Each command runs once without a break, and once killed again and again after so many seconds of work until it ends. Recordings
-are compared byte by byte, runs by their contacts.
+Each command runs once without a break, and once killed again and again until it ends: `simulate` after so many seconds of work, `estimate`
+at each moment of MOMENTS, which the files tell that it writes. Recordings are compared byte by byte, runs by their contacts, frames and states.
 """
 
 from __future__ import annotations
@@ -15,62 +16,141 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from femsense.io.files import folder_hash
+from femsense.io.checkpoint import UNFINISHED
+from femsense.io.files import PART_PREFIX, folder_hash
+from femsense.io.folder_lock import lock_of
 
 MOST_KILLS = 40
+PREPARES_S = 0.7
+"""So long after the files are read it prepares: free frames are looked at, and no frame is done [s]."""
+
+
+def started(words: list[str]) -> subprocess.Popen[bytes]:
+    """Start a command of femsense."""
+    return subprocess.Popen([sys.executable, "-m", "femsense", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def ended(run: subprocess.Popen[bytes], words: list[str]) -> None:
+    """Demand that a command has ended well."""
+    if run.wait():
+        raise SystemExit(f"{' '.join(words)} ended with {run.returncode}")
 
 
 def killed(words: list[str], after: float) -> int:
     """Run a command until it ends by itself, killed after so many seconds each time; return how often it was."""
     for kills in range(MOST_KILLS):
-        run = subprocess.Popen([sys.executable, "-m", "femsense", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        run = started(words)
         try:
             run.wait(after)
         except subprocess.TimeoutExpired:
             run.send_signal(signal.SIGKILL)
             run.wait()
             continue
-        if run.returncode:
-            raise SystemExit(f"{' '.join(words)} ended with {run.returncode}")
+        ended(run, words)
         return kills
     raise SystemExit(f"{' '.join(words)} was killed {MOST_KILLS} times and is not done")
 
 
-def contacts(folder: Path) -> np.ndarray:
-    """Return frame, place and force of each contact of a run, a row each."""
-    names = ("frame", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n")
-    with (folder / "contacts.csv").open(encoding="utf-8") as stream:
-        return np.array([[float(row[name]) for name in names] for row in csv.DictReader(stream)]).reshape(-1, len(names))
+def _prepares(folder: Path, since: float) -> bool:
+    lock = lock_of(folder)
+    return lock.is_file() and max(lock.stat().st_mtime, since) + PREPARES_S < time.time()
+
+
+def _is_between_frames(folder: Path, since: float) -> bool:
+    return (folder / UNFINISHED).is_file() and (folder / UNFINISHED).stat().st_mtime > since
+
+
+def _keeps_a_frame(folder: Path, since: float) -> bool:
+    return any(folder.glob(f"{PART_PREFIX}*{UNFINISHED}"))
+
+
+def _writes_the_run(folder: Path, since: float) -> bool:
+    return any(folder.parent.glob(f"{PART_PREFIX}*-{folder.name}/*"))
+
+
+MOMENTS: dict[str, Callable[[Path, float], bool]] = {
+    "prepares": _prepares,
+    "has kept some frames": _is_between_frames,
+    "keeps frames": _keeps_a_frame,
+    "writes the run": _writes_the_run,
+}
+
+
+def killed_when(words: list[str], folder: Path, moment: Callable[[Path, float], bool]) -> bool:
+    """Run a command and kill it at a moment; return whether it came to that before it ended."""
+    since, run = time.time(), started(words)
+    while run.poll() is None:
+        if moment(folder, since):
+            run.send_signal(signal.SIGKILL)
+            run.wait()
+            return True
+        time.sleep(0.0)  # a run is written in a few milliseconds
+    ended(run, words)
+    return False
+
+
+def numbers(file: Path, names: tuple[str, ...]) -> np.ndarray:
+    """Return columns of a table."""
+    with file.open(encoding="utf-8") as stream:
+        return np.array([[float(row[name] or "nan") for name in names] for row in csv.DictReader(stream)]).reshape(-1, len(names))
+
+
+def difference(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the largest difference; NaN where there are more of one."""
+    return float(np.nanmax(np.abs(first - second), initial=0.0)) if first.shape == second.shape else np.nan
+
+
+def compared(whole: Path, broken: Path) -> str:
+    """Return in words how two runs differ."""
+    columns = ("frame", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "std_n")
+    contacts, others = (numbers(run / "contacts.csv", columns) for run in (whole, broken))
+    frames = [
+        numbers(run / "frames.csv", ("frame", "contacts", "matched", "rms_before_m", "rms_after_m")) for run in (whole, broken)
+    ]
+    with np.load(whole / "states.npz") as one, np.load(broken / "states.npz") as other:
+        nodes = difference(one["nodes_m"], other["nodes_m"])
+    return (
+        f"{len(contacts)} and {len(others)} contacts in {len(frames[0])} frames; largest difference of contacts {difference(contacts, others):.2g}, "
+        f"of frames {difference(*frames):.2g}, of nodes {nodes:.2g} m"
+    )
 
 
 def main() -> None:
     """Print what became of both commands."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robot")
-    parser.add_argument("script")
+    parser.add_argument("script", nargs="?")
     parser.add_argument("--after", type=float, default=25.0)
+    parser.add_argument("--recording")
+    parser.add_argument("--calibration")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        root = Path(name)
-        began = time.perf_counter()
-        for kind, after in (("whole", 1e6), ("killed", given.after)):
-            kills = killed(["simulate", given.robot, given.script, "-o", str(root / kind)], after)
-            print(f"simulate {kind}: killed {kills} times, {time.perf_counter() - began:.0f} s", flush=True)
-        same = folder_hash(root / "whole") == folder_hash(root / "killed")
-        print("simulate: the same bytes" if same else "simulate: OTHER bytes", flush=True)
-        for kind, after in (("whole", 1e6), ("killed", given.after)):
-            kills = killed(["estimate", given.robot, str(root / "whole"), "-o", str(root / f"run-{kind}")], after)
-            print(f"estimate {kind}: killed {kills} times, {time.perf_counter() - began:.0f} s", flush=True)
-        first, second = contacts(root / "run-whole"), contacts(root / "run-killed")
-        alike = first.shape == second.shape
-        print(
-            f"estimate: {len(first)} and {len(second)} contacts, largest difference "
-            f"{np.abs(first - second).max(initial=0.0) if alike else np.nan:.2g}"
-        )
+        root, began = Path(name), time.perf_counter()
+        recording = given.recording or simulated(given.robot, given.script, given.after, root)
+        words = ["estimate", given.robot, recording, *(["-c", given.calibration] if given.calibration else []), "-o"]
+        killed([*words, str(root / "run-whole")], 1e6)
+        print(f"estimate whole: {time.perf_counter() - began:.0f} s", flush=True)
+        for what, moment in MOMENTS.items():
+            caught = killed_when([*words, str(root / "run-killed")], root / "run-killed", moment)
+            print(f"estimate {'killed where it' if caught else 'ended, and never'} {what}", flush=True)
+        killed([*words, str(root / "run-killed")], 1e6)
+        print(f"estimate: {compared(root / 'run-whole', root / 'run-killed')}; {time.perf_counter() - began:.0f} s")
+
+
+def simulated(robot: str, script: str, after: float, root: Path) -> str:
+    """Return the recording of a script, made once without a break and once killed after so many seconds each time."""
+    began = time.perf_counter()
+    for kind, seconds in (("whole", 1e6), ("killed", after)):
+        kills = killed(["simulate", robot, script, "-o", str(root / kind)], seconds)
+        print(f"simulate {kind}: killed {kills} times, {time.perf_counter() - began:.0f} s", flush=True)
+    same = folder_hash(root / "whole") == folder_hash(root / "killed")
+    print("simulate: the same bytes" if same else "simulate: OTHER bytes", flush=True)
+    return str(root / "whole")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from femsense.calib.rigid import fit_rigid
 from femsense.calib.single_inputs import check_single_inputs
 from femsense.calib.still_camera import check_camera_still
 from femsense.calib.without_fit import as_declared, from_rest
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult
 from femsense.core.parallel import one_blas_thread
@@ -96,7 +96,7 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     allowed = None
     if has_image_markers(robot, recording):
         recording, allowed = with_image_markers(robot, recording, _thinned(chosen))
-    by_clouds = views_without_markers(recording)
+    by_clouds = views_without_markers(recording, chosen)
     seen = _as_declared(recording, by_clouds)
     seen = name_markers(robot, seen, _thinned(np.intersect1d(chosen, seen.unnamed_frame)), allowed=allowed)
     if len(seen.marker_frame):
@@ -140,7 +140,15 @@ def _by_markers(robot: Robot, recording: Recording, chosen: IntArray) -> Calibra
 def _as_declared(recording: Recording, views: Sequence[int]) -> Recording:
     """Return the recording with some pose for cameras whose pose is found later; no marker is seen by them."""
     poses = tuple(np.eye(4) if v in views else T for v, T in enumerate(recording.T_robot_camera))
-    return replace(recording, T_robot_camera=poses)
+    rows = ~np.isin(recording.marker_view, views)
+    return replace(
+        recording,
+        T_robot_camera=poses,
+        marker_frame=freeze(recording.marker_frame[rows], np.int64),
+        marker_index=freeze(recording.marker_index[rows], np.int64),
+        marker_view=freeze(recording.marker_view[rows], np.int64),
+        marker_xyz=freeze(recording.marker_xyz[rows]),
+    )
 
 
 def calibrated_start(

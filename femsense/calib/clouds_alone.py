@@ -9,8 +9,9 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.cloud_pose_search import View, find_cloud_pose
+from femsense.calib.first_poses import in_line
 from femsense.calib.from_clouds import refine_poses
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.io.clouds.frame_clouds import read_frame_cloud
@@ -33,16 +34,27 @@ UNDETERMINED = 0.5
 """A direction is not determined where the clouds leave this share of START_STD."""
 
 
-def views_without_markers(recording: Recording) -> list[int]:
-    """Return cameras whose pose is not declared and that see clouds but no marker."""
-    seen = set(recording.marker_view.tolist()) | set(recording.unnamed_view.tolist())
+def views_without_markers(recording: Recording, frames: IntArray) -> list[int]:
+    """Return cameras whose pose is not declared and that see clouds, but no markers that tell a pose in the frames that can be used:
+    three in one frame, and not all in a line."""
+    seen = set(recording.unnamed_view.tolist())
     if recording.rest is not None:
         seen |= set(recording.rest.view.tolist())
     return [
         v
         for v, T in enumerate(recording.T_robot_camera)
-        if T is None and v not in seen and any(files[v] is not None for files in recording.cloud_files)
+        if T is None
+        and v not in seen
+        and any(files[v] is not None for files in recording.cloud_files)
+        and not _markers_tell_pose(recording, frames, v)
     ]
+
+
+def _markers_tell_pose(recording: Recording, frames: IntArray, view: int) -> bool:
+    """Return whether the named markers that a camera sees can tell its pose."""
+    mine = (recording.marker_view == view) & np.isin(recording.marker_frame, frames)
+    most = np.bincount(recording.marker_frame[mine]).max(initial=0)
+    return bool(most >= 3 and not in_line(recording.marker_xyz[mine]))
 
 
 def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> Calibration:

@@ -14,6 +14,7 @@ from clouded_arm import EYES, with_clouds
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.cloud_pose_search import difference
+from femsense.calib.clouds_alone import views_without_markers
 from femsense.calib.visible_side import bare_from
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
@@ -30,6 +31,13 @@ def with_markers(bare: Recording, recording: Recording, T_robot_camera: FloatArr
     seen = transform_points(invert_pose(T_robot_camera) @ T_ROBOT_CAMERA, recording.marker_xyz)
     rows = {name: getattr(recording, name) for name in ("marker_frame", "marker_index", "marker_view")}
     return replace(bare, **rows, marker_xyz=seen)
+
+
+def only(recording: Recording, names: tuple[str, ...]) -> Recording:
+    """Return a recording with some of the markers alone."""
+    kept = np.isin(recording.marker_index, [arm().marker_names.index(name) for name in names])
+    rows = {name: getattr(recording, name)[kept] for name in ("marker_frame", "marker_index", "marker_view", "marker_xyz")}
+    return replace(recording, **rows)
 
 
 def off(T: FloatArray, true: FloatArray) -> tuple[float, float]:
@@ -60,6 +68,21 @@ def test_one_camera_sees_markers_and_the_other_only_clouds(tmp_path: Path) -> No
         assert turn < 1.5
         assert shift < limit
     assert np.isfinite(calibration.rms_m)
+
+
+def test_markers_that_tell_no_pose_leave_it_to_the_clouds(tmp_path: Path) -> None:
+    """Two in a frame, or three in a line."""
+    recording, states = record(INPUTS)
+    bare, poses = with_clouds(tmp_path, recording, states, EYES[:1], clutter=False, colored=True)
+    marked = with_markers(bare, recording, poses[0])
+    two, three = (only(marked, names) for names in (("m0", "m4"), ("m2", "m6", "m10")))
+    along = replace(three, marker_xyz=np.arange(6.0)[:, None] * np.array([0.01, 0.02, 0.0]) + 1e-4 * np.eye(6)[:, :3])
+    assert [views_without_markers(one, np.arange(2)) for one in (marked, two, three, along)] == [[], [0], [], [0]]
+    calibration = calibrate(arm(), two)
+    turn, shift = off(calibration.poses[0], poses[0])
+    assert turn < 1.5
+    assert shift < 1.5e-3
+    assert "cameras placed by clouds alone" in calibration.status
 
 
 def test_a_body_with_a_symmetry_is_refused(tmp_path: Path) -> None:
