@@ -15,7 +15,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.camera import Camera
-from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.cloud import PointCloud, cloud_from_depth
 
 BLUE, GRAY, TINTED = [0.2, 0.4, 0.8], [0.12, 0.12, 0.13], [0.05, 0.09, 0.19]
 
@@ -53,15 +53,19 @@ def test_a_dark_point_is_of_the_robot_where_those_around_it_are(tmp_path, shadow
     assert scan.points((T_ROBOT_CAMERA,))[:, 2].max() < 0.011
 
 
-def test_pixels_that_saw_two_surfaces_are_no_points_of_a_scan(tmp_path):
-    """A step of 20 mm seen from above, with a column of pixels half way between."""
+@pytest.mark.parametrize("name", ["0.png", "0.ply"])
+def test_pixels_that_saw_two_surfaces_are_no_points_of_a_scan(tmp_path, name):
+    """A step of 20 mm seen from above, with a column of pixels half way between; as an image, and as a file of its points."""
     depth = np.full((16, 40), 2900, dtype=np.uint16)
     depth[:, 20], depth[:, 21:] = 3000, 3100
-    cv2.imwrite(str(tmp_path / "0.png"), depth)
+    if name == "0.png":
+        cv2.imwrite(str(tmp_path / name), depth)
+    else:
+        write_cloud(tmp_path / name, cloud_from_depth(depth, 300.0, 300.0, 19.5, 7.5, depth_unit_m=1e-4))
     above = make_pose(rotation_from_vector([np.pi, 0.0, 0.0]), [0.05, 0.0, 0.3])
     recording, _ = record(np.zeros((1, 4)), noise=0.0)
     camera = Camera("", 40, 16, 300.0, 300.0, 19.5, 7.5, np.zeros(5), 1e-4)
-    recording = replace(recording, cameras=(camera,), cloud_files=((tmp_path / "0.png",),), color_files=((None,),))
+    recording = replace(recording, cameras=(camera,), cloud_files=((tmp_path / name,),), color_files=((None,),))
     scan = read_scan(arm(), recording, 0, (above,), arm().body.mesh.nodes)
     assert scan is not None
     heights = np.unique(scan.points((above,))[:, 2].round(6))

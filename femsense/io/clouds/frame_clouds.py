@@ -33,7 +33,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool
         recording: the recording.
         k: index of the frame.
         view: index of the camera.
-        mixed: whether pixels of depth images count that saw two surfaces at once (see `without_mixed_pixels`).
+        mixed: whether pixels count that saw two surfaces at once (see `without_mixed_pixels`, and for files `without_mixed_points`).
 
     Raises:
         InputError: a file that is broken, or of another size than the camera table says.
@@ -44,9 +44,11 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool
     if file.suffix.lower() == ".png":
         return _cloud_of_images(file, recording.color_files[k][view], recording.cameras[view], mixed)
     from femsense.io.clouds.cloud_files import read_cloud
+    from femsense.pointcloud.pixel_grid import without_mixed_points
 
     try:
-        return read_cloud(file)
+        cloud = read_cloud(file)
+        return cloud if mixed else without_mixed_points(cloud)
     except InputError:
         raise
     except Exception as error:
