@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import shutil
 import signal
 import subprocess
 import sys
@@ -77,7 +78,7 @@ def _keeps_a_frame(folder: Path, since: float) -> bool:
 
 
 def _writes_the_run(folder: Path, since: float) -> bool:
-    return any(folder.parent.glob(f"{PART_PREFIX}*-{folder.name}/*"))
+    return any(any(folder.parent.glob(f"{PART_PREFIX}*{of}")) for of in (f"-{folder.name}/*.csv", f"-{folder.name}/*.npz"))
 
 
 MOMENTS: dict[str, Callable[[Path, float], bool]] = {
@@ -158,6 +159,8 @@ def main() -> None:
         print(f"estimate whole: {time.perf_counter() - began:.0f} s", flush=True)
         for what, moment in MOMENTS.items():
             caught = killed_when([*words, str(root / "run-killed")], root / "run-killed", moment)
+            if not caught:  # the next moment needs a run that is not done
+                shutil.rmtree(root / "run-killed")
             print(f"estimate {'killed where it' if caught else 'ended, and never'} {what}", flush=True)
         killed([*words, str(root / "run-killed")], 1e6)
         print(f"estimate: {compared(root / 'run-whole', root / 'run-killed')}; {time.perf_counter() - began:.0f} s")

@@ -21,7 +21,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.factorization import Pattern
 from femsense.fem.linalg.symbolic import Analysis
 from femsense.fem.stencil import FreeMap
-from femsense.io.files import json_text, write_beside
+from femsense.io.files import PART_PREFIX, json_text, write_beside
 from femsense.model.effects import Effect
 
 Progress = TypeVar("Progress")
@@ -82,10 +82,14 @@ class Checkpoint:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Remove the file, and its folder where it is empty, after a result and after an error that would come again."""
+        """Remove the file, and its folder where it is empty, after a result and after an error that would come again.
+
+        With it goes what was left by a computation that was killed while it wrote the file.
+        """
         if self.file is not None and (error is None or isinstance(error, FemsenseError)):
             with contextlib.suppress(OSError):
-                self.file.unlink(missing_ok=True)
+                for file in (self.file, *self.file.parent.glob(f"{PART_PREFIX}*-{self.file.name}")):
+                    file.unlink(missing_ok=True)
                 self.file.parent.rmdir()
 
 

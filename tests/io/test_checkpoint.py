@@ -21,6 +21,7 @@ from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.search.search_state import SearchProgress
 from femsense.model.effects import FORMS, apply_effects
 from femsense.sensing import pipeline
+from femsense.sensing.types import Done
 
 HIDDEN = [{"name": "cable_friction", "coefficient": 0.2}]
 TIP, FORCE = np.array([0.1, 0.0, 0.01]), np.array([0.01, 0.08, -0.15])
@@ -95,6 +96,16 @@ def test_a_file_from_elsewhere_runs_nothing(tmp_path: Path, call: Callable[..., 
     assert checkpoint.kept(SearchProgress) is None and not made.exists()
     pickle.loads(pickle.dumps(hostile))
     assert made.exists()  # anyone else would have run it
+
+
+def test_what_was_left_by_one_that_was_killed_while_it_wrote_goes_at_the_end(tmp_path: Path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / ".part-0a1b-.unfinished").write_bytes(b"half")
+    with Checkpoint((folder / ".unfinished", MADE_FROM)) as checkpoint:
+        checkpoint.keep(Done())
+        assert checkpoint.kept(Done) is not None
+    assert not folder.exists()
 
 
 def test_an_error_that_would_come_again_leaves_nothing(tmp_path: Path):
