@@ -64,6 +64,8 @@ class Shape:
     """How far behind what was seen of it its surface may lie: the thickness of a plate whose other side touches [m]."""
     surface: Surface | None = field(default=None, repr=False)
     """Of a known one, where it stands."""
+    edge_m: float = 0.0
+    """Where its points lie within this of a body's surface, a camera may have seen that body's edge [m]."""
 
     def towards(self, body: FloatArray) -> Shape:
         """Return the shape with the side that faces a body; places of its surface [m], shape (k, 3). Only a plate has two sides.
@@ -146,7 +148,7 @@ def find_shapes(
         group, left = left[0], left[1:]
         own = near[group]
         close = group[own <= own.min() + local_m]
-        if len(close) < 3 or (edge is not None and (np.abs(own) > edge[group]).mean() < OUTLIERS):
+        if len(close) < 3 or (edge is not None and is_edge(own, edge[group])):
             continue
         shape = fit(points[close], std[close], origins[close])
         # the other end of a rod that passes behind, the table in pieces
@@ -155,8 +157,13 @@ def find_shapes(
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])
             shape = fit(points[close], std[close], origins[close])
-        result.append(shape)
+        result.append(shape if edge is None else replace(shape, edge_m=float(np.median(edge[close]))))
     return result
+
+
+def is_edge(gap: FloatArray, edge: FloatArray | float) -> bool:
+    """Return whether points that lie so far from a body's surface [m], shape (k,), are what a camera shows of its edge, up to `edge` off [m]."""
+    return bool((np.abs(gap) > edge).mean() < OUTLIERS)
 
 
 def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

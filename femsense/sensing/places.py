@@ -14,7 +14,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
-from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape
+from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape, is_edge
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.measurement_rows import depth_std
 from femsense.sensing.touches import make_touch
@@ -115,8 +115,13 @@ def _fit_of(tool: Tool, points: FloatArray, std: FloatArray, origins: FloatArray
 
 
 def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> list[Touch]:
-    """Return where completed objects touch a state, the nearest part of each."""
-    found = [_touch(sensor, shape, state) for shape in shapes]
+    """Return where completed objects touch a state, the nearest part of each.
+
+    A force may have moved the body to where points of its own, at an edge or in a dark crease, were taken for an object.
+    """
+    body = Surface(state.positions, sensor.surface.triangles)
+    others = [shape for shape in shapes if shape.edge_m == 0.0 or not is_edge(body.gap(shape.points), shape.edge_m)]
+    found = [_touch(sensor, shape, state) for shape in others]
     return [touch for touch in found if touch is not None]
 
 

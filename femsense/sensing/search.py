@@ -241,13 +241,13 @@ def _held(
 
 
 def nothing_new(sensor: Sensor, fit: Fit, found: Sequence[Touch]) -> bool:
-    """Return whether a fit leaves nothing to be explained by another contact: objects touch where it has contacts, each of its contacts is sure,
-    and nowhere on the surface another one gains enough.
+    """Return whether a fit leaves nothing to be explained by another contact: objects touch where it has contacts, each of its contacts is sure
+    or where an object still touches, and nowhere on the surface another one gains enough.
 
     Arguments:
         found: where objects touch in the state of the fit.
     """
-    if any(v < SURE and not unspoken(fit, i) for i, v in enumerate(chi_squared(fit))):
+    if any(v < SURE and not (unspoken(fit, i) and _near(sensor, fit.touches[i], found)) for i, v in enumerate(chi_squared(fit))):
         return False
     if any(t.source != "cloud" and _near(sensor, t, found) for t in fit.touches):
         return False
@@ -291,7 +291,7 @@ def held_on(
         if seen:
             result.append(_moved_on(sensor, touch, found[j]) if sure[i] else replace(found[j], std_m=0.0))
         elif sure[i] and not (gone and touch.source == "cloud"):
-            result.append(touch)
+            result.append(replace(touch, source="shape"))
         kept += [i] * (len(result) - len(kept))
     new = [f for j, f in enumerate(found) if not len(touches) or gap[:, j].min() >= reach[j]]
     return [*result, *new], np.array([*kept, *(-1 for _ in new)], dtype=np.int64)

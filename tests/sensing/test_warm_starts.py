@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import arm
+from scipy.spatial import cKDTree
 from touched_arm import touched
 
 from femsense.calib.calibrate import calibrate
+from femsense.pointcloud.primitives import Shape
 from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.pipeline import sense_frame
+from femsense.sensing.places import object_touches
 from femsense.sensing.prepare import condensed_at, make_sensor, scan_of
 from femsense.sensing.responses import response_at
 from femsense.sensing.search import held_on, nothing_new
@@ -64,7 +67,8 @@ def test_a_touch_moves_on_with_its_object(pushed):
 def test_what_is_gone_is_left_out_and_what_is_new_is_fitted_along(pushed):
     sensor, frame = pushed
     assert held_on(sensor, frame.touches, [], (True,), gone=True)[0] == []
-    assert held_on(sensor, frame.touches, [], (True,))[0] == [frame.touches[0]]
+    (unseen,), _ = held_on(sensor, frame.touches, [], (True,))
+    assert unseen.place is frame.touches[0].place and unseen.source == "shape"  # nothing is seen to touch there any more
     assert held_on(sensor, frame.touches, [], (False,))[0] == []
     other = make_touch(sensor, AWAY, source="cloud", std_m=1e-3)
     held, kept = held_on(sensor, frame.touches, [frame.touches[0], other], (False,))
@@ -77,6 +81,23 @@ def test_a_fit_is_enough_where_it_leaves_nothing_to_another_contact(pushed, fits
     assert nothing_new(sensor, fit, frame.touches)
     assert not nothing_new(sensor, fit, [*frame.touches, make_touch(sensor, AWAY, source="cloud")])
     assert not nothing_new(sensor, free, [])  # the shape betrays a touch
+    other = make_touch(sensor, AWAY, source="cloud", std_m=1e-3)
+    scan = scan_of(sensor, 3, frame.state)
+    assert scan is not None
+    beside = fit_forces(sensor, 3, condensed_at(sensor, scan, frame.state), [*frame.touches, other], free)
+    assert nothing_new(sensor, beside, [*frame.touches, other])
+    assert not nothing_new(sensor, beside, frame.touches)  # what seemed to touch there does not in this state
+
+
+def test_points_of_the_body_itself_touch_nothing_in_the_state_that_the_force_makes(pushed):
+    """A dark crease is not of the body's colour: in the state without forces its points lie beside the body."""
+    sensor, frame = pushed
+    upper = frame.state.positions[np.isclose(sensor.robot.body.mesh.nodes[:, 2], 0.01)]
+    crease = upper[np.linalg.norm(upper - frame.touches[0].place, axis=1) < 0.02]
+    shape = Shape("points", crease.mean(axis=0), np.eye(3), np.zeros(3), 0.0, 0.006, crease, cKDTree(crease), edge_m=0.0015)
+    assert object_touches(sensor, [shape], frame.free_state)
+    assert not object_touches(sensor, [shape], frame.state)
+    assert object_touches(sensor, [replace(shape, edge_m=0.0)], frame.state)
 
 
 def test_a_state_is_foretold_by_the_inputs(pushed):
