@@ -160,8 +160,13 @@ def objects_known(fit: Fit, touching: Sequence[Touch], elsewhere: Sequence[Touch
     most = [float(np.linalg.norm(fit.forces[i])) + 2.0 * _std_along(fit, i) for i in silent]
     sure = [_std_along(fit, i) for i, value in enumerate(chi_squared(fit)) if value >= SURE]
     if most and max(most) > max(sure):
-        return f"{UNKNOWN}, up to {max(most):.2g} N, beside those that are reported"
-    return f"{UNKNOWN}: too small to be sensed" if touching and not fit.touches else OK
+        where = _at_rest(fit.touches[silent[int(np.argmax(most))]])
+        return f"{UNKNOWN}, up to {max(most):.2g} N {where}, beside those that are reported"
+    return f"{UNKNOWN}: too small to be sensed, {_at_rest(touching[0])}" if touching and not fit.touches else OK
+
+
+def _at_rest(touch: Touch) -> str:
+    return f"at [{', '.join(f'{1e3 * x:.0f}' for x in touch.place)}] mm of the body at rest"
 
 
 def seen_elsewhere(sensor: Sensor, fit: Fit, found: Sequence[Touch]) -> list[Touch]:

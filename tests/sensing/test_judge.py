@@ -56,7 +56,10 @@ def test_a_frame_with_a_force_that_is_not_known_is_not_ok():
     assert objects_known(sure, sure.touches) == "ok"
     assert objects_known(weak, weak.touches[:1]) == "ok"  # the other one is scenery
     said = objects_known(weak, weak.touches)
-    assert said == "an object may touch whose force is not known, up to 0.04 N, beside those that are reported"
+    where = ", ".join(f"{1e3 * x:.0f}" for x in weak.touches[1].place)
+    assert said == (
+        f"an object may touch whose force is not known, up to 0.04 N at [{where}] mm of the body at rest, beside those that are reported"
+    )
     known = replace(weak, covariance=np.diag([1e-4] * 3 + [1e-12] * 3), forces=np.array([[0.0, 0.0, -0.2], [0.0, 0.0, -1e-6]]))
     assert objects_known(known, known.touches) == "ok"  # the shape says that it carries nothing
     none = fit_of([], [])
