@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from ablation_cases import make_problem, tuning_cases
+from ablation_watch import SEEN, predicting_best_watched, table_of_best
 from loop import answer_set, named
 from loop_cases import Case
 
@@ -114,7 +115,8 @@ class Switch:
                 setattr(module, name, known)
 
 
-BASE = Switch("all rules")
+BEST = "what predicts best"
+BASE = Switch("all rules", {}, {}, {"search.swaps.predicting_best": predicting_best_watched})
 SEARCH = (
     Switch("sweeps_for", {"sweeps_for": -INF}),
     Switch("held_gain", {"held_gain": -1e9}),
@@ -149,7 +151,10 @@ SEARCH = (
     Switch("surely predicts", {}, {}, {"search.acceptance.surely_predicts": zero}),
     Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
     Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
-    Switch("what predicts best", {}, {}, {"search.swaps.predicting_best": as_found}),
+    Switch(BEST, {}, {}, {"search.swaps.predicting_best": as_found}),
+    Switch("some states", {}, {"work": 0}, {"data.representative_states.FEWEST": 8}),
+    Switch("fewer states", {}, {"work": 0}, {"data.representative_states.FEWEST": 4}),
+    Switch("nearly all states", {}, {"work": 0}, {"data.representative_states.FEWEST": 12, "search.some_states.SPARED": 1.0}),
     Switch("weights with the error", {}, {}, {"search.search.nothing_explains": nothing}),
 )
 """Rules of the search, each with a search of its own."""
@@ -200,6 +205,7 @@ def run_job(job: Job) -> list[dict[str, Any]]:
     records = []
     for switch in job.switches:
         began = time.process_time()
+        SEEN.clear()
         try:
             with switch.in_force():
                 data, search = search_recordings(problem.declared, problem.recordings, options=switch.options())
@@ -209,6 +215,7 @@ def run_job(job: Job) -> list[dict[str, Any]]:
             continue
         spent = time.process_time() - began
         records.append(_concluded(about, switch, lambda d=data, s=search: conclude(d, s, np.random.default_rng(0)), spent))
+        records[-1]["best"] = list(SEEN)
         for other in job.concluded if switch is job.switches[0] else ():
             asked = replace(data, thresholds=other.options().thresholds)
             records.append(_concluded(about, other, lambda d=asked, s=search: conclude(d, s, np.random.default_rng(0)), spent))
@@ -313,6 +320,7 @@ def table(records: Sequence[dict[str, Any]]) -> None:
     for name, (score, _) in SCORES.items():
         values = [v for r in base.values() if (v := score(r)) is not None]
         print(f"  {name:16s}{100 * np.mean(values):5.1f} % of {len(values)}")
+    table_of_best(list(base.values()))
     print(f"\n{'without':22s}{'cases':>6s}" + "".join(f"{name:>18s}" for name in SCORES) + f"{'time':>8s}{'changed':>9s}")
     for switch in (*SEARCH, *VERDICT):
         pairs = [(base[case], r) for (case, name), r in done.items() if name == switch.name and case in base]

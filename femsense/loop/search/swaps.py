@@ -12,7 +12,7 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
-from femsense.loop.fit.cross_validation import sweeps_predicted
+from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweeps_predicted
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
@@ -24,6 +24,7 @@ from femsense.loop.search.location_search import closer, may_lie_elsewhere
 from femsense.loop.search.refit import beyond, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit, at_step
+from femsense.model.recording import state_key
 
 History = list[tuple[str, FittedModel]]
 
@@ -61,7 +62,7 @@ def predicting_best(
     n_effective: float,
     say: Progress,
 ) -> tuple[History, list[RefitRecord]]:
-    """Return a history and its refits with each effect replaced by one that may stand for it and predicts held-out data better.
+    """Return a history and its refits with each effect replaced by one that may stand for it and surely predicts held-out data better.
 
     This is for weights that hold the error of the model: how far an effect is ahead then says how well it makes up for that error where fitted, too.
     """
@@ -74,6 +75,16 @@ def predicting_best(
             best = list(dict.fromkeys(better))[: data.effort.alternatives]
             history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, say, by_held_out=True)
     return history, refits
+
+
+def surely_closer(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
+    """Return whether another model is closer to the held-out states, each compared with itself, by more than the standard error of that."""
+    falls = dict[tuple[int, bytes], list[float]]()
+    for i, (trial, own, new) in enumerate(zip(data.held, fitted.held_residuals, other.held_residuals)):
+        for k, fall in zip(trial.scene.frame, (own**2 - new**2).sum(axis=1)):
+            falls.setdefault((i, state_key(trial.scene.recording, int(k))), []).append(float(fall))
+    means = np.array([np.mean(own) for own in falls.values()])
+    return len(means) >= LEAST_SWEEPS and bool(means.mean() > means.std(ddof=1) / np.sqrt(len(means)))
 
 
 def _held_rms(r: RefitRecord) -> float:
@@ -174,7 +185,7 @@ def _better(
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
     if by_held_out:
         best = min(passing, key=lambda r: r.fitted.held_rms, default=None)
-        return (best if best is not None and best.fitted.held_rms < fitted.held_rms else None), records
+        return (best if best is not None and surely_closer(data, fitted, best.fitted) else None), records
     best = max(passing, key=lambda r: r.score, default=None)
     return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data, prepare
+from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
@@ -22,7 +25,7 @@ from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
 from femsense.loop.search.search import scored, search_effects
 from femsense.loop.search.search_state import Refit, SearchProgress
-from femsense.loop.search.swaps import swapped
+from femsense.loop.search.swaps import surely_closer, swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import find_effect
 
@@ -238,6 +241,27 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
         own = replace(data, thresholds=replace(DEFAULTS, sweeps_for=wanted))
         winner, records = select_next(own, base, [far], NOISE, lambda text: None)
         assert (winner is not None) == found and records[0].is_named == found
+
+
+def leaving(fitted: FittedModel, frame_mm: Callable[[IntArray], FloatArray]) -> FittedModel:
+    """Return a fitted model that leaves so much of each held-out frame along each axis [mm]."""
+    held = []
+    for h, trial in zip(fitted.held, beside_an_error(held_out_too=False)[0].held):
+        left = np.repeat(1e-3 * frame_mm(trial.scene.frame)[:, None], 3, axis=1)
+        held.append(replace(h, jet=replace(h.jet, residual=left)))
+    return replace(fitted, held=held)
+
+
+def test_what_is_closer_in_one_state_alone_is_not_surely_closer():
+    data, base = beside_an_error(held_out_too=False)
+    first = int(data.held[0].scene.frames[0])
+    own, everywhere = leaving(base, lambda k: np.full(len(k), 1.0)), leaving(base, lambda k: 0.9 + 0.001 * k)
+    by_one = leaving(base, lambda k: np.where(k == first, 0.0, 1.01))
+    assert rms_of(by_one.held_residuals) < rms_of(own.held_residuals)
+    assert surely_closer(data, own, everywhere) and not surely_closer(data, everywhere, own)
+    assert not surely_closer(data, own, by_one)
+    two = replace(data, held=[t.part(t.scene.frames[:2]) for t in data.held])
+    assert not surely_closer(two, own, everywhere)
 
 
 def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
