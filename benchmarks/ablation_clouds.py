@@ -1,9 +1,10 @@
 """What the numbers of the rows of clouds are worth: recordings of a depth camera, asked with each number switched.
 
-    python benchmarks/ablation_clouds.py FOLDER [--cases null,gain,gravity] [--only SURFACE_POINTS,…]
+    python benchmarks/ablation_clouds.py FOLDER [--cases null,gain,gravity] [--only SURFACE_POINTS,… | --few 0,1,2,3]
 
 The cases are those of `benchmarks/clouds.py` on the four-leg robot, seen as clouds alone; FOLDER holds their recordings. The tuning set of
-`benchmarks/ablation.py` has no clouds. Lines that stand in FOLDER/switches.jsonl already are read, not computed again.
+`benchmarks/ablation.py` has no clouds. `--few` takes the markers too, with clouds in so many frames beside them, all of which are looked at
+(`FEWEST_CLOUDS`). Lines that stand in FOLDER/switches.jsonl already are read, not computed again.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from ablation import BASE, Switch
 from clouds import declared_robot, recording_of
 
-from femsense import improve
+from femsense import Recording, improve
 from femsense.core.errors import FemsenseError
 from femsense.loop.fit.joint_fit import DECLARED_POSE_STD
 
@@ -48,14 +50,25 @@ SWITCHES = (
 )
 
 
-def asked(folder: Path, case: str, switch: Switch) -> dict[str, Any]:
-    """Return what the loop says of a case under a switch."""
+def with_few_clouds(recording: Recording, count: int) -> Recording:
+    """Return a recording with clouds in so many of its frames, evenly spread."""
+    n = recording.frame_count
+    kept = set(np.round(np.linspace(0, n - 1, count + 2)[1:-1]).astype(int).tolist())
+    files = tuple(one if k in kept else (None,) * len(one) for k, one in enumerate(recording.cloud_files))
+    return replace(recording, cloud_files=files)
+
+
+def asked(folder: Path, case: str, switch: Switch, few: int | None = None) -> dict[str, Any]:
+    """Return what the loop says of a case under a switch, by clouds alone, or by markers beside few clouds."""
     recording = recording_of(folder, "four-leg", case, 20, 1.0)
+    measured = "clouds"
+    if few is not None:
+        recording, measured = with_few_clouds(recording, few), "both" if few else "markers"
     began = time.process_time()
     about = {"case": case, "switch": switch.name}
     try:
         with switch.in_force():
-            loop = improve(declared_robot("four-leg", case), [recording], options=replace(switch.options(), measured="clouds"))
+            loop = improve(declared_robot("four-leg", case), [recording], options=replace(switch.options(), measured=measured))
     except FemsenseError as error:
         return {**about, "failed": str(error)}
     return {
@@ -81,6 +94,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--cases", default="null,gain,gravity")
     parser.add_argument("--only", default=None)
+    parser.add_argument("--few", default="", help="frames with clouds beside markers")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -88,13 +102,15 @@ def main() -> None:
     known = {(r["case"], r["switch"]): r for r in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
     cases = options.cases.split(",")
     print("| switched | " + " | ".join(cases) + " |\n" + "|---" * (1 + len(cases)) + "|", flush=True)
-    for switch in SWITCHES:
+    few = {f"markers and {count} clouds": int(count) for count in options.few.split(",") if count}
+    looked_at = {"data.dataset.FEWEST_CLOUDS": 1}
+    for switch in [Switch(name, {}, {}, looked_at) for name in few] or SWITCHES:
         if options.only is not None and switch.name not in options.only.split(","):
             continue
         cells = []
         for case in cases:
             if (case, switch.name) not in known:
-                known[case, switch.name] = asked(options.folder, case, switch)
+                known[case, switch.name] = asked(options.folder, case, switch, few.get(switch.name))
                 with file.open("a") as lines:
                     lines.write(json.dumps(known[case, switch.name]) + "\n")
             cells.append(in_words(known[case, switch.name]))

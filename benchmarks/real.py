@@ -1,6 +1,7 @@
 """Robots that others built and recorded: what calibration leaves, what the loop names, and how far it is on runs that were not fitted.
 
-    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M] [--calibrated | --weights | --by-hand | --fitted]
+    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M]
+                              [--calibrated | --weights | --by-hand | --fitted | --states]
 
 Robots and recordings are made below OUT from the files of `shared/data`; nothing of these is copied. A row that stands in OUT already is
 read, not computed again, and one that takes longer than M minutes says so. `--calibrated` leaves the loop out. docs/real-robots.md tells
@@ -155,6 +156,16 @@ def print_by_hand(out: Path, data: Path) -> None:
             f"| {density:g} | {modulus / 1e3:.0f} | {1e3 * np.mean(errors[False]):.1f} | {1e3 * np.mean(errors[True]):.1f} |",
             flush=True,
         )
+
+
+def print_states(data: Path) -> None:
+    """Print the states of the arm that are fitted or held out: where its tip is under the pressures of chambers 1 to 3 of each segment."""
+    print("| recording | time [s] | pressures [psi] | tip aside, below the base [mm] |\n|---|---|---|---|")
+    for name in ("apr_4_1", "apr_4_2", "apr_5_1"):
+        for state in arm.read_states(data, name):
+            psi = ", ".join(f"{p / arm.PSI_PA:.1f}" for p in state.pressures)
+            aside, _, height = 1e3 * (state.markers[4] - state.markers[0])
+            print(f"| {name} | {state.time_s:.0f} | {psi} | {aside:.1f}, {-height:.1f} |")
 
 
 def print_weights(out: Path, data: Path) -> None:
@@ -331,7 +342,11 @@ def main() -> None:
     ask.add_argument("--weights", action="store_true", help="the force at the tip of the trunk, instead")
     ask.add_argument("--by-hand", action="store_true", help="the tentacle with the authors' pose and given moduli, instead")
     ask.add_argument("--fitted", action="store_true", help="what calibration leaves by the loop's weights, instead")
+    ask.add_argument("--states", action="store_true", help="where the tip of the arm was measured, instead")
     given = ask.parse_args()
+    if given.states:
+        print_states(given.data / "arm")
+        return
     if given.weights:
         print_pairs(given.out / "trunk", given.data / "trunk")
         print_weights(given.out / "trunk", given.data / "trunk")

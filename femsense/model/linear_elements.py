@@ -17,7 +17,7 @@ from femsense.model.robot import spread_features
 PLACES = 8
 """Forces that are tried, spread over the surface."""
 MOST_TETS = 24_000
-"""A quadratic mesh of more elements takes too long for a remark."""
+"""A quadratic mesh of more elements takes too long for a remark, and in every state of a recording."""
 LARGE = 0.1
 """From which share on it is said: below, forces are off by no more than a modulus is known to in practice."""
 

@@ -33,14 +33,13 @@ from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.thresholds import Thresholds
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state, share_on_finer
+from femsense.model.linear_elements import MOST_TETS
 from femsense.model.observation import SceneJet, placements
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.robot import Robot
 
-MOST_TETS = 24000
-"""A finer mesh than this takes too long in every state."""
 MOST_WORK = 100_000
 """Tetrahedra × states; beyond it the errors of other states are interpolated between those that were computed."""
 PULLING = "cables", "cable_slots"
