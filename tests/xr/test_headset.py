@@ -15,6 +15,7 @@ from live_bars import Source
 from xr_bar import write_run_with_mesh
 
 from femsense.xr.stream.run_source import open_run
+from femsense.xr.view import serve
 
 pytest.importorskip("websockets")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
@@ -47,7 +48,10 @@ await page.addInitScript(() => {
   globalThis.device = device;
 });
 await page.goto(url);
-await page.waitForFunction(() => globalThis.femsense?.shown.robots.get('bar')?.shown, null, { timeout: 60000 });
+await page.waitForFunction(() => {
+  const shown = globalThis.femsense?.shown;
+  return shown && (!shown.robots || shown.robots.get('bar')?.shown); // a stream's robots, or a run
+}, null, { timeout: 60000 });
 const frames = (n = 2) => page.evaluate((n) => new Promise((done) => {
   const next = () => (n-- > 0 ? (femsense.stage.renderer.xr.getSession() ?? globalThis).requestAnimationFrame(next) : done());
   next();
@@ -195,22 +199,58 @@ await leave();
 await end({ waiting, ring, placed, anchored, asked, aligned, said, after: await look() });
 """
 
+OUT_OF_SIGHT = """
+await page.evaluate(() => {
+  const watch = new MutationObserver((found) => (globalThis.written += found.length));
+  for (const id of ['panel', 'dock']) watch.observe(document.getElementById(id), { childList: true, subtree: true, characterData: true });
+});
+const written = () => page.waitForFunction(() => globalThis.written > 0, null, { timeout: 60000 });
+const none = () => page.evaluate(() => (globalThis.written = 0));
+await none();
+await written();
+await enter('#enter-vr');
+await none();
+const begun = Date.now();
+while (Date.now() < begun + 1000) await frames(4);
+const within = await page.evaluate(() => globalThis.written);
+await leave();
+await none();
+await written();
+await end({ within });
+"""
+
+CLOCK = """
+const clock = () => page.evaluate(() => [femsense.shown.time.toFixed(2), document.querySelector('#clock strong').textContent]);
+await page.evaluate(() => { femsense.shown.play(false); femsense.shown.seek(0); });
+await enter('#enter-vr');
+await page.evaluate(() => femsense.shown.seek(0.25));
+await frames();
+const within = await clock();
+await leave();
+await end({ within, after: await clock() });
+"""
+
 
 def in_the_room(
     request: pytest.FixtureRequest, page: Path, tmp_path: Path, script: str, *, commands: bool = False
 ) -> tuple[dict[str, Any], Source]:
     """What a script finds in an emulated headset beside two bars that stream."""
-    iwer = npm_folder(request.config.cache.mkdir("iwer"), "iwer@2.5.0") / "node_modules" / "iwer" / "build" / "iwer.min.js"
     source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), page, still=True, commands=commands)
     try:
-        browser = start_browser(request.config, ROOM + script, source.server.url, str(iwer), str(tmp_path))
-        out, errors = browser.communicate(timeout=300)
-        assert browser.returncode == 0, errors
-        found: dict[str, Any] = json.loads(out.splitlines()[-1])
+        return through_a_headset(request, source.server.url, tmp_path, script), source
     finally:
         source.close()
+
+
+def through_a_headset(request: pytest.FixtureRequest, url: str, tmp_path: Path, script: str) -> dict[str, Any]:
+    """What a script finds in a page in an emulated headset."""
+    iwer = npm_folder(request.config.cache.mkdir("iwer"), "iwer@2.5.0") / "node_modules" / "iwer" / "build" / "iwer.min.js"
+    browser = start_browser(request.config, ROOM + script, url, str(iwer), str(tmp_path))
+    out, errors = browser.communicate(timeout=300)
+    assert browser.returncode == 0, errors
+    found: dict[str, Any] = json.loads(out.splitlines()[-1])
     assert found["problems"] == []
-    return found, source
+    return found
 
 
 def test_a_headset_enters_drags_carries_and_leaves(request: pytest.FixtureRequest, built_page: Path, tmp_path: Path) -> None:
@@ -240,6 +280,19 @@ def test_the_robot_follows_one_hand_while_the_other_is_closed_too(
     held = [wish["armed"] for wish in source.wishes if wish["held"]]
     turns = [now for before, now in zip([None, *held], held) if before != now]
     assert turns == [False, True, False, True] and not source.wishes[-1]["held"] and not source.wishes[-1]["armed"]
+
+
+def test_a_page_that_nobody_sees_is_not_written(request: pytest.FixtureRequest, built_page: Path, tmp_path: Path) -> None:
+    seen, _ = in_the_room(request, built_page, tmp_path, OUT_OF_SIGHT)
+    assert seen["within"] == 0
+
+
+def test_the_clock_of_a_run_is_right_again_after_a_headset(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    with serve(write_run_with_mesh(tmp_path / "bar"), open_browser=False, page=built_page) as server:
+        seen = through_a_headset(request, server.url, tmp_path, CLOCK)
+    assert seen["within"] == ["0.25", "0.00"] and seen["after"] == ["0.25", "0.25"]
 
 
 def test_in_ar_a_hit_surface_carries_the_robot_and_touched_markers_lay_it_over_the_real_one(

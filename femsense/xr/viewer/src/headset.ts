@@ -77,6 +77,11 @@ export class Headset {
     return this.stage.renderer.xr.isPresenting;
   }
 
+  /** Whether nobody sees the page around the picture: in VR, and in AR where the device does not lay it over the room. */
+  get alone(): boolean {
+    return this.presenting && !this.stage.renderer.xr.getSession()?.domOverlayState;
+  }
+
   /** The space that the robot needs, in glTF's frame [m]. */
   fit(box: Box3): void {
     this.box = box.clone();

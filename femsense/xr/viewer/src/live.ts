@@ -53,9 +53,7 @@ class Streams {
     stage.headset.changed = (on) => this.presenting(on);
     this.connect();
     showPlaying(true);
-    window.setInterval(() => {
-      for (const robot of this.robots.values()) robot.pace.count(performance.now());
-    }, COUNT_MS);
+    window.setInterval(() => this.robots.forEach((robot) => robot.pace.count(performance.now())), COUNT_MS);
     window.setInterval(() => void this.ask(), ASKED_MS);
     stage.run(() => this.step());
   }
@@ -83,10 +81,7 @@ class Streams {
     const robot = new Robot(id, model, this.stage);
     this.robots.set(id, robot);
     if (!this.chosen || this.chosen === known) this.choose(robot);
-    robot.load().then(
-      () => this.arrange(),
-      (reason: Error) => notice(reason.message),
-    );
+    robot.load().then(() => this.arrange(), (reason: Error) => notice(reason.message));
     this.tabs();
   }
 
@@ -161,7 +156,7 @@ class Streams {
     }
   }
 
-  /** Brings the panel, the badge and the time line up to date. */
+  /** Brings the badge, the buttons and what answers up to date, and the rest of the page where it can be seen. */
   private read(now: number): void {
     const robot = this.chosen;
     const badge = element("badge");
@@ -175,7 +170,12 @@ class Streams {
     if (badge.textContent !== said) badge.textContent = said;
     element("live").setAttribute("aria-pressed", String(!this.paused && state === "live"));
     element("panel").hidden = !robot?.shown;
-    if (!robot) return;
+    if (robot?.shown && robot.reach) this.dragging.answered(robot.reach, robot.ghost);
+    if (robot && !this.stage.headset.alone) this.describe(robot, state);
+  }
+
+  /** Brings the panel and the time line up to date. */
+  private describe(robot: Robot, state: string): void {
     element("about").textContent = robot.about();
     element<HTMLOptionElement>("paint-stress").hidden = !robot.model.field;
     this.legend(element<HTMLSelectElement>("paint").value as Paint);
@@ -190,7 +190,6 @@ class Streams {
     const end = this.paused ? Math.max(this.at, newest - KEPT_S + PLOTTED_S) : newest;
     this.plot.draw(robot.history, end - PLOTTED_S, end, shown.time_s);
     this.timeline(robot, newest, shown.time_s);
-    if (robot.reach) this.dragging.answered(robot.reach, robot.ghost);
   }
 
   private timeline(robot: Robot, newest: number, shown: number): void {

@@ -3,7 +3,7 @@
 import { AnimationMixer, type AnimationAction, type Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { amount, frameAt, isDoubtful, loadRun, type Run } from "./data";
+import { amount, frameAt, isDoubtful, loadRun, type Frame, type Run } from "./data";
 import type { Field, Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
@@ -38,6 +38,7 @@ class Player {
   private readonly times: number[];
   private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
   private shown = -1;
+  private told = -1; // the frame that panel and plot have
   private field: Field | null = null;
 
   constructor(
@@ -59,9 +60,10 @@ class Player {
     const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
     stage.headset.changed = (on) => {
       if (on) stage.headset.alignment = alignWith(stage, this.body, landmarks);
+      else this.seek(this.time); // the page did not follow
     };
     new ResizeObserver(() => {
-      this.shown = -1;
+      this.told = -1;
       this.seek(this.time);
     }).observe(element("plot"));
     this.describe();
@@ -76,18 +78,26 @@ class Player {
   seek(time: number): void {
     this.time = Math.min(Math.max(time, 0), this.duration);
     this.pose(this.time);
-    this.clock();
     const frames = this.run?.frames ?? [];
     const now = frames.length ? frameAt(frames, this.time) : -1;
     if (now !== this.shown && now >= 0) {
       this.body.show(frames[now]!.contacts);
       this.body.painter.frame(now);
       this.body.setDoubtful(isDoubtful(frames[now]!));
-      showFrame(frames[now]!, this.run!.inputs, this.body.arrows.full);
-      this.plot.draw(frames, 0, this.duration, frames[now]!.time_s);
     }
     this.shown = now;
+    if (!this.stage.headset.alone) this.tell(frames);
     this.stage.touch();
+  }
+
+  /** Brings the clock, the panel and the plot to what is shown. */
+  private tell(frames: Frame[]): void {
+    this.clock();
+    const frame = this.shown === this.told ? undefined : frames[this.shown];
+    this.told = this.shown;
+    if (!frame) return;
+    showFrame(frame, this.run!.inputs, this.body.arrows.full);
+    this.plot.draw(frames, 0, this.duration, frame.time_s);
   }
 
   /** Goes some frames on or back. */
