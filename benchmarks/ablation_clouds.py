@@ -3,8 +3,8 @@
     python benchmarks/ablation_clouds.py FOLDER [--cases null,gain,gravity] [--only SURFACE_POINTS,… | --few 0,1,2,3]
 
 The cases are those of `benchmarks/clouds.py` on the four-leg robot, seen as clouds alone; FOLDER holds their recordings. The tuning set of
-`benchmarks/ablation.py` has no clouds. `--few` takes the markers too, with clouds in so many frames beside them, all of which are looked at
-(`FEWEST_CLOUDS`). Lines that stand in FOLDER/switches.jsonl already are read, not computed again.
+`benchmarks/ablation.py` has no clouds. `--few` takes the markers too, with clouds in so many frames beside
+them. Lines that stand in FOLDER/switches.jsonl already are read, not computed again.
 """
 
 from __future__ import annotations
@@ -103,8 +103,7 @@ def main() -> None:
     cases = options.cases.split(",")
     print("| switched | " + " | ".join(cases) + " |\n" + "|---" * (1 + len(cases)) + "|", flush=True)
     few = {f"markers and {count} clouds": int(count) for count in options.few.split(",") if count}
-    looked_at = {"data.dataset.FEWEST_CLOUDS": 1}
-    for switch in [Switch(name, {}, {}, looked_at) for name in few] or SWITCHES:
+    for switch in [Switch(name, {}, {}) for name in few] or SWITCHES:
         if options.only is not None and switch.name not in options.only.split(","):
             continue
         cells = []

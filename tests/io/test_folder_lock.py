@@ -13,7 +13,7 @@ from femsense.core.errors import InputError
 from femsense.io.folder_lock import lock_of, only_writer
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such locks")
-HOLDS = "import sys, time\nfrom femsense.io.folder_lock import only_writer\nwith only_writer(sys.argv[1]):\n    print('in', flush=True)\n    time.sleep(600)\n"
+HOLDS = "import sys, time\nfrom femsense.io.folder_lock import only_writer\nwith only_writer(sys.argv[1]):\n    print('in', flush=True)\n    time.sleep(60)\n"
 
 
 def holder(folder: Path) -> subprocess.Popen[str]:

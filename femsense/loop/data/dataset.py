@@ -36,8 +36,6 @@ from femsense.model.robot import Robot
 
 MAX_ROWS = 3000
 """Marker rows a recording at most, and rows of clouds; more are thinned out by whole frames."""
-FEWEST_CLOUDS = 4
-"""Where there are markers, fewer frames with clouds than this are not looked at."""
 MESH = next(effect for effect in EFFECTS if effect.remeshes)
 """The effect that says which mesh is fine enough."""
 QUADRATIC: Entry = {"element": "tet10"}
@@ -163,7 +161,7 @@ def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]
     none = usable[:0]
     marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]
     cloudy = none if measured == "markers" else np.intersect1d(usable, cloud_frames(recording))
-    if len(marked) and (measured == "auto" or len(cloudy) < FEWEST_CLOUDS):
+    if len(marked) and measured == "auto":
         cloudy = none
     if not len(marked) and not len(cloudy):
         raise DataError(_nothing(recording, measured))
