@@ -11,7 +11,7 @@ FINEST = 1e-4
 """No pixel is narrower than this [1]; rays that are closer differ by the digits of a file."""
 REGULAR = 0.1
 """Rays are those of pixels where they lie so few pixels off their centres, root mean square [1]."""
-WIDEST = 20_000
+WIDEST = 5_000
 """More pixels than this no camera has along a line."""
 
 
