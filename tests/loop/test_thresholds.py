@@ -10,7 +10,7 @@ from pathlib import Path
 import femsense.loop
 from femsense.loop.thresholds import Effort, Thresholds
 
-MOST = 57
+MOST = 56
 LOOP = Path(femsense.loop.__file__).parent
 TOLERANCES = {
     "calibration": {"STEPS"},
