@@ -169,7 +169,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         radius=curvature,
         spread=CONE * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
     )
-    return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])))
+    return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])), shape=shape)
 
 
 def _face_towards(shape: Shape, place: FloatArray, normals: FloatArray, faces: IntArray) -> int:

@@ -22,6 +22,7 @@ from femsense.model.drive import DrivenRobot
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.local_planes import LocalPlanes
+from femsense.pointcloud.primitives import Shape
 from femsense.sensing import run_arrays
 
 MEDIAN = 1.0 - 1.483 ** (-2.0 / 3.0)
@@ -189,6 +190,8 @@ class Touch:
     line: FloatArray = field(default_factory=lambda: np.zeros(3))
     """Unit vector at rest along which alone it is known no better than that, as along a rod; zero: all ways alike."""
     across_m: float = 0.0  # how well it is known across the line [m]
+    pulls: bool = False  # whether a weight hangs there, as on a thread: along gravity, not about the normal
+    shape: Shape | None = None  # the rigid object that touches there, where one is seen or declared
 
 
 @dataclass(frozen=True, eq=False, slots=True)

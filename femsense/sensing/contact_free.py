@@ -1,0 +1,176 @@
+"""What contact-free frames teach: the prior of the nuisance parameters, the noise, its overdispersion, and the odds of an inferred contact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import t as student
+
+from femsense.calib.from_clouds import free_clouds
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
+from femsense.core.pose import moved_poses
+from femsense.inference.error_field import spread_field
+from femsense.inference.nuisance import Nuisance, columns, first_nuisance, fit_nuisance, gram_of, learnt
+from femsense.inference.pixels import Skin
+from femsense.inference.rows import Rows
+from femsense.model.quasi_static_path import free_path
+from femsense.sensing.fit import fit
+from femsense.sensing.model import Fit, Frame, Limits, Model
+from femsense.sensing.odds import INFERRED
+from femsense.sensing.proposals import inferred
+from femsense.sensing.prepare import pose_covariance, scan_of
+from femsense.sensing.types import Sensor
+
+MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
+"""Prior of the relative modulus: σ = 0.03, or 0.01 where cable pulls are nuisance parameters too, because the two are nearly collinear; of each pull 0.05."""
+SEVERAL = 4
+"""Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
+FLAG = 1e-3
+"""Share of contact-free frames that the posterior check may flag."""
+LEAST_SPREAD = 0.05
+"""Spread of the log of a check between contact-free frames at least."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ContactFree:
+    """A contact-free frame."""
+
+    frame: Frame
+    fit: Fit
+
+
+def learn(sensor: Sensor) -> Model:
+    """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
+    model = _first_model(sensor)
+    for turn in range(2):
+        frames = _contact_free(model)
+        if not frames:
+            return replace(model, inferred_odds=INFERRED)
+        model = _taught(model, [one.fit for one in frames])
+        if turn == 0:
+            model = _at_the_mean(model)
+    frames = _contact_free(model)
+    return _with_limits(model, frames)
+
+
+def _first_model(sensor: Sensor) -> Model:
+    nodes, triangles = sensor.robot.body.mesh.nodes, sensor.surface.triangles
+    corners = nodes[triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    field = spread_field(corners.mean(axis=1), facing, sensor.size)
+    skin = Skin(triangles, nodes, freeze(facing), field, sensor.pivot, sensor.size)
+    pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
+    drives = len(sensor.robot.body.cables) + len(sensor.robot.body.chambers) if pulls else 0
+    modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
+    covariance = block_diag(
+        pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives)
+    )
+    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(field))
+    return Model(sensor, skin, nuisance, sensor.knowledge.noises)
+
+
+def _contact_free(model: Model) -> list[ContactFree]:
+    """Return the contact-free frames, each fitted without contacts; a frame that gives nothing is left out."""
+    result = []
+    for k, state in free_path(model.sensor.driven, free_clouds(model.sensor.recording)):
+        try:
+            scan = scan_of(model.sensor, k, state)
+        except FemsenseError:
+            continue
+        if scan is None or len(scan.view) < 30:
+            continue
+        frame = Frame(k, model.pixels(scan), scan, state, None)
+        found = fit(model, frame, (), np.zeros((0, 3)), state)
+        if found is not None:
+            result.append(ContactFree(frame, found))
+    return result
+
+
+def _taught(model: Model, frames: Sequence[Fit], *, sizes: tuple[float, float, float] | None = None) -> Model:
+    """Return the model with noise, overdispersion and prior as some contact-free frames show them."""
+    nuisance, scale, T = model.nuisance, 1.0, model.overdispersion
+    for _ in range(2):
+        grams, left = [], []
+        for one in frames:
+            rows = _rescaled(one.rows, scale, T)
+            N, residual = one.C @ nuisance.root, rows.residual - one.C @ nuisance.mean
+            eta, _, weight = fit_nuisance(rows, residual, N, np.zeros(N.shape[1]))
+            grams.append(gram_of(rows, one.C, weight))
+            z = (residual - N @ eta) / rows.std
+            left.append((np.where(weight * T * rows.std**2 > 0.5, z, np.nan), rows.rest))
+        scale *= float(np.clip(1.4826 * np.nanmedian(np.abs(np.concatenate([z for z, _ in left]))), 0.3, 30.0))
+        T = _overdispersion(left, 0.5 * model.skin.field.length)
+        nuisance = learnt(nuisance, grams, sizes=sizes)
+    return replace(model, nuisance=nuisance, scale=model.scale * scale, overdispersion=T)
+
+
+def _rescaled(rows: Rows, scale: float, T: float) -> Rows:
+    return replace(rows, std=rows.std * scale, share=np.full(len(rows), 1.0 / T))
+
+
+def _overdispersion(left: Sequence[tuple[FloatArray, FloatArray]], cell: float) -> float:
+    """Return T ≥ 1: variance of sums of whitened residuals over cells of the surface, relative to that of independent pixels."""
+    sums = squares = 0.0
+    for z, rest in left:
+        robot = np.isfinite(z)
+        label = np.unique(np.floor(rest[robot] / cell).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+        sums += float((np.bincount(label, z[robot]) ** 2).sum())
+        squares += float((z[robot] ** 2).sum())
+    return max(1.0, sums / max(squares, 1e-9))
+
+
+def _at_the_mean(model: Model) -> Model:
+    """Return the model with cameras and modulus where the contact-free frames show them, so that rays and states are near the true ones."""
+    v, sensor = 6 * model.views, model.sensor
+    shown = model.nuisance.mean[: model.nuisance.common]
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -shown[:v], sensor.pivot))
+    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + shown[v])))
+    first = np.concatenate([-shown[:v], [1.0 / (1.0 + shown[v]) - 1.0], np.zeros(model.drives)])
+    sensor = replace(
+        sensor,
+        robot=robot,
+        driven=replace(sensor.driven, robot=robot),
+        calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
+    )
+    nuisance = first_nuisance(first, model.nuisance.first_covariance, len(model.skin.field))
+    return replace(model, sensor=sensor, nuisance=nuisance)
+
+
+def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
+    """Return the model with the odds of an inferred contact and the limits of the posterior check, from what each contact-free frame shows by what the
+    others teach."""
+    fits = [one.fit for one in frames]
+    gains, checks = [], []
+    for i, one in enumerate(frames if len(frames) >= SEVERAL else ()):
+        others = _taught(model, [f for j, f in enumerate(fits) if j != i], sizes=model.nuisance.sizes)
+        others = replace(others, scale=model.scale, overdispersion=model.overdispersion)
+        alone = fit(others, one.frame, (), np.zeros((0, 3)), one.frame.predicted)
+        assert alone is not None
+        gains.append(max(inferred(replace(others, inferred_odds=0.0), alone)[0], 0.0))
+        checks.append(check_values(others, alone))
+    odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
+    sensor = replace(model.sensor, knowledge=replace(model.sensor.knowledge, bias_m=model.nuisance.sizes[0], model_share=model.nuisance.sizes[1]))
+    limits = None if not checks else Limits(*(_limit([c[j] for c in checks]) for j in range(3)))
+    return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
+
+
+def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
+    """Return the statistics of the posterior check: misfit per pixel, |η̃|², and the share of pixels behind the body."""
+    pixels = found.rows.pixel
+    z = found.left(model.nuisance)[pixels]
+    per_pixel = float(np.minimum(z**2, 25.0).mean())
+    behind = float((found.rows.residual[pixels] < -4.0 * found.rows.std[pixels]).mean())
+    return per_pixel, float(found.eta @ found.eta), behind
+
+
+def _limit(values: Sequence[float]) -> float:
+    """Return the largest value to expect of a new contact-free frame: a prediction limit of its logarithm (Student's t) at level FLAG."""
+    logs = np.log(np.maximum(values, 1e-4))
+    n = len(logs)
+    spread = max(float(logs.std(ddof=1)), LEAST_SPREAD) if n > 1 else 1.0
+    return float(np.exp(logs.mean() + student.isf(FLAG, max(n - 1, 1)) * spread * np.sqrt(1.0 + 1.0 / n)))

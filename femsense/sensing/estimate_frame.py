@@ -1,0 +1,172 @@
+"""Contacts and forces of one frame: predict, propose, fit, keep the best, stop.
+
+docs/estimator.md has the objective J, the proposals and the posterior check.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.drive import has_history
+from femsense.sensing.fit import TOLERANCE, fit
+from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
+from femsense.sensing.prepare import scan_of
+from femsense.sensing.proposals import SAME, proposals
+from femsense.sensing.types import Touch
+
+ROUNDS, FITTED = 8, 4
+"""Rounds of proposals at most, and proposals that are fitted in each."""
+FEWEST = 30
+"""Fewer pixels of the robot say nothing of its shape."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimate:
+    """A frame, estimated, as the next one starts from it."""
+
+    frame: Frame
+    best: Fit
+    rms_before_m: float
+    """Residual of the predicted state, along the normal."""
+    stages_ms: dict[str, float]
+
+
+def estimate_frame(model: Model, k: int, previous: Estimate | None) -> Estimate:
+    """Return the hypothesis of frame k with the lowest J.
+
+    Raises:
+        FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
+    """
+    clock = Clock()
+    frame = _predicted(model, k, previous, clock)
+    start = _carried_over(model, frame, previous)
+    best = start if start is not None else _without_contacts(model, frame)
+    clock.lap("fit")
+    if given := given_touches(model.sensor):
+        best = _at_given_places(model, frame, given, best, previous)
+    elif not said_free(model.sensor, k):
+        best = _searched(model, frame, best)
+    clock.lap("search")
+    exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
+    best = best if exact is None else replace(best, state=exact)
+    before = model.rows(frame, frame.predicted).residual
+    inlier = best.weight[: len(before)] * best.rows.std[: len(before)] ** 2 / best.rows.share[: len(before)] > 0.5
+    rms = float(np.sqrt(np.mean(before[inlier] ** 2))) if inlier.any() else float("nan")
+    clock.lap("state")
+    return Estimate(frame, best, rms, clock.stages)
+
+
+def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
+    """Return the best fit after proposals have stopped to lower J."""
+    for _ in range(ROUNDS):
+        better = next((found for found in _fits(model, frame, best) if found.criterion < best.criterion - TOLERANCE), None)
+        if better is None:
+            break
+        best = better
+    return best
+
+
+def _fits(model: Model, frame: Frame, best: Fit):  # type: ignore[no-untyped-def]
+    """Yield fits of the most promising proposals, one after the other."""
+    for one in proposals(model, best)[:FITTED]:
+        start = best.state if best.contacts and one.contacts else frame.predicted
+        found = fit(model, frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
+        if found is not None:
+            yield found
+
+
+# --- predict ------------------------------------------------------------------------------------------------------------
+
+
+def _predicted(model: Model, k: int, previous: Estimate | None, clock: Clock) -> Frame:
+    """Return the frame with its predicted state, its pixels, and the objects near the body."""
+    tensions = previous.best.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
+    start = None if previous is None else previous.frame.predicted
+    blank = Frame(k, None, None, start, tensions)  # type: ignore[arg-type]
+    predicted = model.solve(blank, (), np.zeros((0, 3)), start, exact=True)
+    if predicted is None:
+        raise DataError("no equilibrium under the inputs")
+    clock.lap("equilibrium")
+    expected = _expected(predicted, previous)
+    scan = scan_of(model.sensor, k, expected)
+    if scan is None or len(scan.view) < FEWEST:
+        count = 0 if scan is None else len(scan.view)
+        raise DataError(f"only {count} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees")
+    pixels = model.pixels(scan)
+    clock.lap("read")
+    objects: tuple[object, ...] = ()
+    if not len(model.sensor.places) and not said_free(model.sensor, k):
+        objects = tuple(objects_near(model.sensor, scan, expected))
+    clock.lap("objects")
+    return Frame(k, pixels, scan, predicted, tensions, objects)  # type: ignore[arg-type]
+
+
+def _expected(predicted: Equilibrium, previous: Estimate | None) -> Equilibrium:
+    """Return about where the body is: the previous state, moved as the inputs have moved the predicted one since."""
+    if previous is None or not previous.best.contacts:
+        return predicted
+    moved = previous.best.state.positions + predicted.positions - previous.frame.predicted.positions
+    return replace(previous.best.state, positions=moved)
+
+
+def _without_contacts(model: Model, frame: Frame) -> Fit:
+    found = fit(model, frame, (), np.zeros((0, 3)), frame.predicted)
+    assert found is not None
+    return found
+
+
+def _carried_over(model: Model, frame: Frame, previous: Estimate | None) -> Fit | None:
+    """Return the fit of the previous frame's contacts where dropping any of them would raise J; else None."""
+    if previous is None or not previous.best.contacts or len(model.sensor.places) or said_free(model.sensor, frame.index):
+        return None
+    start = _expected(frame.predicted, previous)
+    seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), start))
+    contacts = [_followed(model, contact, seen) for contact in previous.best.contacts]
+    found = fit(model, frame, contacts, previous.best.forces, start, tau=previous.best.tau)
+    if found is None:
+        return None
+    alone = None if (found.drop_gain > found.odds).all() else _without_contacts(model, frame)
+    return found if alone is None or found.criterion < alone.criterion else alone
+
+
+def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
+    """Return a contact of the previous frame at the object that is seen to touch near it now; inferred where none is."""
+    distance = [float(np.linalg.norm(one.place - contact.place)) for one in seen] if contact.source == "cloud" else []
+    if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * seen[int(np.argmin(distance))].std_m):
+        return seen[int(np.argmin(distance))]
+    if contact.source == "shape":
+        return contact
+    std = float(np.sqrt(model.sensor.surface.area.sum() / (2.0 * np.pi)))
+    return replace(contact, source="shape", std_m=std, line=np.zeros(3), expected=contact.place, shape=None, pulls=False)
+
+
+def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: Estimate | None) -> Fit:
+    """Return the fit with forces at the given places, whatever its evidence."""
+    forces, start, tau = np.zeros((len(given), 3)), frame.predicted, None
+    if previous is not None and len(previous.best.contacts) == len(given):
+        forces, start, tau = previous.best.forces, _expected(frame.predicted, previous), previous.best.tau
+    if said_free(model.sensor, frame.index):
+        return alone
+    found = fit(model, frame, given, forces, start, tau=tau)
+    return alone if found is None else found
+
+
+class Clock:
+    """Durations of the stages of a frame [ms]."""
+
+    def __init__(self) -> None:
+        self.began = self.last = time.perf_counter()
+        self.stages: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.stages[name] = self.stages.get(name, 0.0) + 1e3 * (now - self.last)
+        self.last = now
