@@ -3,9 +3,10 @@
     η = (pose step of each camera, relative softness, relative pull of each cable and chamber, error field b of the cameras, error field m of the model)
     r = C(x) η + noise,   C = [∂r/∂pose, d·∂x/∂softness, d·∂x/∂pulls, k, |x − x_rest| k]
 
-Contact-free frames i have η_i = (θ, e + e_i): θ and e are common to all, e_i is each frame's own error. With b = s_b·unit, m = s_m·unit and the
-share a of their variance that is common, θ and e have the posterior of a linear Gaussian model in which e_i is marginalised; (s_b, s_m, a) maximise its evidence over a grid
-(type-II maximum likelihood, MacKay 1992). A new frame has η ~ N(μ, R Rᵀ) with the posterior of (θ, e) and the prior of its own e_i.
+Contact-free frames i have η_i = (θ, e + e_i): θ and e are common to all, e_i is each frame's own error. With b = s_b·unit, m = s_m·unit
+and the share a of their variance that is common, θ and e have the posterior of a linear Gaussian model in which e_i is marginalised;
+(s_b, s_m, a) maximise its evidence over a grid (type-II maximum likelihood, MacKay 1992). A new frame has η ~ N(μ, R Rᵀ) with the posterior of (θ, e)
+and the prior of its own e_i.
 """
 
 from __future__ import annotations
@@ -109,6 +110,21 @@ def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[floa
     return replace(
         nuisance, mean=freeze(mean + root @ np.linalg.solve(inner, right)), root=freeze(root_of(covariance)), sizes=sizes
     )
+
+
+def without_poses(gram: FloatArray, pose_steps: int, common: int) -> FloatArray:
+    """Return inner products of a frame with the error field made orthogonal to the pose: what looks like a pose is one (restricted spatial
+    regression, Reich, Hodges & Zadnik 2006).
+
+    Arguments:
+        gram: of `gram_of`.
+        pose_steps: 6 v.
+        common: c, columns before the field.
+    """
+    pose, field = slice(0, pose_steps), slice(common, len(gram) - 1)
+    change = np.eye(len(gram))
+    change[pose, field] = -np.linalg.lstsq(gram[pose, pose], gram[pose, field], rcond=1e-10)[0]
+    return np.asarray(change.T @ gram @ change)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

@@ -94,7 +94,21 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
         )  # fmt: skip
     through = np.where(on & (residual < 0.0), BEHIND, 1.0)
     other = log_odds_of_other(pixels.robot_share, pixels.ray_std, skin.size, through)
-    return rows_on(skin, positions, triangle, weights, direction, residual, std, other, np.full(m, pixels.share), pixels.points, pixels.view, views, pixel=True)
+    return rows_on(
+        skin,
+        positions,
+        triangle,
+        weights,
+        direction,
+        residual,
+        std,
+        other,
+        np.full(m, pixels.share),
+        pixels.points,
+        pixels.view,
+        views,
+        pixel=True,
+    )
 
 
 def rows_on(
@@ -126,7 +140,20 @@ def rows_on(
     by_pose = np.zeros((len(residual), views, 6))
     by_pose[np.arange(len(residual)), view] = np.hstack([np.cross(points - skin.pivot, direction), direction])
     field = skin.field.weights(rest, skin.facing[triangle])
-    return Rows(residual, std, log_other, share, nodes, weights, direction, by_pose.reshape(len(residual), -1), field, way, rest, np.full(len(residual), pixel))
+    return Rows(
+        residual,
+        std,
+        log_other,
+        share,
+        nodes,
+        weights,
+        direction,
+        by_pose.reshape(len(residual), -1),
+        field,
+        way,
+        rest,
+        np.full(len(residual), pixel),
+    )
 
 
 @njit(cache=True)

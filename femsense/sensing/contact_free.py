@@ -14,15 +14,15 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.inference.error_field import spread_field
-from femsense.inference.nuisance import Nuisance, columns, first_nuisance, fit_nuisance, gram_of, learnt
+from femsense.inference.nuisance import first_nuisance, fit_nuisance, gram_of, learnt, without_poses
 from femsense.inference.pixels import Skin
 from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
 from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Limits, Model
 from femsense.sensing.odds import INFERRED
-from femsense.sensing.proposals import inferred
 from femsense.sensing.prepare import pose_covariance, scan_of
+from femsense.sensing.proposals import inferred
 from femsense.sensing.types import Sensor
 
 MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
@@ -52,7 +52,7 @@ def learn(sensor: Sensor) -> Model:
             return replace(model, inferred_odds=INFERRED)
         model = _taught(model, [one.fit for one in frames])
         if turn == 0:
-            model = _at_the_mean(model)
+            model = _at_the_mean(model, [one.fit for one in frames])
     frames = _contact_free(model)
     return _with_limits(model, frames)
 
@@ -67,9 +67,7 @@ def _first_model(sensor: Sensor) -> Model:
     pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
     drives = len(sensor.robot.body.cables) + len(sensor.robot.body.chambers) if pulls else 0
     modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
-    covariance = block_diag(
-        pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives)
-    )
+    covariance = block_diag(pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives))
     nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(field))
     return Model(sensor, skin, nuisance, sensor.knowledge.noises)
 
@@ -84,7 +82,8 @@ def _contact_free(model: Model) -> list[ContactFree]:
             continue
         if scan is None or len(scan.view) < 30:
             continue
-        frame = Frame(k, model.pixels(scan), scan, state, None)
+        marked = model.drives > 0 and bool((model.sensor.recording.marker_frame == k).any())
+        frame = Frame(k, model.pixels(scan), scan, state, None, with_markers=marked)
         found = fit(model, frame, (), np.zeros((0, 3)), state)
         if found is not None:
             result.append(ContactFree(frame, found))
@@ -124,10 +123,17 @@ def _overdispersion(left: Sequence[tuple[FloatArray, FloatArray]], cell: float) 
     return max(1.0, sums / max(squares, 1e-9))
 
 
-def _at_the_mean(model: Model) -> Model:
-    """Return the model with cameras and modulus where the contact-free frames show them, so that rays and states are near the true ones."""
-    v, sensor = 6 * model.views, model.sensor
-    shown = model.nuisance.mean[: model.nuisance.common]
+def _at_the_mean(model: Model, frames: Sequence[Fit]) -> Model:
+    """Return the model with cameras and modulus where the contact-free frames show them, so that rays and states are near the true ones.
+
+    Where pulls are nuisance parameters, a pose that is far off and an opposite error field fit a little better together than a small one of each; there
+    the field is held orthogonal to the pose.
+    """
+    v, sensor, nuisance = 6 * model.views, model.sensor, model.nuisance
+    shown = nuisance.mean[: nuisance.common]
+    if model.drives:
+        grams = [without_poses(gram_of(one.rows, one.C, one.weight), v, nuisance.common) for one in frames]
+        shown = learnt(nuisance, grams, sizes=nuisance.sizes).mean[: nuisance.common]
     poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -shown[:v], sensor.pivot))
     robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + shown[v])))
     first = np.concatenate([-shown[:v], [1.0 / (1.0 + shown[v]) - 1.0], np.zeros(model.drives)])
@@ -138,7 +144,7 @@ def _at_the_mean(model: Model) -> Model:
         calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
     )
     nuisance = first_nuisance(first, model.nuisance.first_covariance, len(model.skin.field))
-    return replace(model, sensor=sensor, nuisance=nuisance)
+    return replace(model, sensor=sensor, nuisance=nuisance, modulus_shift=float(shown[v]))
 
 
 def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
@@ -154,7 +160,10 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
         gains.append(max(inferred(replace(others, inferred_odds=0.0), alone)[0], 0.0))
         checks.append(check_values(others, alone))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
-    sensor = replace(model.sensor, knowledge=replace(model.sensor.knowledge, bias_m=model.nuisance.sizes[0], model_share=model.nuisance.sizes[1]))
+    sensor = replace(
+        model.sensor,
+        knowledge=replace(model.sensor.knowledge, bias_m=model.nuisance.sizes[0], model_share=model.nuisance.sizes[1]),
+    )
     limits = None if not checks else Limits(*(_limit([c[j] for c in checks]) for j in range(3)))
     return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
 
@@ -165,7 +174,7 @@ def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
     z = found.left(model.nuisance)[pixels]
     per_pixel = float(np.minimum(z**2, 25.0).mean())
     behind = float((found.rows.residual[pixels] < -4.0 * found.rows.std[pixels]).mean())
-    return per_pixel, float(found.eta @ found.eta), behind
+    return per_pixel, float((found.eta[: model.nuisance.root.shape[1]] ** 2).sum()), behind
 
 
 def _limit(values: Sequence[float]) -> float:

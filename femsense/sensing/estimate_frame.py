@@ -6,21 +6,27 @@ docs/estimator.md has the objective J, the proposals and the posterior check.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
+from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
+from femsense.pointcloud.primitives import Shape
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.no_penetration import COMPLETED
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.prepare import scan_of
 from femsense.sensing.proposals import SAME, proposals
-from femsense.sensing.types import Touch
+from femsense.sensing.reported import contacts_of
+from femsense.sensing.run_arrays import sensed
+from femsense.sensing.status import checked
+from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
 """Rounds of proposals at most, and proposals that are fitted in each."""
@@ -30,16 +36,40 @@ FEWEST = 30
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """A frame, estimated, as the next one starts from it."""
+    """A frame, estimated."""
 
-    frame: Frame
     best: Fit
     rms_before_m: float
-    """Residual of the predicted state, along the normal."""
+    """Residual of the predicted state, along the normal or of markers in 3-D."""
     stages_ms: dict[str, float]
 
 
-def estimate_frame(model: Model, k: int, previous: Estimate | None) -> Estimate:
+def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
+    """Return contacts, forces and status of frame k. Raises FemsenseError."""
+    found = estimate_frame(model, k, previous)
+    best, sensor = found.best, model.sensor
+    status = checked(model, best)
+    contacts = contacts_of(model, best, previous)
+    report = FrameReport(
+        int(sensor.recording.frame_numbers[k]),
+        float(sensor.recording.time_s[k]),
+        str(status),
+        len(sensed(contacts)),
+        measurements(best.rows),
+        found.rms_before_m,
+        rms_of(best.rows, inliers(best)),
+        sum(found.stages_ms.values()),
+        dict(best.state.tension),
+        dict(best.state.pressure),
+        found.stages_ms,
+    )
+    state = replace(best.state, factor=None)
+    return SensedFrame(
+        best.contacts, state, best.forces, best.frame.predicted, report, contacts, tau=best.tau, trusted=status.trusted
+    )
+
+
+def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estimate:
     """Return the hypothesis of frame k with the lowest J.
 
     Raises:
@@ -57,11 +87,26 @@ def estimate_frame(model: Model, k: int, previous: Estimate | None) -> Estimate:
     clock.lap("search")
     exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
     best = best if exact is None else replace(best, state=exact)
-    before = model.rows(frame, frame.predicted).residual
-    inlier = best.weight[: len(before)] * best.rows.std[: len(before)] ** 2 / best.rows.share[: len(before)] > 0.5
-    rms = float(np.sqrt(np.mean(before[inlier] ** 2))) if inlier.any() else float("nan")
+    before = rms_of(model.rows(frame, frame.predicted), inliers(best))
     clock.lap("state")
-    return Estimate(frame, best, rms, clock.stages)
+    return Estimate(best, before, clock.stages)
+
+
+def inliers(best: Fit) -> BoolArray:
+    """Return which rows of the measurements are the robot's with probability above one half, shape (r,)."""
+    responsibility = best.weight * best.rows.std**2 / best.rows.share
+    return np.asarray((responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
+
+
+def rms_of(rows: Rows, robot: BoolArray) -> float:
+    """Return the root mean square residual [m] of the robot's pixels along the normal, or of markers in 3-D."""
+    own = rows.residual[robot[: len(rows)]] if rows.pixel.any() else rows.residual.reshape(-1, 3)
+    return float(np.sqrt((own**2).sum() / max(len(own), 1))) if len(own) else float("nan")
+
+
+def measurements(rows: Rows) -> int:
+    """Return the number of pixels, or of markers."""
+    return int(rows.pixel.sum()) if rows.pixel.any() else len(rows) // 3
 
 
 def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
@@ -74,7 +119,7 @@ def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
     return best
 
 
-def _fits(model: Model, frame: Frame, best: Fit):  # type: ignore[no-untyped-def]
+def _fits(model: Model, frame: Frame, best: Fit) -> Iterator[Fit]:
     """Yield fits of the most promising proposals, one after the other."""
     for one in proposals(model, best)[:FITTED]:
         start = best.state if best.contacts and one.contacts else frame.predicted
@@ -86,35 +131,37 @@ def _fits(model: Model, frame: Frame, best: Fit):  # type: ignore[no-untyped-def
 # --- predict ------------------------------------------------------------------------------------------------------------
 
 
-def _predicted(model: Model, k: int, previous: Estimate | None, clock: Clock) -> Frame:
+def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock) -> Frame:
     """Return the frame with its predicted state, its pixels, and the objects near the body."""
-    tensions = previous.best.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
-    start = None if previous is None else previous.frame.predicted
-    blank = Frame(k, None, None, start, tensions)  # type: ignore[arg-type]
-    predicted = model.solve(blank, (), np.zeros((0, 3)), start, exact=True)
+    tensions = previous.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
+    predicted = model.predict(k, None if previous is None else previous.free_state, tensions)
     if predicted is None:
         raise DataError("no equilibrium under the inputs")
     clock.lap("equilibrium")
     expected = _expected(predicted, previous)
     scan = scan_of(model.sensor, k, expected)
-    if scan is None or len(scan.view) < FEWEST:
-        count = 0 if scan is None else len(scan.view)
-        raise DataError(f"only {count} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees")
-    pixels = model.pixels(scan)
     clock.lap("read")
-    objects: tuple[object, ...] = ()
+    if scan is None:
+        return Frame(k, None, None, predicted, tensions)
+    if len(scan.view) < FEWEST:
+        raise DataError(
+            f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
+        )
+    objects: list[Shape] = []
     if not len(model.sensor.places) and not said_free(model.sensor, k):
-        objects = tuple(objects_near(model.sensor, scan, expected))
+        objects = objects_near(model.sensor, scan, expected)
     clock.lap("objects")
-    return Frame(k, pixels, scan, predicted, tensions, objects)  # type: ignore[arg-type]
+    touching = away_from_scenery(model.sensor, object_touches(model.sensor, objects, expected))
+    latent = tuple(one for one in touching if one.shape is not None and one.shape.kind in COMPLETED)
+    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects), latent=latent)
 
 
-def _expected(predicted: Equilibrium, previous: Estimate | None) -> Equilibrium:
+def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
     """Return about where the body is: the previous state, moved as the inputs have moved the predicted one since."""
-    if previous is None or not previous.best.contacts:
+    if previous is None or not previous.touches or not previous.trusted:
         return predicted
-    moved = previous.best.state.positions + predicted.positions - previous.frame.predicted.positions
-    return replace(previous.best.state, positions=moved)
+    moved = previous.state.positions + predicted.positions - previous.free_state.positions
+    return replace(previous.state, positions=moved)
 
 
 def _without_contacts(model: Model, frame: Frame) -> Fit:
@@ -123,14 +170,20 @@ def _without_contacts(model: Model, frame: Frame) -> Fit:
     return found
 
 
-def _carried_over(model: Model, frame: Frame, previous: Estimate | None) -> Fit | None:
+def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit | None:
     """Return the fit of the previous frame's contacts where dropping any of them would raise J; else None."""
-    if previous is None or not previous.best.contacts or len(model.sensor.places) or said_free(model.sensor, frame.index):
+    if (
+        previous is None
+        or not previous.touches
+        or not previous.trusted
+        or len(model.sensor.places)
+        or said_free(model.sensor, frame.index)
+    ):
         return None
     start = _expected(frame.predicted, previous)
     seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), start))
-    contacts = [_followed(model, contact, seen) for contact in previous.best.contacts]
-    found = fit(model, frame, contacts, previous.best.forces, start, tau=previous.best.tau)
+    contacts = [_followed(model, contact, seen) for contact in previous.touches]
+    found = fit(model, frame, contacts, previous.forces, start, tau=previous.tau)
     if found is None:
         return None
     alone = None if (found.drop_gain > found.odds).all() else _without_contacts(model, frame)
@@ -148,11 +201,11 @@ def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
     return replace(contact, source="shape", std_m=std, line=np.zeros(3), expected=contact.place, shape=None, pulls=False)
 
 
-def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: Estimate | None) -> Fit:
+def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: SensedFrame | None) -> Fit:
     """Return the fit with forces at the given places, whatever its evidence."""
     forces, start, tau = np.zeros((len(given), 3)), frame.predicted, None
-    if previous is not None and len(previous.best.contacts) == len(given):
-        forces, start, tau = previous.best.forces, _expected(frame.predicted, previous), previous.best.tau
+    if previous is not None and len(previous.touches) == len(given):
+        forces, start, tau = previous.forces, _expected(frame.predicted, previous), previous.tau
     if said_free(model.sensor, frame.index):
         return alone
     found = fit(model, frame, given, forces, start, tau=tau)

@@ -21,7 +21,7 @@ from femsense.inference.nuisance import columns, fit_nuisance
 from femsense.inference.rows import Rows, stacked
 from femsense.sensing.cone import within_cones
 from femsense.sensing.model import Fit, Frame, Linearised, Model
-from femsense.sensing.no_penetration import gap_rows
+from femsense.sensing.no_penetration import gap_rows, is_with
 from femsense.sensing.odds import odds_of
 from femsense.sensing.touches import moved_to, nodal_forces_by_shift, pressed, touch_normal, ways_of
 from femsense.sensing.types import Touch
@@ -39,6 +39,8 @@ CATCH = 3.0
 STEPS, HALVINGS = 14, (1.0, 0.5, 0.2, 0.05)
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less."""
+LATENT = 0.05
+"""Prior scale of the force at an object that touches and is no contact of the hypothesis [N]."""
 CHORD = 0.02
 """The tangent of a state serves for states whose nodes are nearer than this share of the body's diagonal."""
 
@@ -84,10 +86,11 @@ def fit(
     state = model.solve(frame, contacts, forces, start) if m and forces.any() else start
     if state is None:
         return None
-    eta = np.zeros(model.nuisance.root.shape[1]) if eta is None else eta
+    q = model.nuisance.root.shape[1]
     near = linearised is not None and _near(model, linearised.positions, state.positions)
     linear = linearised if near and linearised is not None else model.linearised(state)
     here = _point(model, frame, contacts, forces, np.full(m, FIRST_TAU) if tau is None else np.array(tau), state, linear)
+    eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
         return _finished(model, frame, here, linear, eta, True)
@@ -134,12 +137,31 @@ def _near(model: Model, first: FloatArray, second: FloatArray) -> bool:
 
 
 def _point(
-    model: Model, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, tau: FloatArray, state: Equilibrium, linear: Linearised
+    model: Model,
+    frame: Frame,
+    contacts: tuple[Touch, ...],
+    forces: FloatArray,
+    tau: FloatArray,
+    state: Equilibrium,
+    linear: Linearised,
 ) -> Point:
     rows = stacked([model.rows(frame, state), *gap_rows(model, frame, contacts, state.positions)])
     C = columns(rows, linear.softening)
     axes = axes_at(model, contacts, state)
-    return Point(contacts, forces, tau, state, axes, rows, C, C @ model.nuisance.root, rows.residual - C @ model.nuisance.mean)
+    N = np.hstack([C @ model.nuisance.root, _latent_columns(model, frame, contacts, rows, state, linear)])
+    return Point(contacts, forces, tau, state, axes, rows, C, N, rows.residual - C @ model.nuisance.mean)
+
+
+def _latent_columns(
+    model: Model, frame: Frame, contacts: Sequence[Touch], rows: Rows, state: Equilibrium, linear: Linearised
+) -> FloatArray:
+    """Return the columns of normal forces at objects that touch and are no contact of the hypothesis, shape (r, l).
+
+    Left out, a force too small to be significant would bias those of its neighbours and make their intervals too narrow.
+    """
+    own = [one for one in frame.latent if not any(is_with(contact, one.shape) for contact in contacts)]
+    loads = [one.patch.spread(-LATENT * touch_normal(model.sensor, one, state), len(state.positions)) for one in own]
+    return rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(rows), 0))
 
 
 def axes_at(model: Model, contacts: Sequence[Touch], state: Equilibrium) -> FloatArray:
@@ -209,7 +231,9 @@ def contact_columns(model: Model, here: Point | Fit, axes: FloatArray, linear: L
     return here.rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(here.rows), 0))
 
 
-def _step(model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _step(
+    model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, and A⁻¹."""
     J = contact_columns(model, here, here.axes, linear)
     scale, at = _whitened(model, here, trust=True)

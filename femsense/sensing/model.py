@@ -13,10 +13,11 @@ from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.inference.nuisance import Nuisance
 from femsense.inference.pixels import Pixels, Skin, pixel_rows
-from femsense.inference.rows import Rows
+from femsense.inference.rows import Rows, stacked
 from femsense.model.camera import CameraNoise
 from femsense.model.frame_state import solve_frame
 from femsense.pointcloud.primitives import Shape
+from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.touches import nodal_forces
 from femsense.sensing.types import Sensor, Touch
 
@@ -43,6 +44,8 @@ class Model:
     """Power of 1/cos(incidence) with which the noise along the ray grows beyond what is declared."""
     inferred_odds: float = 0.0
     """L of an inferred contact: −2 log of its prior odds, raised by what the search gains in contact-free frames."""
+    modulus_shift: float = 0.0
+    """Relative softness that contact-free frames asked for and that the body has been given."""
     limits: Limits | None = None
     """What the posterior check compares with; None before contact-free frames are seen."""
     candidates: Candidates = field(default_factory=lambda: Candidates())
@@ -58,6 +61,17 @@ class Model:
         return len(self.sensor.calibration.poses)
 
     @property
+    def compliance_std(self) -> float:
+        """Relative standard deviation of the compliance at a contact [1].
+
+        Gravity and cables pull as declared, and yet the model needs another modulus or other pulls to move as the body does (law, mesh, ties): what it
+        needs there, it needs at a contact. The root mean square of the pulls that contact-free frames ask for, and that of the modulus.
+        """
+        asked = np.arange(6 * self.views, self.nuisance.common)
+        square = self.nuisance.mean[asked] ** 2 + (self.nuisance.root[asked] ** 2).sum(axis=1)
+        return float(np.sqrt(self.modulus_shift**2 + square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
+
+    @property
     def drives(self) -> int:
         """Number of cables and chambers whose pulls are nuisance parameters."""
         return self.nuisance.common - 6 * self.views - 1
@@ -70,9 +84,13 @@ class Model:
         return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, share, 1.0 / self.overdispersion, scan.segmented)
 
     def rows(self, frame: Frame, state: Equilibrium) -> Rows:
-        """Return the rows of a frame at a state."""
-        assert frame.pixels is not None
-        return pixel_rows(frame.pixels, self.skin, state.positions, self.views)
+        """Return the rows of a frame at a state: its pixels, or its markers where it has none. Raises DataError."""
+        if frame.pixels is None:
+            return marker_rows(self.sensor, frame.index, state, len(self.skin.field))
+        rows = pixel_rows(frame.pixels, self.skin, state.positions, self.views)
+        if not frame.with_markers:
+            return rows
+        return stacked([rows, marker_rows(self.sensor, frame.index, state, len(self.skin.field))])
 
     def solve(
         self, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium | None, *, exact: bool = False
@@ -88,6 +106,12 @@ class Model:
             rough=not exact,
         )
         state = solve_frame(self.sensor.driven, frame.index, start=start, nodal_forces=loads, options=options)
+        return state if state.converged else None
+
+    def predict(self, k: int, start: Equilibrium | None, tensions: tuple[FloatArray, ...] | None) -> Equilibrium | None:
+        """Return the equilibrium of frame k under its inputs without contact forces; None where there is none."""
+        options = SolveOptions(before=tensions, reuse_factor=start is not None, relative_tolerance=EXACT)
+        state = solve_frame(self.sensor.driven, k, start=start, options=options)
         return state if state.converged else None
 
     def linearised(self, state: Equilibrium) -> Linearised:
@@ -138,8 +162,12 @@ class Frame:
     """Under the inputs without contact forces."""
     previous_tensions: tuple[FloatArray, ...] | None
     """Tensions along the cables before this frame (friction)."""
+    with_markers: bool = False
+    """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
     objects: tuple[Shape, ...] = ()
     """Rigid objects seen or declared near the body, completed."""
+    latent: tuple[Touch, ...] = ()
+    """Where these touch the expected state: an object in touch that is no contact of a hypothesis may carry a small force all the same."""
 
     @property
     def coloured(self) -> bool:

@@ -48,22 +48,27 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
         if is_rigid(contact):
             assert contact.shape is not None
             shape = contact.shape.towards(positions[model.sensor.surface.nodes])
-            shared = sum(other.shape is contact.shape for other in contacts) > 1
+            shared = sum(is_with(other, contact.shape) for other in contacts) > 1
             at = _closest(model, shape, positions, contact.place if shared else None)
             if at is not None:
                 rows.append(_row(model, frame, shape, *at, positions, odds=_density(model, contact)[1]))
     for own in frame.objects:
-        if own.kind in COMPLETED and not any(contact.shape is own for contact in contacts):
+        if own.kind in COMPLETED and not any(is_with(contact, own) for contact in contacts):
             shape = own.towards(positions[model.sensor.surface.nodes])
             at = _closest(model, shape, positions, None)
-            if at is not None and at[2] < 0.0:
+            if at is not None and at[2] < 0.0 and shape.behind_m == 0.0:
                 rows.append(_row(model, frame, shape, *at, positions, odds=float(np.log(OVERLAPPING))))
     return rows
 
 
+def is_with(contact: Touch, shape: Shape | None) -> bool:
+    """Return whether a contact is with an object, whichever of its sides touches."""
+    return contact.shape is not None and shape is not None and contact.shape.points is shape.points
+
+
 def is_rigid(contact: Touch) -> bool:
-    """Return whether a contact is with an object whose surface is known."""
-    return contact.shape is not None and contact.shape.kind in COMPLETED
+    """Return whether a contact is with an object whose surface is known where it touches: of a plate, the side that is seen."""
+    return contact.shape is not None and contact.shape.kind in COMPLETED and contact.shape.behind_m == 0.0
 
 
 def gap_odds(model: Model, contact: Touch) -> float:
@@ -83,9 +88,7 @@ def gap_std(model: Model, shape: Shape) -> float:
     return float(np.hypot(np.sqrt(model.overdispersion) * shape.std_m, GAP_STD))
 
 
-def _closest(
-    model: Model, shape: Shape, positions: FloatArray, near: FloatArray | None
-) -> tuple[int, FloatArray, float] | None:
+def _closest(model: Model, shape: Shape, positions: FloatArray, near: FloatArray | None) -> tuple[int, FloatArray, float] | None:
     """Return triangle, barycentric weights and gap [m] of the surface point closest to an object; None where nothing comes near.
 
     Arguments:
@@ -119,7 +122,17 @@ def _free_triangles(model: Model) -> IntArray:
     return np.flatnonzero(~clamped[model.skin.triangles].any(axis=1))
 
 
-def _row(model: Model, frame: Frame, shape: Shape, triangle: int, weights: FloatArray, gap: float, positions: FloatArray, *, odds: float) -> Rows:
+def _row(
+    model: Model,
+    frame: Frame,
+    shape: Shape,
+    triangle: int,
+    weights: FloatArray,
+    gap: float,
+    positions: FloatArray,
+    *,
+    odds: float,
+) -> Rows:
     """Return the row of a gap [m] at a surface point."""
     place = weights @ positions[model.skin.triangles[triangle]]
     step = SLOPE * np.eye(3)

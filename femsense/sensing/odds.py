@@ -46,5 +46,5 @@ def in_sight(model: Model, rows: Rows, places: FloatArray) -> BoolArray:
     robot = rows.pixel & (np.abs(rows.residual) < 5.0 * rows.std)
     seen = rows.rest[robot]
     seen = seen[:: max(1, len(seen) // 2000)]
-    near = ((places[:, None] - seen[None]) ** 2).sum(axis=2) < model.sensor.surface.edge ** 2
+    near = ((places[:, None] - seen[None]) ** 2).sum(axis=2) < model.sensor.surface.edge**2
     return np.asarray(near.sum(axis=1) >= SEEN_BY)

@@ -130,7 +130,9 @@ def _tau(force: FloatArray) -> float:
     return max(float(np.linalg.norm(force)), 0.05)
 
 
-def inferred(model: Model, best: Fit, *, without: int | None = None, pulls: bool = False) -> tuple[float, list[tuple[Touch, FloatArray]]]:
+def inferred(
+    model: Model, best: Fit, *, without: int | None = None, pulls: bool = False
+) -> tuple[float, list[tuple[Touch, FloatArray]]]:
     """Return by how much one more contact lowers J, marginalised over the candidates, and the best places with their forces.
 
     Arguments:
@@ -182,7 +184,13 @@ def answers_at(model: Model, best: Fit) -> FloatArray:
 
 
 def linearised_evidence(
-    model: Model, best: Fit, answers: FloatArray, normals: FloatArray, *, without: int | None = None, hangs: BoolArray | None = None
+    model: Model,
+    best: Fit,
+    answers: FloatArray,
+    normals: FloatArray,
+    *,
+    without: int | None = None,
+    hangs: BoolArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the decrease of −2 log evidence by one more contact at each candidate, shape (c,), and its force [N], shape (c, 3).
 
@@ -206,7 +214,9 @@ def linearised_evidence(
             own = slice(5 * without, 5 * without + 3)
             kept[5 * without : 5 * without + 5] = False
             residual = residual + J[:, own] @ (axes[without] @ best.forces[without])
-        scale = np.concatenate([[*force_scale(t, c.pulls), *_free_ways(c, f)] for c, f, t in zip(best.contacts, best.forces, best.tau)])
+        scale = np.concatenate(
+            [[*force_scale(t, c.pulls), *_free_ways(c, f)] for c, f, t in zip(best.contacts, best.forces, best.tau)]
+        )
         N = np.hstack([N, (J * scale)[:, kept]])
     weight = misfit(z[thin], part.log_other, part.share, kappa[thin])[1] * part.share / (kappa[thin] * part.std) ** 2
     weight *= np.where(part.pixel, len(pixels) / max(part.pixel.sum(), 1), 1.0)

@@ -255,6 +255,10 @@ class SensedFrame:
     """Whether each force was more than noise."""
     response: Response | None = None  # near the state
     free_response: Response | None = None  # near the state under the inputs alone
+    tau: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Prior scale of each force [N], shape (m,); of the objective alone."""
+    trusted: bool = True
+    """Whether the next frame may start from this one."""
 
 
 @dataclass(eq=False, slots=True)

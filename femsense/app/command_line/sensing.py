@@ -19,6 +19,7 @@ class SensingMethod(StrEnum):
 
     rays = "rays"
     paper = "paper"
+    evidence = "evidence"
 
 
 def calibrate(
