@@ -9,6 +9,8 @@ Source of the mixture: Verbeek, Vlassis & Kröse 2003 for EM; Aitkin & Wilson 19
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
@@ -45,8 +47,29 @@ def log_odds_of_other(robot_share: FloatArray, std: FloatArray, length: float, s
     return np.asarray(np.log((1.0 - robot_share) * np.sqrt(2.0 * np.pi) * std * seen_through / (robot_share * length)))
 
 
-def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) -> FloatArray:
-    """Return κ of each row at the start of a fit, shape (r,): nine in ten pixels lie within 1.65 κ, and every other row.
+@dataclass(frozen=True, slots=True)
+class Width:
+    """κ of the pixels and of all other rows."""
+
+    pixels: float = 1.0
+    others: float = 1.0
+
+    def of(self, pixel: BoolArray) -> FloatArray:
+        """Return κ of rows, of which some are pixels, shape (r,)."""
+        return np.where(pixel, self.pixels, self.others)
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the noise has its own width."""
+        return self.pixels == 1.0 and self.others == 1.0
+
+    def narrowed(self) -> Width:
+        """Return the next, narrower widths."""
+        return Width(*(max(1.0, kappa / 3.0) if kappa > 1.5 else 1.0 for kappa in (self.pixels, self.others)))
+
+
+def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) -> Width:
+    """Return κ at the start of a fit: nine in ten pixels lie within 1.65 κ, and every other row.
 
     Arguments:
         z: whitened residuals, shape (r,).
@@ -55,10 +78,6 @@ def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) ->
     """
     kappa = np.abs(z) / 1.65
     common = float(np.quantile(kappa[pixel], 0.9)) if pixel.any() else 1.0
-    kappa[pixel] = common if coloured else min(common, most)
-    return np.where(kappa > 1.5, kappa, 1.0)
-
-
-def narrowed(kappa: FloatArray) -> FloatArray:
-    """Return the next, narrower widths."""
-    return np.where(kappa > 1.5, np.maximum(1.0, kappa / 3.0), 1.0)
+    common = common if coloured else min(common, most)
+    others = float(kappa[~pixel].max(initial=1.0)) if pixel.any() else 1.0
+    return Width(*(value if value > 1.5 else 1.0 for value in (common, others)))

@@ -19,7 +19,7 @@ from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model
-from femsense.sensing.no_penetration import COMPLETED
+from femsense.sensing.no_penetration import COMPLETED, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.prepare import scan_of
 from femsense.sensing.proposals import SAME, proposals
@@ -84,6 +84,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
         best = _at_given_places(model, frame, given, best, previous)
     elif not said_free(model.sensor, k):
         best = _searched(model, frame, best)
+    best = _beside_latent_forces(model, frame, best)
     clock.lap("search")
     exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
     best = best if exact is None else replace(best, state=exact)
@@ -119,6 +120,19 @@ def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
     return best
 
 
+def _beside_latent_forces(model: Model, frame: Frame, best: Fit) -> Fit:
+    """Return the best hypothesis fitted again next to latent forces of objects in touch that are none of its contacts, where there are any."""
+    if not best.contacts or not frame.objects:
+        return best
+    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), best.state))
+    others = [t for t in touching if t.shape is not None and t.shape.kind in COMPLETED and not any(is_with(c, t.shape) for c in best.contacts)]
+    if not others:
+        return best
+    beside = replace(frame, latent=tuple(others))
+    again = fit(model, beside, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
+    return best if again is None else again
+
+
 def _fits(model: Model, frame: Frame, best: Fit) -> Iterator[Fit]:
     """Yield fits of the most promising proposals, one after the other."""
     for one in proposals(model, best)[:FITTED]:
@@ -151,9 +165,7 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
     if not len(model.sensor.places) and not said_free(model.sensor, k):
         objects = objects_near(model.sensor, scan, expected)
     clock.lap("objects")
-    touching = away_from_scenery(model.sensor, object_touches(model.sensor, objects, expected))
-    latent = tuple(one for one in touching if one.shape is not None and one.shape.kind in COMPLETED)
-    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects), latent=latent)
+    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects))
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:

@@ -16,12 +16,12 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.equilibrium import Equilibrium
-from femsense.inference.mixture import first_width, narrowed
+from femsense.inference.mixture import first_width
 from femsense.inference.nuisance import columns, fit_nuisance
 from femsense.inference.rows import Rows, stacked
 from femsense.sensing.cone import within_cones
 from femsense.sensing.model import Fit, Frame, Linearised, Model
-from femsense.sensing.no_penetration import gap_rows, is_with
+from femsense.sensing.no_penetration import gap_rows
 from femsense.sensing.odds import odds_of
 from femsense.sensing.touches import moved_to, nodal_forces_by_shift, pressed, touch_normal, ways_of
 from femsense.sensing.types import Touch
@@ -39,7 +39,7 @@ CATCH = 3.0
 STEPS, HALVINGS = 14, (1.0, 0.5, 0.2, 0.05)
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less."""
-LATENT = 0.05
+LATENT = 0.2
 """Prior scale of the force at an object that touches and is no contact of the hypothesis [N]."""
 CHORD = 0.02
 """The tangent of a state serves for states whose nodes are nearer than this share of the body's diagonal."""
@@ -99,7 +99,7 @@ def fit(
     kappa = first_width(z, here.rows.pixel, frame.coloured, CATCH)
     converged = False
     for _ in range(STEPS):
-        eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa)
+        eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
         phi += _prior(here)
         step, eta_there, A_inverse = _step(model, here, linear, eta, weight)
         there = None
@@ -107,25 +107,27 @@ def fit(
             there = _moved(model, frame, here, linear, length * step)
             if there is None:
                 continue
-            eta_new, phi_there, _ = fit_nuisance(there.rows, there.residual, there.N, eta_there, kappa=kappa)
+            eta_new, phi_there, _ = fit_nuisance(
+                there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel)
+            )
             phi_there += _prior(there)
             if phi_there < phi:
                 break
             there = None
         if there is None:
-            if (kappa == 1.0).all():
+            if kappa.narrow:
                 converged = True
                 break
-            kappa = narrowed(kappa)
+            kappa = kappa.narrowed()
             continue
         here, eta = replace(there, tau=_prior_scales(there, A_inverse)), eta_new
         if not _near(model, linear.positions, here.state.positions):
             linear = model.linearised(here.state)
             here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
-        if (kappa == 1.0).all() and phi - phi_there < TOLERANCE:
+        if kappa.narrow and phi - phi_there < TOLERANCE:
             converged = True
             break
-        kappa = narrowed(kappa)
+        kappa = kappa.narrowed()
     return _in_cones(model, frame, _finished(model, frame, here, linear, eta, converged), here)
 
 
@@ -148,19 +150,13 @@ def _point(
     rows = stacked([model.rows(frame, state), *gap_rows(model, frame, contacts, state.positions)])
     C = columns(rows, linear.softening)
     axes = axes_at(model, contacts, state)
-    N = np.hstack([C @ model.nuisance.root, _latent_columns(model, frame, contacts, rows, state, linear)])
+    N = np.hstack([C @ model.nuisance.root, _latent_columns(model, frame, rows, state, linear)])
     return Point(contacts, forces, tau, state, axes, rows, C, N, rows.residual - C @ model.nuisance.mean)
 
 
-def _latent_columns(
-    model: Model, frame: Frame, contacts: Sequence[Touch], rows: Rows, state: Equilibrium, linear: Linearised
-) -> FloatArray:
-    """Return the columns of normal forces at objects that touch and are no contact of the hypothesis, shape (r, l).
-
-    Left out, a force too small to be significant would bias those of its neighbours and make their intervals too narrow.
-    """
-    own = [one for one in frame.latent if not any(is_with(contact, one.shape) for contact in contacts)]
-    loads = [one.patch.spread(-LATENT * touch_normal(model.sensor, one, state), len(state.positions)) for one in own]
+def _latent_columns(model: Model, frame: Frame, rows: Rows, state: Equilibrium, linear: Linearised) -> FloatArray:
+    """Return the columns of latent normal forces (see `Frame.latent`), shape (r, l)."""
+    loads = [one.patch.spread(-LATENT * touch_normal(model.sensor, one, state), len(state.positions)) for one in frame.latent]
     return rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(rows), 0))
 
 

@@ -167,7 +167,8 @@ class Frame:
     objects: tuple[Shape, ...] = ()
     """Rigid objects seen or declared near the body, completed."""
     latent: tuple[Touch, ...] = ()
-    """Where these touch the expected state: an object in touch that is no contact of a hypothesis may carry a small force all the same."""
+    """Objects in touch that are no contact of the best hypothesis: each may carry a small force along its normal, which left out would bias those of its
+    neighbours and make their intervals too narrow. Empty while hypotheses are compared."""
 
     @property
     def coloured(self) -> bool:

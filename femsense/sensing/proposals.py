@@ -17,6 +17,7 @@ from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
 from femsense.sensing.fit import CATCH, axes_at, axes_of, contact_columns, force_scale
 from femsense.sensing.model import Fit, Model
+from femsense.sensing.no_penetration import is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
 from femsense.sensing.places import away_from_scenery, object_touches
 from femsense.sensing.touches import make_touch, touch_normal, ways_of
@@ -30,6 +31,8 @@ SAME = 0.08
 """Contacts within this share of the body's diagonal are one."""
 STALE = 0.03
 """Answers at the candidates serve while no node has moved farther than this share of the diagonal: they rank, and do not estimate."""
+SHORT = 10.0
+"""By how much the linearised gain of a contact at a seen object may fall short of the fitted one: it keeps the contact points."""
 SEARCHED, CLOSE = 2, 20.0
 """Candidates that are fitted, the best first, and by how much −2 log evidence of the last may be below the first."""
 
@@ -68,29 +71,33 @@ def _dropped(best: Fit) -> list[Proposal]:
 
 
 def _at_objects(model: Model, best: Fit, seen: Sequence[Touch]) -> list[Proposal]:
-    """Return additions at seen objects, and inferred contacts that a seen object accounts for."""
-    found, new = [], []
-    for one in seen:
-        reach = max(SAME * model.sensor.size, 2.0 * one.std_m)
-        distance = [float(np.linalg.norm(one.place - contact.place)) for contact in best.contacts]
-        if not distance or min(distance) >= reach:
-            new.append(one)
-            continue
-        i = int(np.argmin(distance))
-        ways, std = ways_of(one)
-        cost = float(((ways @ (best.contacts[i].place - one.place) / std) ** 2).sum())
-        own = odds_of(model, one, best.rows)
-        if best.contacts[i].source == "shape" and best.odds[i] - own > cost:
-            found.append(_replaced(best, i, one, best.forces[i], best.odds[i] - own - cost))
-    if new:
-        n = len(best.state.positions)
-        loads = np.array([one.patch.spread(axis, n) for one in new for axis in np.eye(3)])
-        moves = best.linearised.tangent.respond(loads)
-        normals = np.array([touch_normal(model.sensor, one, best.state) for one in new])
-        gains, forces = linearised_evidence(model, best, np.moveaxis(moves, 0, 2), normals)
-        odds = [odds_of(model, one, best.rows) for one in new]
-        found += [_added(best, one, f, g - L) for one, g, f, L in zip(new, gains, forces, odds) if g > L]
+    """Return additions at seen objects that are no contact yet, and inferred contacts replaced by them."""
+    new = [one for one in seen if not _is_there(model, best, one)]
+    if not new:
+        return []
+    n = len(best.state.positions)
+    loads = np.array([one.patch.spread(axis, n) for one in new for axis in np.eye(3)])
+    answers = np.moveaxis(best.linearised.tangent.respond(loads), 0, 2)
+    normals = np.array([touch_normal(model.sensor, one, best.state) for one in new])
+    odds = np.array([odds_of(model, one, best.rows) for one in new])
+    gains, forces = linearised_evidence(model, best, answers, normals)
+    found = [_added(best, one, f, g - L) for one, g, f, L in zip(new, gains, forces, odds) if g > L - SHORT]
+    for i, contact in enumerate(best.contacts):
+        if contact.source == "shape":
+            gains, forces = linearised_evidence(model, best, answers, normals, without=i)
+            found += [
+                _replaced(best, i, one, f, g - L + best.odds[i] - best.drop_gain[i])
+                for one, g, f, L in zip(new, gains, forces, odds)
+                if g - L + best.odds[i] > -SHORT
+            ]
     return found
+
+
+def _is_there(model: Model, best: Fit, seen: Touch) -> bool:
+    """Return whether a hypothesis has a contact at a seen object."""
+    reach = max(SAME * model.sensor.size, 2.0 * seen.std_m)
+    near = [c for c in best.contacts if c.source == "cloud" and float(np.linalg.norm(c.place - seen.place)) < reach]
+    return bool(near) or any(is_with(contact, seen.shape) for contact in best.contacts)
 
 
 def _inferred(model: Model, best: Fit) -> list[Proposal]:
@@ -201,7 +208,7 @@ def linearised_evidence(
         hangs: candidates that are hanging weights, whose normals point upwards and whose forces keep to no cone, shape (c,).
     """
     rows, z = best.rows, best.left(model.nuisance)
-    kappa = first_width(z, rows.pixel, best.frame.coloured, CATCH)
+    kappa = first_width(z, rows.pixel, best.frame.coloured, CATCH).of(rows.pixel)
     pixels = np.flatnonzero(rows.pixel)
     thin = np.concatenate([pixels[:: max(1, len(pixels) // THIN)], np.flatnonzero(~rows.pixel)])
     part = rows.some(thin)
