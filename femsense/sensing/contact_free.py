@@ -160,10 +160,13 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
         gains.append(max(inferred(replace(others, inferred_odds=0.0), alone)[0], 0.0))
         checks.append(check_values(others, alone))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
-    sensor = replace(
-        model.sensor,
-        knowledge=replace(model.sensor.knowledge, bias_m=model.nuisance.sizes[0], model_share=model.nuisance.sizes[1]),
+    noises = tuple(
+        replace(one, at_1m=model.scale * one.at_1m, floor=model.scale * one.floor, slope=model.scale * one.slope)
+        for one in model.noises
     )
+    bias, share = model.nuisance.sizes[:2]
+    knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share)
+    sensor = replace(model.sensor, knowledge=knowledge)
     limits = None if not checks else Limits(*(_limit([c[j] for c in checks]) for j in range(3)))
     return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
 

@@ -19,7 +19,7 @@ from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model
-from femsense.sensing.no_penetration import COMPLETED, is_with
+from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.prepare import scan_of
 from femsense.sensing.proposals import SAME, proposals
@@ -30,6 +30,10 @@ from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
 """Rounds of proposals at most, and proposals that are fitted in each."""
+UNDETERMINED_TAU = 2.0
+"""Prior scale of the force at an object in touch that the data do not determine [N]: what hands and grippers press with."""
+MANY = 30
+"""Pixels of an object without a known shape that may carry a latent force."""
 FEWEST = 30
 """Fewer pixels of the robot say nothing of its shape."""
 
@@ -84,7 +88,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
         best = _at_given_places(model, frame, given, best, previous)
     elif not said_free(model.sensor, k):
         best = _searched(model, frame, best)
-    best = _beside_latent_forces(model, frame, best)
+        best = _with_objects_in_touch(model, frame, best)
     clock.lap("search")
     exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
     best = best if exact is None else replace(best, state=exact)
@@ -120,17 +124,35 @@ def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
     return best
 
 
-def _beside_latent_forces(model: Model, frame: Frame, best: Fit) -> Fit:
-    """Return the best hypothesis fitted again next to latent forces of objects in touch that are none of its contacts, where there are any."""
-    if not best.contacts or not frame.objects:
-        return best
+def _with_objects_in_touch(model: Model, frame: Frame, best: Fit) -> Fit:
+    """Return the best hypothesis fitted again with objects in touch that are none of its contacts, where there are any.
+
+    Their forces are not significant. Left out, they would bias those of their neighbours and make their intervals too narrow. An object whose surface
+    lies at the body's becomes a contact with a wide interval, another one a latent force.
+    """
     touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), best.state))
-    others = [t for t in touching if t.shape is not None and t.shape.kind in COMPLETED and not any(is_with(c, t.shape) for c in best.contacts)]
-    if not others:
+    others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
+    at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
+    latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
+    if not at_surface and not (latent and best.contacts):
         return best
-    beside = replace(frame, latent=tuple(others))
-    again = fit(model, beside, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
+    again = fit(
+        model,
+        replace(frame, latent=tuple(latent)),
+        [*best.contacts, *at_surface],
+        np.vstack([best.forces, np.zeros((len(at_surface), 3))]),
+        best.state,
+        eta=best.eta,
+        tau=np.append(best.tau, np.full(len(at_surface), UNDETERMINED_TAU)),
+        linearised=best.linearised,
+    )
     return best if again is None else again
+
+
+def _is_object(contact: Touch) -> bool:
+    """Return whether a contact is with an object of known shape, or with one whose pixels are too many for a scrap of the scene."""
+    shape = contact.shape
+    return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
 
 
 def _fits(model: Model, frame: Frame, best: Fit) -> Iterator[Fit]:
@@ -194,8 +216,11 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
         return None
     start = _expected(frame.predicted, previous)
     seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), start))
-    contacts = [_followed(model, contact, seen) for contact in previous.touches]
-    found = fit(model, frame, contacts, previous.forces, start, tau=previous.tau)
+    kept = [i for i, contact in enumerate(previous.touches) if not contact.undetermined]
+    if not kept:
+        return None
+    contacts = [_followed(model, previous.touches[i], seen) for i in kept]
+    found = fit(model, frame, contacts, previous.forces[kept], start, tau=previous.tau[kept])
     if found is None:
         return None
     alone = None if (found.drop_gain > found.odds).all() else _without_contacts(model, frame)

@@ -107,9 +107,7 @@ def fit(
             there = _moved(model, frame, here, linear, length * step)
             if there is None:
                 continue
-            eta_new, phi_there, _ = fit_nuisance(
-                there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel)
-            )
+            eta_new, phi_there, _ = fit_nuisance(there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel))
             phi_there += _prior(there)
             if phi_there < phi:
                 break
@@ -258,6 +256,8 @@ def _prior_scales(here: Point, inverse: FloatArray) -> FloatArray:
     """Return τ of each force by type-II maximum likelihood: its expected square under the posterior (MacKay 1992)."""
     tau = here.tau.copy()
     for i, (contact, force, axes) in enumerate(zip(here.contacts, here.forces, here.axes)):
+        if contact.undetermined:
+            continue
         q = (axes @ force) / force_scale(1.0, contact.pulls)
         spread = tau[i] ** 2 * float(np.trace(inverse[5 * i : 5 * i + 3, 5 * i : 5 * i + 3]))
         tau[i] = np.clip(np.sqrt((q @ q + spread) / 3.0), *TAU)

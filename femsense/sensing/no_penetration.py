@@ -35,6 +35,8 @@ LATTICE = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) 
 """Barycentric points of a triangle at which the gap is taken, shape (15, 3)."""
 SLOPE = 1e-5
 """Step of the central difference of a distance [m]."""
+TOUCHING = 2.0
+"""An object is in touch whose gap is below this many standard deviations."""
 ZONE = 3.0
 """Where several contacts are with one object, surface points within this many edges of a contact point belong to it."""
 COMPLETED = ("sphere", "cylinder", "plate", "known")
@@ -45,7 +47,7 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
     """Return one row for each contact with an object whose surface is known, and one for each object that overlaps the body elsewhere."""
     rows = []
     for contact in contacts:
-        if is_rigid(contact):
+        if is_rigid(model, contact):
             assert contact.shape is not None
             shape = contact.shape.towards(positions[model.sensor.surface.nodes])
             shared = sum(is_with(other, contact.shape) for other in contacts) > 1
@@ -53,7 +55,7 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
             if at is not None:
                 rows.append(_row(model, frame, shape, *at, positions, odds=_density(model, contact)[1]))
     for own in frame.objects:
-        if own.kind in COMPLETED and not any(is_with(contact, own) for contact in contacts):
+        if _is_known(model, own) and not any(is_with(contact, own) for contact in contacts):
             shape = own.towards(positions[model.sensor.surface.nodes])
             at = _closest(model, shape, positions, None)
             if at is not None and at[2] < 0.0 and shape.behind_m == 0.0:
@@ -66,14 +68,28 @@ def is_with(contact: Touch, shape: Shape | None) -> bool:
     return contact.shape is not None and shape is not None and contact.shape.points is shape.points
 
 
-def is_rigid(contact: Touch) -> bool:
+def is_rigid(model: Model, contact: Touch) -> bool:
     """Return whether a contact is with an object whose surface is known where it touches: of a plate, the side that is seen."""
-    return contact.shape is not None and contact.shape.kind in COMPLETED and contact.shape.behind_m == 0.0
+    return contact.shape is not None and _is_known(model, contact.shape) and contact.shape.behind_m == 0.0
+
+
+def _is_known(model: Model, shape: Shape) -> bool:
+    """Return whether the surface of an object is known better than the mesh resolves."""
+    return shape.kind in COMPLETED and gap_std(model, shape) < model.sensor.surface.edge
+
+
+def in_touch(model: Model, contact: Touch, positions: FloatArray) -> bool:
+    """Return whether an object whose surface is known lies at the surface of the body within two standard deviations."""
+    if not is_rigid(model, contact):
+        return False
+    assert contact.shape is not None
+    at = _closest(model, contact.shape.towards(positions[model.sensor.surface.nodes]), positions, None)
+    return at is not None and at[2] < TOUCHING * gap_std(model, contact.shape)
 
 
 def gap_odds(model: Model, contact: Touch) -> float:
     """Return −2 log of the density of a gap of 0 of a touching object, relative to one that hovers anywhere near the body; 0 where its surface is not known."""
-    return -2.0 * _density(model, contact)[0] if is_rigid(contact) else 0.0
+    return -2.0 * _density(model, contact)[0] if is_rigid(model, contact) else 0.0
 
 
 def _density(model: Model, contact: Touch) -> tuple[float, float]:

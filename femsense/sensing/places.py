@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, IntArray
@@ -34,6 +35,8 @@ CONE = float(np.sqrt(10.0 / 3.0))
 """Radius of a cone of pressure over its root mean square radius."""
 AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
+SOME = 300
+"""Rays that tell the angle between neighbours."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
 FLOOR_STD = 0.0007
@@ -65,7 +68,8 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
     low, high = state.positions.min(axis=0) - reach, state.positions.max(axis=0) + reach
     close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     gap = np.full(len(points), np.inf)
-    gap[close] = Surface(state.positions, sensor.surface.triangles).signed_gap(points[close], within=reach)
+    body = Surface(state.positions, sensor.surface.triangles)
+    gap[close] = body.signed_gap(points[close], within=reach)
     near = np.flatnonzero(gap < reach)
     if len(near) < 3:
         return []
@@ -81,14 +85,35 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else fit_shape,
-        edge=_edge_of(sensor, points - origins, view) + 3.0 * std,
+        edge=_edge_of(sensor, scan, body, points, origins, view) + 3.0 * std,
     )
 
 
-def _edge_of(sensor: Sensor, rays: FloatArray, view: IntArray) -> FloatArray:
-    """Return how far beside the body a camera may show points of its edge [m], shape (o,); 0 where it is not known how large pixels are."""
-    pixel = np.array([0.0 if camera is None else 1.0 / camera.fx for camera in sensor.recording.cameras])
-    return np.asarray(BLEEDING * pixel[view] * np.linalg.norm(rays, axis=1))
+def _edge_of(
+    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, origins: FloatArray, view: IntArray
+) -> FloatArray:
+    """Return how far beside the body a camera may show points of its edge [m], shape (o,); inf for points of its halo.
+
+    A pixel whose ray passes the body that closely has a depth anywhere between the body and what is behind it.
+    """
+    cameras = sensor.recording.cameras
+    pixel = np.array([_pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
+    edge = BLEEDING * pixel[view] * np.linalg.norm(points - origins, axis=1)
+    beside = body.beside_rays(points, origins)
+    return np.where((beside > 0.0) & (beside < edge), np.inf, edge)
+
+
+def _pixel_of(scan: Scan, view: int) -> float:
+    """Return the angle between neighbouring rays of a camera [rad], from the robot's points; 0 where there are too few.
+
+    A cloud that was thinned has a larger one, and a wider halo in metres.
+    """
+    seen = scan.camera_points[scan.view == view]
+    if len(seen) < FEWEST:
+        return 0.0
+    rays = seen[:, :2] / seen[:, 2:]
+    some = rays[:: max(1, len(rays) // SOME)]
+    return float(np.median(cKDTree(rays).query(some, k=2)[0][:, 1]))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

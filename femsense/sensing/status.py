@@ -102,7 +102,7 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
             return verdict(Status.BEHIND_BODY, percent=100.0 * behind)
     for i in np.flatnonzero(~best.rows.pixel):
         gap = float(-best.rows.residual[i])
-        if gap < -OVERLAP * float(best.rows.std[i]) and not any(is_rigid(c) for c in best.contacts):
+        if gap < -OVERLAP * float(best.rows.std[i]) and not any(is_rigid(model, c) for c in best.contacts):
             return verdict(Status.OVERLAP, overlap_mm=-1e3 * gap)
     try:
         off = marker_rows(model.sensor, best.frame.index, best.state, 0).residual

@@ -33,7 +33,7 @@ MEDIAN = 1.0 - 1.483 ** (-2.0 / 3.0)
 class SensingOptions:
     """What the data cannot say."""
 
-    method: str = "rays"
+    method: str = "evidence"
     """"rays": every point a measurement; "paper": feature points, Algorithms 2 and 3, normals only, one linear step."""
     friction: float | None = 1.0
     """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
@@ -191,6 +191,7 @@ class Touch:
     """Unit vector at rest along which alone it is known no better than that, as along a rod; zero: all ways alike."""
     across_m: float = 0.0  # how well it is known across the line [m]
     pulls: bool = False  # whether a weight hangs there, as on a thread: along gravity, not about the normal
+    undetermined: bool = False  # an object in touch whose force the data do not determine
     shape: Shape | None = None  # the rigid object that touches there, where one is seen or declared
 
 
