@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import t as student
+from scipy.stats import chi2
 
 from femsense.calib.from_clouds import free_clouds
 from femsense.core.arrays import FloatArray, freeze
@@ -18,6 +18,7 @@ from femsense.inference.nuisance import first_nuisance, fit_nuisance, gram_of, l
 from femsense.inference.pixels import Skin
 from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
+from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Limits, Model
 from femsense.sensing.odds import INFERRED
@@ -30,9 +31,7 @@ MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
 SEVERAL = 4
 """Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
 FLAG = 1e-3
-"""Share of contact-free frames that the posterior check may flag."""
-LEAST_SPREAD = 0.05
-"""Spread of the log of a check between contact-free frames at least."""
+"""How often the nuisance of a contact-free frame may be as large by noise alone."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,6 +45,10 @@ class ContactFree:
 def learn(sensor: Sensor) -> Model:
     """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
     model = _first_model(sensor)
+    first = free_clouds(sensor.recording)
+    if len(first):
+        background = background_of(sensor, int(first[0]))
+        model = replace(model, sensor=replace(sensor, background=background))
     for turn in range(2):
         frames = _contact_free(model)
         if not frames:
@@ -152,12 +155,15 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
     others teach."""
     fits = [one.fit for one in frames]
     gains, checks = [], []
-    for i, one in enumerate(frames if len(frames) >= SEVERAL else ()):
-        others = _taught(model, [f for j, f in enumerate(fits) if j != i], sizes=model.nuisance.sizes)
-        others = replace(others, scale=model.scale, overdispersion=model.overdispersion)
+    for i, one in enumerate(frames):
+        others = model
+        if len(frames) >= SEVERAL:
+            others = _taught(model, [f for j, f in enumerate(fits) if j != i], sizes=model.nuisance.sizes)
+            others = replace(others, scale=model.scale, overdispersion=model.overdispersion, inferred_odds=0.0)
         alone = fit(others, one.frame, (), np.zeros((0, 3)), one.frame.predicted)
         assert alone is not None
-        gains.append(max(inferred(replace(others, inferred_odds=0.0), alone)[0], 0.0))
+        if len(frames) >= SEVERAL:
+            gains.append(max(inferred(others, alone)[0], 0.0))
         checks.append(check_values(others, alone))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
     noises = tuple(
@@ -167,22 +173,31 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
     bias, share = model.nuisance.sizes[:2]
     knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share)
     sensor = replace(model.sensor, knowledge=knowledge)
-    limits = None if not checks else Limits(*(_limit([c[j] for c in checks]) for j in range(3)))
+    misfit, nuisance, behind = np.array(checks).T
+    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01))
     return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
 
 
 def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
-    """Return the statistics of the posterior check: misfit per pixel, |η̃|², and the share of pixels behind the body."""
-    pixels = found.rows.pixel
+    """Return the statistics of the posterior check: misfit per pixel, |η̃|² over its quantile at level FLAG, and the share of pixels behind the body.
+
+    The misfit is capped at five standard deviations; where colour does not separate the robot, it is that of the robot's own pixels. With
+    A = Nᵀ W N, the fitted η̃ has the covariance A (A + 1)⁻¹; its |η̃|² is that of a gamma distribution with the same mean and variance
+    (Satterthwaite 1946).
+    """
+    pixels, q = found.rows.pixel, model.nuisance.root.shape[1]
     z = found.left(model.nuisance)[pixels]
-    per_pixel = float(np.minimum(z**2, 25.0).mean())
+    robot = np.ones(len(z)) if found.frame.coloured else (found.weight * found.rows.std**2 / found.rows.share)[pixels]
+    N = found.N[:, :q]
+    seen = np.maximum(np.linalg.eigvalsh((N * found.weight[:, None]).T @ N), 0.0)
+    share = seen / (1.0 + seen)
+    degrees = share.sum() ** 2 / max(float((share**2).sum()), 1e-12)
+    expected = share.sum() / max(degrees, 1e-12) * float(chi2.isf(FLAG, degrees)) if degrees > 0.0 else 1.0
     behind = float((found.rows.residual[pixels] < -4.0 * found.rows.std[pixels]).mean())
-    return per_pixel, float((found.eta[: model.nuisance.root.shape[1]] ** 2).sum()), behind
+    misfit = float(robot @ np.minimum(z**2, 25.0) / max(robot.sum(), 1.0))
+    return misfit, float((found.eta[:q] ** 2).sum()) / max(expected, 1e-12), behind
 
 
-def _limit(values: Sequence[float]) -> float:
-    """Return the largest value to expect of a new contact-free frame: a prediction limit of its logarithm (Student's t) at level FLAG."""
-    logs = np.log(np.maximum(values, 1e-4))
-    n = len(logs)
-    spread = max(float(logs.std(ddof=1)), LEAST_SPREAD) if n > 1 else 1.0
-    return float(np.exp(logs.mean() + student.isf(FLAG, max(n - 1, 1)) * spread * np.sqrt(1.0 + 1.0 / n)))
+def _limit(seen: FloatArray, least: float) -> float:
+    """Return the largest value to expect of a statistic that was so large in contact-free frames; it scatters by `least` at least."""
+    return float(seen.max() + 3.0 * max(float(seen.std()), least))

@@ -17,6 +17,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
+from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
@@ -52,7 +53,7 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     """Return contacts, forces and status of frame k. Raises FemsenseError."""
     found = estimate_frame(model, k, previous)
     best, sensor = found.best, model.sensor
-    status = checked(model, best)
+    status = camera_verdict(model, best, checked(model, best))
     contacts = contacts_of(model, best, previous)
     report = FrameReport(
         int(sensor.recording.frame_numbers[k]),
@@ -243,10 +244,11 @@ def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: 
     forces, start, tau = np.zeros((len(given), 3)), frame.predicted, None
     if previous is not None and len(previous.touches) == len(given):
         forces, start, tau = previous.forces, _expected(frame.predicted, previous), previous.tau
-    if said_free(model.sensor, frame.index):
-        return alone
-    found = fit(model, frame, given, forces, start, tau=tau)
-    return alone if found is None else found
+    tried = [fit(model, frame, given, forces, start, tau=tau)]
+    if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
+        tried.append(fit(model, frame, given, forces, start, tau=tau, catch=np.inf))
+    found = [one for one in tried if one is not None]
+    return min(found, key=lambda one: one.criterion) if found else alone
 
 
 class Clock:

@@ -36,6 +36,8 @@ FIRST_TAU = 0.3
 """Prior scale of a force that is not known yet [N]."""
 CATCH = 3.0
 """κ at the start at most where colour does not separate the robot."""
+SIZINGS, SETTLED = 8, 0.02
+"""Updates of τ in one linear problem at most, and the relative change below which one is the last."""
 STEPS, HALVINGS = 14, (1.0, 0.5, 0.2, 0.05)
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less."""
@@ -72,12 +74,14 @@ def fit(
     eta: FloatArray | None = None,
     tau: FloatArray | None = None,
     linearised: Linearised | None = None,
+    catch: float = CATCH,
 ) -> Fit | None:
     """Return a hypothesis at the minimum of Φ near a start; None where there is no equilibrium.
 
     Arguments:
         contacts: with their places at the start; forces: at the start [N], shape (m, 3).
         start: a state near by.
+        catch: κ at the start at most where colour does not separate the robot.
         eta, tau, linearised: where the nuisance, the prior scales and the tangent are known from a fit near by.
     """
     m, contacts = len(contacts), tuple(contacts)
@@ -96,19 +100,21 @@ def fit(
         return _finished(model, frame, here, linear, eta, True)
     wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=30.0, steps=1)[0]
     z = (here.residual - here.N @ wide) / here.rows.std
-    kappa = first_width(z, here.rows.pixel, frame.coloured, CATCH)
+    kappa = first_width(z, here.rows.pixel, frame.coloured, catch)
     converged = False
     for _ in range(STEPS):
         eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
-        phi += _prior(here)
-        step, eta_there, A_inverse = _step(model, here, linear, eta, weight)
+        phi += _prior(model, here)
+        step, eta_there, tau = _step(model, here, linear, eta, weight)
+        phi += _prior(model, replace(here, tau=tau)) - _prior(model, here)
+        here = replace(here, tau=tau)
         there = None
         for length in HALVINGS:
             there = _moved(model, frame, here, linear, length * step)
             if there is None:
                 continue
             eta_new, phi_there, _ = fit_nuisance(there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel))
-            phi_there += _prior(there)
+            phi_there += _prior(model, there)
             if phi_there < phi:
                 break
             there = None
@@ -118,7 +124,7 @@ def fit(
                 break
             kappa = kappa.narrowed()
             continue
-        here, eta = replace(there, tau=_prior_scales(there, A_inverse)), eta_new
+        here, eta = there, eta_new
         if not _near(model, linear.positions, here.state.positions):
             linear = model.linearised(here.state)
             here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
@@ -171,10 +177,16 @@ def axes_of(normal: FloatArray) -> FloatArray:
     return np.stack([normal, across, np.cross(normal, across)])
 
 
-def force_scale(tau: float, pulls: bool = False) -> FloatArray:
+def force_scale(tau: float, across: float = ACROSS) -> FloatArray:
     """Return the prior standard deviation of a force along its axes [N], shape (3,)."""
-    across = SWAYING if pulls else ACROSS
     return tau * np.array([1.0, across, across])
+
+
+def across(model: Model, contact: Touch) -> float:
+    """Return the prior scale of the force across its first axis relative to that along it: what acts at a given place and may pull, acts any way."""
+    if contact.pulls:
+        return SWAYING
+    return 1.0 if contact.source == "given" and not model.sensor.options.push else ACROSS
 
 
 def _place_scale(contact: Touch, force: FloatArray, limit: float = np.inf) -> FloatArray:
@@ -193,11 +205,13 @@ def _place_offset(contact: Touch) -> FloatArray:
     return np.asarray(ways @ (contact.place - contact.expected) / std)
 
 
-def _prior(here: Point) -> float:
+def _prior(model: Model, here: Point) -> float:
     """Return |f̃|² + |s̃|²."""
     total = 0.0
     for contact, force, axes, tau in zip(here.contacts, here.forces, here.axes, here.tau):
-        total += float((((axes @ force) / force_scale(tau, contact.pulls)) ** 2).sum() + (_place_offset(contact) ** 2).sum())
+        total += float(
+            (((axes @ force) / force_scale(tau, across(model, contact))) ** 2).sum() + (_place_offset(contact) ** 2).sum()
+        )
     return total
 
 
@@ -209,7 +223,7 @@ def _whitened(model: Model, here: Point, *, trust: bool) -> tuple[FloatArray, Fl
     limit = model.sensor.surface.edge if trust else np.inf
     scales, at = [np.zeros(0)], [np.zeros(0)]
     for contact, force, axes, tau in zip(here.contacts, here.forces, here.axes, here.tau):
-        own = force_scale(tau, contact.pulls)
+        own = force_scale(tau, across(model, contact))
         scales += [own, _place_scale(contact, force, limit)]
         at += [(axes @ force) / own, _place_offset(contact)]
     return np.concatenate(scales), np.concatenate(at)
@@ -228,14 +242,29 @@ def contact_columns(model: Model, here: Point | Fit, axes: FloatArray, linear: L
 def _step(
     model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, and A⁻¹."""
+    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, and the prior scales τ, shape (m,).
+
+    τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
+    expected under the posterior (MacKay 1992).
+    """
+    m = len(here.contacts)
     J = contact_columns(model, here, here.axes, linear)
-    scale, at = _whitened(model, here, trust=True)
-    A = np.hstack([J * scale, here.N])
+    A = np.hstack([J, here.N])
     WA = A * weight[:, None]
-    inverse = np.linalg.inv(np.eye(A.shape[1]) + A.T @ WA)
-    u = inverse @ (WA.T @ (here.residual + J @ (at * scale)))
-    return (u[: len(at)] - at) * scale, u[len(at) :], inverse
+    gram, tau = A.T @ WA, here.tau.copy()
+    for _ in range(SIZINGS):
+        scale, at = _whitened(model, replace(here, tau=tau), trust=True)
+        full = np.append(scale, np.ones(here.N.shape[1]))
+        inverse = np.linalg.inv(np.eye(len(full)) + full[:, None] * gram * full)
+        u = inverse @ (full * (WA.T @ (here.residual + J @ (at * scale))))
+        last = tau.copy()
+        for i, contact in enumerate(here.contacts):
+            f = slice(5 * i, 5 * i + 3)
+            if not contact.undetermined:
+                tau[i] = np.clip(tau[i] * np.sqrt((u[f] @ u[f] + np.trace(inverse[f, f])) / 3.0), *TAU)
+        if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
+            break
+    return (u[: 5 * m] - at) * scale, u[5 * m :], last
 
 
 def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: FloatArray) -> Point | None:
@@ -252,18 +281,6 @@ def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: Fl
     return None if state is None else _point(model, frame, tuple(contacts), forces, here.tau, state, linear)
 
 
-def _prior_scales(here: Point, inverse: FloatArray) -> FloatArray:
-    """Return τ of each force by type-II maximum likelihood: its expected square under the posterior (MacKay 1992)."""
-    tau = here.tau.copy()
-    for i, (contact, force, axes) in enumerate(zip(here.contacts, here.forces, here.axes)):
-        if contact.undetermined:
-            continue
-        q = (axes @ force) / force_scale(1.0, contact.pulls)
-        spread = tau[i] ** 2 * float(np.trace(inverse[5 * i : 5 * i + 3, 5 * i : 5 * i + 3]))
-        tau[i] = np.clip(np.sqrt((q @ q + spread) / 3.0), *TAU)
-    return tau
-
-
 # --- the optimum --------------------------------------------------------------------------------------------------------
 
 
@@ -276,7 +293,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
     A = np.hstack([J * scale, here.N])
     H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
     P = np.linalg.inv(H)
-    evidence = phi + _prior(here) + float(np.linalg.slogdet(H)[1])
+    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(H)[1])
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
         f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
@@ -287,7 +304,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
     odds = np.array([odds_of(model, contact, here.rows) for contact in here.contacts])
     covariance = force_map @ P[: 5 * m, : 5 * m] @ force_map.T
     return Fit(
-        frame, here.contacts, freeze(here.forces), here.tau, here.state, here.rows, linear, here.C, here.N, eta, weight, phi, evidence,
+        frame, here.contacts, freeze(here.forces), here.tau, here.axes, here.state, here.rows, linear, here.C, here.N, eta, weight, phi, evidence,
         odds, covariance, places, gain, converged,
     )  # fmt: skip
 

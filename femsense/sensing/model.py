@@ -88,9 +88,10 @@ class Model:
         if frame.pixels is None:
             return marker_rows(self.sensor, frame.index, state, len(self.skin.field))
         rows = pixel_rows(frame.pixels, self.skin, state.positions, self.views)
-        if not frame.with_markers:
-            return rows
-        return stacked([rows, marker_rows(self.sensor, frame.index, state, len(self.skin.field))])
+        more = [] if frame.background is None else [frame.background]
+        if frame.with_markers:
+            more.append(marker_rows(self.sensor, frame.index, state, len(self.skin.field)))
+        return stacked([rows, *more])
 
     def solve(
         self, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium | None, *, exact: bool = False
@@ -162,6 +163,8 @@ class Frame:
     """Under the inputs without contact forces."""
     previous_tensions: tuple[FloatArray, ...] | None
     """Tensions along the cables before this frame (friction)."""
+    background: Rows | None = None
+    """Rows of what stands around the robot, where it is asked whether a camera has moved."""
     with_markers: bool = False
     """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
     objects: tuple[Shape, ...] = ()
@@ -186,6 +189,8 @@ class Fit:
     """[N], shape (m, 3)."""
     tau: FloatArray
     """Prior scale of each force [N], shape (m,)."""
+    axes: FloatArray
+    """Axes of each force: outward normal and two tangents, shape (m, 3, 3)."""
     state: Equilibrium
     rows: Rows
     linearised: Linearised

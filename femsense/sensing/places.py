@@ -89,9 +89,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
     )
 
 
-def _edge_of(
-    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, origins: FloatArray, view: IntArray
-) -> FloatArray:
+def _edge_of(sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, origins: FloatArray, view: IntArray) -> FloatArray:
     """Return how far beside the body a camera may show points of its edge [m], shape (o,); inf for points of its halo.
 
     A pixel whose ray passes the body that closely has a depth anywhere between the body and what is behind it.

@@ -15,7 +15,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
-from femsense.sensing.fit import CATCH, axes_at, axes_of, contact_columns, force_scale
+from femsense.sensing.fit import CATCH, SWAYING, across, axes_at, axes_of, contact_columns, force_scale
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
@@ -222,7 +222,7 @@ def linearised_evidence(
             kept[5 * without : 5 * without + 5] = False
             residual = residual + J[:, own] @ (axes[without] @ best.forces[without])
         scale = np.concatenate(
-            [[*force_scale(t, c.pulls), *_free_ways(c, f)] for c, f, t in zip(best.contacts, best.forces, best.tau)]
+            [[*force_scale(t, across(model, c)), *_free_ways(c, f)] for c, f, t in zip(best.contacts, best.forces, best.tau)]
         )
         N = np.hstack([N, (J * scale)[:, kept]])
     weight = misfit(z[thin], part.log_other, part.share, kappa[thin])[1] * part.share / (kappa[thin] * part.std) ** 2
@@ -243,7 +243,7 @@ def linearised_evidence(
     mu = np.where(hangs, np.inf, np.inf if friction is None else friction)
     gain, force = np.full(c, -np.inf), np.zeros((c, 3))
     for tau in SIZES:
-        p = np.where(hangs[:, None], force_scale(tau, True), force_scale(tau))
+        p = np.where(hangs[:, None], force_scale(tau, SWAYING), force_scale(tau))
         H = np.eye(3) + p[:, :, None] * M * p[:, None, :]
         f = np.linalg.solve(H, (p * g)[:, :, None])[:, :, 0] * p
         own = (g * f).sum(axis=1) - np.linalg.slogdet(H)[1]

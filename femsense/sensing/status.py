@@ -19,6 +19,8 @@ SQUEEZED = 0.6
 """Least principal stretch of the elements under a contact at which law and mesh hold [1]."""
 MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
 """Markers disagree with the cloud where they are off by more than so many times the residual of the calibration, and this share of the diagonal."""
+MARKERS_MISFIT = 9.0
+"""Mean square of the whitened residuals of markers above which a frame is not explained: three standard deviations everywhere."""
 UNDETERMINED = 3.0
 """A force below so many standard deviations has no determined size."""
 OVERLAP = 3.0
@@ -32,6 +34,7 @@ class Status(Enum):
     NOT_CONVERGED = "not converged: the forces still changed after the last step"
     SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: use a finer mesh or the effect hyperelastic"
     NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.1f} times what contact-free frames let expect"
+    NOT_EXPLAINED_MARKERS = "not explained: the markers are off by {times:.1f} standard deviations"
     LARGE_ERROR_FIELD = (
         "not explained: a smooth error takes up the residual, {times:.1f} times what contact-free frames let expect"
     )
@@ -39,8 +42,12 @@ class Status(Enum):
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
     OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
     UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
-    CAMERA_MOVED = "{who} moved by {shift_mm:.1f} mm and {turn_deg:.1f}°: that fits the frame better than the contacts alone"
-    CAMERA_MAY_HAVE_MOVED = "{who} may have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°: that fits the frame about as well as the inferred contacts"
+    CAMERA_MOVED = (
+        "{who} seems to have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°, since the background did: that fits the frame better"
+    )
+    CAMERA_MAY_HAVE_MOVED = (
+        "{who} or the robot's base may have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°: that fits the frame as well"
+    )
     PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
     FAILED = "{what}"
 
@@ -78,7 +85,11 @@ def checked(model: Model, best: Fit) -> Verdict:
     stretch = least_stretch(model.sensor.robot.body.mesh, best.state.positions, carrying)
     if stretch < SQUEEZED:
         return verdict(Status.SQUEEZED, percent=100.0 * max(stretch, 0.0))
-    if best.frame.pixels is not None:
+    if best.frame.pixels is None:
+        z = best.left(model.nuisance)
+        if (z**2).mean() > MARKERS_MISFIT:
+            return verdict(Status.NOT_EXPLAINED_MARKERS, times=float(np.sqrt((z**2).mean())))
+    else:
         failed = _pixels_fail(model, best)
         if failed is not None:
             return failed
