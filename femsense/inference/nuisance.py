@@ -83,7 +83,7 @@ def fit_nuisance(
         last = phi
         W = weight * rows.share / (kappa * rows.std) ** 2
         NW = N * W[:, None]
-        eta = np.linalg.solve(np.eye(N.shape[1]) + NW.T @ N, NW.T @ residual)
+        eta = np.asarray(np.linalg.solve(np.eye(N.shape[1]) + NW.T @ N, NW.T @ residual), dtype=np.float64)
     phi, weight = misfit((residual - N @ eta) / rows.std, rows.log_other, rows.share, kappa)
     return eta, phi + float(eta @ eta), weight * rows.share / (kappa * rows.std) ** 2
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
@@ -65,7 +67,7 @@ def stacked(blocks: Sequence[Rows]) -> Rows:
         return blocks[0]
     most = max(block.nodes.shape[1] for block in blocks)
 
-    def padded(values: IntArray | FloatArray) -> IntArray | FloatArray:
+    def padded(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return np.pad(values, ((0, 0), (0, most - values.shape[1])))
 
     columns = []

@@ -131,6 +131,7 @@ def find_shapes(
     local_m: float,
     fit: Fit | None = None,
     edge: FloatArray | None = None,
+    halo: BoolArray | None = None,
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -142,44 +143,44 @@ def find_shapes(
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
         fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
         edge: how far off the surface a camera may have put points of its edge [m], shape (o,): what lies within that is no object.
+        halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
     """
     fit = fit or fit_shape
     result: list[Shape] = []
     left = _groups(points, std)
     while left:
         group, left = left[0], left[1:]
-        own = near[group]
-        close = group[own <= own.min() + local_m]
-        if len(close) < 3 or (edge is not None and is_edge(own, edge[group])):
+        gap = near[group]
+        close = group[gap <= gap.min() + local_m]
+        if (
+            len(close) < 3
+            or (edge is not None and is_edge(gap, edge[group]))
+            or (halo is not None and halo[group].mean() > 1.0 - OUTLIERS)
+        ):
             continue
-        off_edge = np.ones(len(points), dtype=np.bool_) if edge is None else near > edge
-        shape = _completed(fit, points[close], std[close], origins[close], off_edge[close])
+        own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
+        shape = _completed(fit, points[close], std[close], origins[close], own)
         # the other end of a rod that passes behind, the table in pieces
         more = [g for g in left if shape.holds(points[g], std[g])]
         if more:
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])
-            shape = _completed(fit, points[close], std[close], origins[close], off_edge[close])
-        result.append(shape if edge is None else replace(shape, edge_m=_typical(edge[close])))
+            own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
+            shape = _completed(fit, points[close], std[close], origins[close], own)
+        result.append(shape if edge is None else replace(shape, edge_m=float(np.median(edge[close]))))
     return result
 
 
-def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArray, off_edge: BoolArray) -> Shape:
-    """Return the shape of an object from the points that are none of what a camera adds around the silhouette of a body.
+def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArray, own: BoolArray) -> Shape:
+    """Return the shape of an object from its own points, not from what a camera adds around the silhouette of a body.
 
     Stereo matching widens a silhouette by one to three pixels, with the colour of what is behind it and a depth in between: next to a finger that
     touches, these points hang together with its own.
     """
-    if off_edge.sum() < FEWEST:
+    if own.sum() < FEWEST:
         return _raw(points, std)
-    shape = fit(points[off_edge], std[off_edge], origins[off_edge])
+    shape = fit(points[own], std[own], origins[own])
     return shape if shape.kind != "points" else _raw(points, std)
-
-
-def _typical(edge: FloatArray) -> float:
-    """Return the median of those that are finite; 0 without any."""
-    known = edge[np.isfinite(edge)]
-    return float(np.median(known)) if len(known) else 0.0
 
 
 def is_edge(gap: FloatArray, edge: FloatArray | float) -> bool:

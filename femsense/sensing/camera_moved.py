@@ -17,22 +17,17 @@ from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.inference.mixture import misfit
 from femsense.inference.nuisance import root_of
-from femsense.inference.rows import Rows
-from femsense.sensing.background import look, off_background
-from femsense.sensing.fit import contact_columns, fit
+from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.pose_rows import background_rows, far, pose_gain
 from femsense.sensing.status import Status, Verdict, verdict
 
-FAR = 0.1
-"""Prior of a pose that has moved: one standard deviation in radians and in shares of the body's diagonal."""
 MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
 EQUAL = 16.3
 """Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
 STEPS, STILL = 8, 1e-3
 """Steps of the pose at most, and the share of FAR below which one is the last."""
-OTHER = np.log(1e-2)
-"""Log odds that a pixel of the background shows something new."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,8 +49,8 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
         return found
     inferred = any(contact.source == "shape" for contact in best.contacts)
     failed = found.status in (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP)
-    limit = float(chi2.isf(1e-3, 6 * model.views))
-    if not (inferred or failed) and _gain_of_poses(model, best) < limit:
+    limit = max(float(chi2.isf(1e-3, 6 * model.views)), 0.0 if model.limits is None else model.limits.pose)
+    if not (inferred or failed) and pose_gain(model, best) < limit:
         return found
     try:
         stood = _stood(model, best)
@@ -88,7 +83,7 @@ def moved_cameras(model: Model, best: Fit) -> Moved | None:
         if fitted.criterion < lowest:
             lowest = fitted.criterion
             found = Moved(step - change, lowest + MOVED)
-        if np.abs(change / _wide(model)).max() < STILL:
+        if np.abs(change / far(model)).max() < STILL:
             break
         step, forces, tau, start = step - change, fitted.forces, fitted.tau, fitted.state
     return found
@@ -101,17 +96,13 @@ def _stood(model: Model, best: Fit) -> float | None:
     return None if again is None else again.criterion
 
 
-def _wide(model: Model) -> FloatArray:
-    return np.tile(np.repeat([FAR, FAR * model.sensor.size], 3), model.views)
-
-
 def _at(model: Model, step: FloatArray) -> Model:
     """Return the model with its cameras moved by a step and free to move on."""
     sensor, nuisance, v = model.sensor, model.nuisance, len(step)
     poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, step, sensor.pivot))
     mean = nuisance.mean.copy()
     mean[:v] += step
-    covariance = nuisance.root @ nuisance.root.T + block_diag(np.diag(_wide(model) ** 2), np.zeros((len(mean) - v,) * 2))
+    covariance = nuisance.root @ nuisance.root.T + block_diag(np.diag(far(model) ** 2), np.zeros((len(mean) - v,) * 2))
     calibration = replace(sensor.calibration, poses=poses, T_robot_camera=poses[0])
     nuisance = replace(nuisance, mean=freeze(mean), root=freeze(root_of(covariance)))
     return replace(model, sensor=replace(sensor, calibration=calibration), nuisance=nuisance)
@@ -122,49 +113,9 @@ def _seen_from(model: Model, frame: Frame) -> Frame:
     return replace(frame, pixels=model.pixels(frame.scan), objects=(), background=background_rows(model, frame.index))
 
 
-def background_rows(model: Model, k: int) -> Rows | None:
-    """Return the rows of the background of frame k, which move with the poses alone; None where no contact-free frame shows enough of it."""
-    sensor = model.sensor
-    if sensor.background is None:
-        return None
-    glance = look(sensor, k)
-    if not len(glance.view):
-        return None
-    off, by_pose = off_background(sensor, sensor.background, glance, sensor.calibration.poses)
-    told = by_pose.any(axis=1)
-    off, by_pose, r = off[told], by_pose[told], int(told.sum())
-    zeros = np.zeros((r, 3))
-    return Rows(
-        off, np.ones(r), np.full(r, OTHER), np.full(r, 1.0 / model.overdispersion), np.zeros((r, 3), dtype=np.int64), zeros, zeros, by_pose,
-        np.zeros((r, len(model.skin.field))), np.zeros(r), zeros, np.zeros(r, dtype=np.bool_),
-    )  # fmt: skip
-
-
 def _misfit_of_background(model: Model, best: Fit) -> float:
     rows = background_rows(model, best.frame.index)
     return 0.0 if rows is None else misfit(rows.residual, rows.log_other, rows.share)[0]
-
-
-def _gain_of_poses(model: Model, best: Fit) -> float:
-    """Return by how much pose steps of any size would lower Φ next to the contacts, to first order."""
-    J = contact_columns(model, best, best.axes, best.linearised) if best.contacts else np.zeros((len(best.rows), 0))
-    beside = np.hstack([J[:, [i for i in range(J.shape[1]) if i % 5 < 3]], best.N])
-    W = best.weight[:, None]
-    residual = best.left(model.nuisance) * best.rows.std
-    P = best.C[:, : 6 * model.views] * _wide(model)
-    K = np.linalg.pinv(
-        (beside * W).T @ beside + np.diag(np.append(np.zeros(beside.shape[1] - best.N.shape[1]), np.ones(best.N.shape[1])))
-    )
-    own = P - beside @ (K @ ((beside * W).T @ P))
-    right = (own * W).T @ residual
-    gain = float(right @ np.linalg.solve(np.eye(P.shape[1]) + (own * W).T @ P, right))
-    background = background_rows(model, best.frame.index)
-    if background is not None:
-        z, B = background.residual, background.by_pose * _wide(model)
-        W_b = background.share / np.maximum(1.0, np.abs(z) / 2.5)
-        g = (B * W_b[:, None]).T @ z
-        gain += float(g @ np.linalg.solve(np.eye(B.shape[1]) + (B * W_b[:, None]).T @ B, g))
-    return gain
 
 
 def _in_words(model: Model, moved: Moved) -> dict[str, float | str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import NonlinearConstraint, minimize
 
 from femsense.core.arrays import FloatArray
 from femsense.sensing.model import Fit
@@ -36,15 +36,15 @@ def within_cones(sensor: Sensor, fit: Fit, axes: FloatArray) -> FloatArray | Non
         start[i] = axes[i].T @ np.array([-normal, *(local[i, 1:] * min(1.0, mu * normal / size))])
     scale = 1.0 / max(float(np.linalg.norm(start.ravel() - x0)) ** 2 * float(np.linalg.norm(K)), 1e-9)
 
-    def inside(x: FloatArray, i: int) -> float:
-        own = axes[i] @ x[3 * i : 3 * i + 3]
-        return float(-mu * own[0] - np.sqrt((own[1:] ** 2).sum() + 1e-12))
+    def room(x: FloatArray) -> FloatArray:
+        own = np.array([axes[i] @ x[3 * i : 3 * i + 3] for i in bound])
+        return np.asarray(-mu * own[:, 0] - np.sqrt((own[:, 1:] ** 2).sum(axis=1) + 1e-12))
 
-    found = minimize(
-        lambda x: scale * (x - x0) @ K @ (x - x0),
+    found = minimize(  # type: ignore[call-overload]
+        lambda x: float(scale * (x - x0) @ K @ (x - x0)),
         start.ravel(),
-        jac=lambda x: 2.0 * scale * K @ (x - x0),
-        constraints=[{"type": "ineq", "fun": inside, "args": (i,)} for i in bound],
+        jac=lambda x: np.asarray(2.0 * scale * K @ (x - x0)),
+        constraints=NonlinearConstraint(room, 0.0, np.inf),
         method="SLSQP",
         options={"maxiter": 50, "ftol": 1e-9},
     )

@@ -22,6 +22,7 @@ from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Limits, Model
 from femsense.sensing.odds import INFERRED
+from femsense.sensing.pose_rows import pose_gain
 from femsense.sensing.prepare import pose_covariance, scan_of
 from femsense.sensing.proposals import inferred
 from femsense.sensing.types import Sensor
@@ -164,7 +165,7 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
         assert alone is not None
         if len(frames) >= SEVERAL:
             gains.append(max(inferred(others, alone)[0], 0.0))
-        checks.append(check_values(others, alone))
+        checks.append((*check_values(others, alone), pose_gain(others, alone)))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
     noises = tuple(
         replace(one, at_1m=model.scale * one.at_1m, floor=model.scale * one.floor, slope=model.scale * one.slope)
@@ -173,8 +174,8 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
     bias, share = model.nuisance.sizes[:2]
     knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share)
     sensor = replace(model.sensor, knowledge=knowledge)
-    misfit, nuisance, behind = np.array(checks).T
-    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01))
+    misfit, nuisance, behind, pose = np.array(checks).T
+    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01), _limit(pose, 1.0))
     return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
 
 

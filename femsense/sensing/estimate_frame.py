@@ -88,8 +88,8 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     if given := given_touches(model.sensor):
         best = _at_given_places(model, frame, given, best, previous)
     elif not said_free(model.sensor, k):
-        best = _searched(model, frame, best)
-        best = _with_objects_in_touch(model, frame, best)
+        best = _searched(model, best)
+        best = _with_objects_in_touch(model, best)
     clock.lap("search")
     exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
     best = best if exact is None else replace(best, state=exact)
@@ -115,23 +115,37 @@ def measurements(rows: Rows) -> int:
     return int(rows.pixel.sum()) if rows.pixel.any() else len(rows) // 3
 
 
-def _searched(model: Model, frame: Frame, best: Fit) -> Fit:
+def _searched(model: Model, best: Fit) -> Fit:
     """Return the best fit after proposals have stopped to lower J."""
     for _ in range(ROUNDS):
-        better = next((found for found in _fits(model, frame, best) if found.criterion < best.criterion - TOLERANCE), None)
+        best = _with_objects(model, best)
+        better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:
             break
         best = better
     return best
 
 
-def _with_objects_in_touch(model: Model, frame: Frame, best: Fit) -> Fit:
+def _with_objects(model: Model, best: Fit) -> Fit:
+    """Return a fit with the objects near the body: where colour does not separate them, of the pixels in front that it does not take for the robot."""
+    frame = best.frame
+    if frame.coloured or frame.scan is None:
+        return best
+    pixels = best.rows.pixel
+    other = ~inliers(best)[pixels] & (best.rows.residual[pixels] > 0.0)
+    scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
+    seen = replace(frame, objects=tuple(objects_near(model.sensor, scan, best.state)))
+    again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
+    return best if again is None else again
+
+
+def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
     """Return the best hypothesis fitted again with objects in touch that are none of its contacts, where there are any.
 
     Their forces are not significant. Left out, they would bias those of their neighbours and make their intervals too narrow. An object whose surface
     lies at the body's becomes a contact with a wide interval, another one a latent force.
     """
-    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), best.state))
+    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(best.frame.objects), best.state))
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
@@ -139,7 +153,7 @@ def _with_objects_in_touch(model: Model, frame: Frame, best: Fit) -> Fit:
         return best
     again = fit(
         model,
-        replace(frame, latent=tuple(latent)),
+        replace(best.frame, latent=tuple(latent)),
         [*best.contacts, *at_surface],
         np.vstack([best.forces, np.zeros((len(at_surface), 3))]),
         best.state,
@@ -156,11 +170,11 @@ def _is_object(contact: Touch) -> bool:
     return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
 
 
-def _fits(model: Model, frame: Frame, best: Fit) -> Iterator[Fit]:
+def _fits(model: Model, best: Fit) -> Iterator[Fit]:
     """Yield fits of the most promising proposals, one after the other."""
     for one in proposals(model, best)[:FITTED]:
-        start = best.state if best.contacts and one.contacts else frame.predicted
-        found = fit(model, frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
+        start = best.state if best.contacts and one.contacts else best.frame.predicted
+        found = fit(model, best.frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
         if found is not None:
             yield found
 

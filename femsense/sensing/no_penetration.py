@@ -64,8 +64,14 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
 
 
 def is_with(contact: Touch, shape: Shape | None) -> bool:
-    """Return whether a contact is with an object, whichever of its sides touches."""
-    return contact.shape is not None and shape is not None and contact.shape.points is shape.points
+    """Return whether a contact is with an object, whichever of its sides touches: the pixels of the two lie in the same place."""
+    if contact.shape is None or shape is None:
+        return False
+    if contact.shape.points is shape.points:
+        return True
+    first, second = contact.shape.points, shape.points
+    apart = float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)))
+    return apart < 0.5 * float(np.linalg.norm(np.ptp(first, axis=0)))
 
 
 def is_rigid(model: Model, contact: Touch) -> bool:

@@ -23,11 +23,11 @@ from femsense.sensing.types import Touch
 if TYPE_CHECKING:
     from femsense.sensing.model import Model
 
-VISIBLE = 2.0 * np.log(10.0)
-INFERRED = 2.0 * np.log(1000.0)
-UNRESOLVED = 2.0 * np.log(10.0)
-IN_SIGHT = 2.0 * np.log(10.0)
-HANGING = 2.0 * np.log(10.0)
+VISIBLE = float(2.0 * np.log(10.0))
+INFERRED = float(2.0 * np.log(1000.0))
+UNRESOLVED = float(2.0 * np.log(10.0))
+IN_SIGHT = float(2.0 * np.log(10.0))
+HANGING = float(2.0 * np.log(10.0))
 SEEN_BY = 3
 """A place is in sight where at least so many pixels of the robot lie within an edge of it."""
 

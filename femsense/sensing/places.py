@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from femsense.calib.scan import Scan
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
@@ -76,6 +76,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
     std = depth_std(sensor, np.linalg.norm(points - origins, axis=1), view)
+    edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
@@ -85,20 +86,25 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else fit_shape,
-        edge=_edge_of(sensor, scan, body, points, origins, view) + 3.0 * std,
+        edge=edge + 3.0 * std,
+        halo=halo,
     )
 
 
-def _edge_of(sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, origins: FloatArray, view: IntArray) -> FloatArray:
-    """Return how far beside the body a camera may show points of its edge [m], shape (o,); inf for points of its halo.
+def _edge_of(
+    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, gap: FloatArray, origins: FloatArray, view: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return how far beside the body a camera may show points of its edge [m], shape (o,), and which points are a stereo camera's halo, shape (o,).
 
-    A pixel whose ray passes the body that closely has a depth anywhere between the body and what is behind it.
+    A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely.
     """
-    cameras = sensor.recording.cameras
+    cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
     pixel = np.array([_pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
-    edge = BLEEDING * pixel[view] * np.linalg.norm(points - origins, axis=1)
+    depth = np.linalg.norm(points - origins, axis=1)
+    edge = np.asarray(BLEEDING * pixel[view] * depth)
+    matched = np.array([noise.kind == "stereo" for noise in noises])[view]
     beside = body.beside_rays(points, origins)
-    return np.where((beside > 0.0) & (beside < edge), np.inf, edge)
+    return edge, np.asarray(matched & ((gap < edge) | ((beside > 0.0) & (beside < edge))))
 
 
 def _pixel_of(scan: Scan, view: int) -> float:
@@ -111,7 +117,7 @@ def _pixel_of(scan: Scan, view: int) -> float:
         return 0.0
     rays = seen[:, :2] / seen[:, 2:]
     some = rays[:: max(1, len(rays) // SOME)]
-    return float(np.median(cKDTree(rays).query(some, k=2)[0][:, 1]))
+    return float(np.median(np.asarray(cKDTree(rays).query(some, k=2)[0])[:, 1]))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

@@ -18,7 +18,7 @@ def contacts_of(model: Model, best: Fit, previous: SensedFrame | None) -> tuple[
     """Return the contacts of a fit; those that begin a track have track −1, those at given places the number of their place."""
     sensor, k = model.sensor, best.frame.index
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
-    found = []
+    found: list[ContactForce] = []
     for i, (contact, force) in enumerate(zip(best.contacts, best.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, contact, best.state)
         if size == 0.0 and contact.source != "given":

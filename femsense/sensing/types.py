@@ -34,8 +34,8 @@ class SensingOptions:
     """What the data cannot say."""
 
     method: str = "rays"
-    """"rays": every point a measurement; "evidence": the same rows under one objective (docs/estimator.md); "paper": feature points, Algorithms 2 and 3, normals
-    only, one linear step."""
+    """"rays": every point a measurement; "evidence": the same under one objective (docs/estimator.md); "paper": feature points, Algorithms 2 and 3,
+    normals only, one linear step."""
     friction: float | None = 1.0
     """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
     push: bool = False  # what acts at a given place keeps to its cone, too
