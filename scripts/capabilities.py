@@ -1,7 +1,7 @@
 """List what a user can do: commands with their options, formats that are read and written, keys, columns, effects, public names.
 
-    python scripts/capabilities.py                 the list, one capability a line
-    python scripts/capabilities.py --since FILE    which lines of an older list are gone; exit status 1 if any is
+python scripts/capabilities.py                 the list, one capability a line
+python scripts/capabilities.py --since FILE    which lines of an older list are gone; exit status 1 if any is
 """
 
 from __future__ import annotations

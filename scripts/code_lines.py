@@ -1,6 +1,6 @@
 """Print the lines of code a room: those that hold a token other than docstrings, comments and layout.
 
-    python scripts/code_lines.py [FOLDER]
+python scripts/code_lines.py [FOLDER]
 """
 
 from __future__ import annotations
@@ -12,7 +12,15 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING, tokenize.ENDMARKER}
+LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENCODING,
+    tokenize.ENDMARKER,
+}
 
 
 def code_lines(file: Path) -> int:
@@ -22,7 +30,11 @@ def code_lines(file: Path) -> int:
     texts = set[int]()
     for node in ast.walk(ast.parse(text)):
         for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant) and isinstance(statement.value.value, str):
+            if (
+                isinstance(statement, ast.Expr)
+                and isinstance(statement.value, ast.Constant)
+                and isinstance(statement.value.value, str)
+            ):
                 texts.update(range(statement.lineno, (statement.end_lineno or statement.lineno) + 1))
     with file.open("rb") as stream:
         spans = [range(t.start[0], t.end[0] + 1) for t in tokenize.tokenize(stream.readline) if t.type not in LAYOUT]

@@ -58,21 +58,27 @@ def load(file: Path = ROOT / "scripts" / "sabotages.toml") -> list[Sabotage]:
     return [Sabotage(**entry) for entry in tomllib.loads(file.read_text(encoding="utf-8"))["sabotage"]]
 
 
+def copy_repository(root: Path, folder: Path) -> Path:
+    """Copy what the tests need into a folder, compiled kernels too; data that stand beside the repository are linked."""
+    copy = folder / root.name
+    for part in (root / name for name in NEEDED if (root / name).exists()):
+        if part.is_dir():
+            shutil.copytree(part, copy / part.name, symlinks=True, ignore=shutil.ignore_patterns("node_modules"))
+        else:
+            shutil.copy2(part, copy / part.name)
+    if (root.parent / "shared").exists():
+        (folder / "shared").symlink_to(root.parent / "shared")
+    return copy
+
+
 def result_of(sabotage: Sabotage, root: Path = ROOT) -> str:
     """Run the test in a copy of the repository with the line broken; return "failed", "SURVIVED", "skipped" or "DID NOT RUN".
 
-    Compiled kernels are copied too; numba compiles those of the changed file again. A kernel of another file that inlines one of
-    this file stays as it was compiled: the test has to call the broken file itself.
+    numba compiles the kernels of the changed file again. A kernel of another file that inlines one of them stays as it was: the
+    test has to call the broken file itself.
     """
     with tempfile.TemporaryDirectory(prefix="sabotage-") as folder:
-        copy = Path(folder) / root.name
-        for part in (root / name for name in NEEDED if (root / name).exists()):
-            if part.is_dir():
-                shutil.copytree(part, copy / part.name, symlinks=True, ignore=shutil.ignore_patterns("node_modules"))
-            else:
-                shutil.copy2(part, copy / part.name)
-        if (root.parent / "shared").exists():
-            (Path(folder) / "shared").symlink_to(root.parent / "shared")
+        copy = copy_repository(root, Path(folder))
         broken = copy / sabotage.file
         broken.write_text(broken.read_text(encoding="utf-8").replace(sabotage.line, sabotage.broken), encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-x", "--tb=no", "-p", "no:cacheprovider", sabotage.test]
