@@ -88,8 +88,8 @@ def improve(
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.io.recording_folder import load_recording
+    from femsense.loop.files import saved_loop
     from femsense.loop.improve import ImproveOptions
-    from femsense.report.loop.document import Loop
     from femsense.report.loop.text import loop_text
 
     set_workers(workers)
@@ -127,7 +127,5 @@ def improve(
             progress=progress,
         )
     page = loop_page(output, say=say)
-    text = f"{loop_text(Loop.model_validate(document))}\n\nwritten: {output}" + (
-        f"\nlook at it: {page}" if page is not None else ""
-    )
+    text = f"{loop_text(saved_loop(document))}\n\nwritten: {output}" + (f"\nlook at it: {page}" if page is not None else "")
     return Answer({"folder": str(output), **document}, text)
