@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
@@ -26,7 +26,7 @@ class Schema(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-SchemaType = TypeVar("SchemaType", bound=Schema)
+T = TypeVar("T")
 
 
 # TOML
@@ -75,25 +75,25 @@ def _known_binary(path: Path) -> str | None:
     return found or ("bytes that are no text" if b"\0" in head else None)
 
 
-def validated(schema: type[SchemaType], document: dict[str, Any], path: Path) -> SchemaType:
-    """Return the checked document. Raises the first InputError of `schema_problems`."""
+def validated(schema: type[T], document: Any, path: Path) -> T:
+    """Return the checked document of a schema or dataclass. Raises the first InputError of `schema_problems`."""
     problems = schema_problems(schema, document, path)
     if problems:
         raise problems[0]
-    return schema.model_validate(document)
+    return TypeAdapter(schema).validate_python(document)
 
 
-def schema_problems(schema: type[Schema], document: dict[str, Any], path: Path) -> list[InputError]:
+def schema_problems(schema: type[Any], document: Any, path: Path) -> list[InputError]:
     """Return what is wrong with a document, unknown keys first (a misspelt key also shows as a missing one)."""
     try:
-        schema.model_validate(document)
+        TypeAdapter(schema).validate_python(document)
     except ValidationError as error:
         found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
         return [_problem(schema, item, path) for item in found]
     return []
 
 
-def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
+def _problem(schema: type[Any], item: Any, path: Path) -> InputError:
     """Translate one finding of pydantic."""
     location = tuple(item["loc"])
     where = f"{path}: {key_path(location)}" if location else str(path)
@@ -119,12 +119,12 @@ def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
     return InputError(what, where=where, found=short(item["input"]), expected=expected)
 
 
-def _keys_at(schema: type[Schema], location: Sequence[int | str]) -> Iterable[str]:
+def _keys_at(schema: type[Any], location: Sequence[int | str]) -> Iterable[str]:
     inner = _annotation_at(schema, location)
     return inner.model_fields if isinstance(inner, type) and issubclass(inner, BaseModel) else ()
 
 
-def _description_at(schema: type[Schema], location: Sequence[int | str]) -> str | None:
+def _description_at(schema: type[Any], location: Sequence[int | str]) -> str | None:
     """Return what the schema says of the innermost described key of a place."""
     description: str | None = None
     for i, part in enumerate(location):

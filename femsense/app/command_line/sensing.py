@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, places
+from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, filled, option, places
 
 USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
 
@@ -25,8 +25,8 @@ class SensingMethod(StrEnum):
 def calibrate(
     robot: RobotPath,
     recording: RecordingPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("calibration.json"),
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
+    output: Annotated[Path, option("-o --output", "FILE", "The file to write.")] = Path("calibration.json"),
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
@@ -51,38 +51,22 @@ def calibrate(
 def estimate(
     robot: RobotPath,
     recording: RecordingPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="The folder to write.", show_default=False)],
+    output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            "-c",
-            "--calibration",
-            metavar="FILE",
-            help="Of femsense calibrate; made first where it is not given.",
-            show_default=False,
-        ),
+        Path | None, option("-c --calibration", "FILE", "Of femsense calibrate; made first where it is not given.")
     ] = None,
-    at: Annotated[
-        list[str] | None,
-        typer.Option("--at", metavar="X,Y,Z …", help="Where forces act, in metres on the body at rest.", show_default=False),
-    ] = None,
+    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Where forces act, in metres on the body at rest.")] = None,
     method: Annotated[
         SensingMethod,
-        typer.Option(
-            "--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."
-        ),
+        option("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
     ] = SensingMethod.rays,
-    friction: Annotated[
-        float, typer.Option("--friction", metavar="MU", help="The cone about the normal in which contact forces lie.")
-    ] = 1.0,
+    friction: Annotated[float, option("--friction", "MU", "The cone about the normal in which contact forces lie.")] = 1.0,
     push: Annotated[
-        bool, typer.Option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
+        bool, option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
     ] = False,
-    smooth: Annotated[
-        float, typer.Option("--smooth", metavar="SECONDS", help="Average forces over so long; they lag by as much.")
-    ] = 0.0,
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
-    again: Annotated[bool, typer.Option("--again", help="Compute even where RUN holds this result already.")] = False,
+    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
+    again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
@@ -92,9 +76,9 @@ def estimate(
 
     if push and not at:
         raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
-    options = SensingOptions(method=method.value, friction=friction, push=push, smooth_s=smooth, correct=correct)
-    if smooth > 0:
-        say(f"forces are averaged over {smooth:g} s and lag by as much")
+    options = filled(SensingOptions, locals(), method=method.value)
+    if smooth_s > 0:
+        say(f"forces are averaged over {smooth_s:g} s and lag by as much")
     with progress_bar("estimate") as progress:
         run = estimate_into(
             output,
@@ -114,25 +98,12 @@ def estimate(
 
 def reach(
     robot: RobotPath,
-    target: Annotated[
-        list[str],
-        typer.Option(
-            "--target", metavar="MARKER=X,Y,Z …", help="Where a marker is wanted, in metres, robot frame.", show_default=False
-        ),
-    ],
-    control: Annotated[str, typer.Option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
-    force: Annotated[
-        list[str] | None,
-        typer.Option("--force", metavar="X,Y,Z=FX,FY,FZ …", help="Known contact forces.", show_default=False),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option("-c", "--calibration", metavar="FILE", help="Commands count from its initial inputs.", show_default=False),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="A JSON file to write.", show_default=False)
-    ] = None,
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
+    target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],
+    control: Annotated[str, option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
+    force: Annotated[list[str] | None, option("--force", "X,Y,Z=FX,FY,FZ …", "Known contact forces.")] = None,
+    calibration: Annotated[Path | None, option("-c --calibration", "FILE", "Commands count from its initial inputs.")] = None,
+    output: Annotated[Path | None, option("-o --output", "FILE", "A JSON file to write.")] = None,
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the inputs that bring points of the body to places."""
