@@ -1,0 +1,135 @@
+"""Drift of the camera's pose and of the rest shape, measured wherever nothing touches."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.fem.mesh import TetMesh, surface_triangles
+from femsense.pointcloud.rays import Surface
+
+POINTS = 2000
+DEGREE = np.pi / 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriftLimits:
+    """When drift is worth saying."""
+
+    position_m: float = 1e-3
+    rotation_rad: float = 0.5 * DEGREE
+    shape_m: float = 1e-3
+    """Root mean square over the patches of the surface."""
+    frames: int = 5
+    """Over which a measurement is averaged, and the reference too."""
+    every_s: float = 1.0
+    reach: float = 0.05
+    """Points farther from the surface than this share of the body's diagonal are not the robot's."""
+    patches: int = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What has changed since the reference."""
+
+    position_m: float
+    """Size of the shift of the camera relative to the robot [m]."""
+    rotation_rad: float
+    shape_m: float
+    """What the pose cannot account for: root mean square change of the distance between cloud and modelled surface [m]."""
+
+    def text(self, limits: DriftLimits) -> str:
+        """Return in words what has passed its limit; empty where nothing has."""
+        parts = []
+        if self.position_m > limits.position_m or self.rotation_rad > limits.rotation_rad:
+            parts.append(f"the pose by {1e3 * self.position_m:.1f} mm and {self.rotation_rad / DEGREE:.1f}°: camera or base moved")
+        if self.shape_m > limits.shape_m:
+            parts.append(f"the rest shape by {1e3 * self.shape_m:.1f} mm: creep, warmth or another zero of the inputs")
+        return "; ".join(parts) + (" – t takes the present state as reference" if parts else "")
+
+
+class DriftWatch:
+    """Compares contact-free frames with the first ones.
+
+    In each, a pose step (rotation ω about the body's middle, shift t) and the mean distance d of each patch of the surface
+    explain the signed distances of the points: least squares of n·(ω × p + t) + d = −distance. The patches take what is left.
+    """
+
+    def __init__(self, mesh: TetMesh, limits: DriftLimits | None = None) -> None:
+        self.limits = limits or DriftLimits()
+        self._triangles = surface_triangles(mesh)
+        self._tets = mesh.tets
+        middles = mesh.nodes[self._triangles].mean(axis=1)
+        self._size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+        self._patch = _patches(middles, self.limits.patches)
+        self._recent: deque[FloatArray] = deque(maxlen=self.limits.frames)
+        self._reference: FloatArray | None = None
+        self._last_s = float("-inf")
+
+    def is_due(self, time_s: float) -> bool:
+        """Return whether a contact-free frame at this time [s] is to be measured."""
+        return time_s - self._last_s >= self.limits.every_s
+
+    def measure(self, time_s: float, points: FloatArray, nodes: FloatArray) -> Drift | None:
+        """Take in a contact-free frame; return the drift since the first ones, None while these are collected.
+
+        Arguments:
+            time_s: of the frame [s].
+            points: measured, robot frame [m], shape (k, 3).
+            nodes: of the sensed body [m], shape (n, 3).
+        """
+        self._last_s = time_s
+        found = self._fit(points[:: max(1, len(points) // POINTS)], nodes)
+        if found is None:
+            return None
+        self._recent.append(found)
+        if len(self._recent) < self.limits.frames:
+            return None
+        mean = np.nanmean(self._recent, axis=0)
+        if self._reference is None:
+            self._reference = mean
+            self._recent.clear()
+            return None
+        change = mean - self._reference
+        shape = change[6:][np.isfinite(change[6:])]
+        rms = float(np.sqrt((shape**2).mean())) if len(shape) else 0.0
+        return Drift(float(np.linalg.norm(change[3:6])), float(np.linalg.norm(change[:3])), rms)
+
+    def _fit(self, points: FloatArray, nodes: FloatArray) -> FloatArray | None:
+        """Return pose step (6) and distances of the patches [m], shape (6 + patches,); nan for patches that are not seen."""
+        surface = Surface(nodes, self._triangles)
+        place, gap, triangle, _ = surface.closest(points)
+        near = np.abs(gap) < self.limits.reach * self._size
+        if near.sum() < 10 * self.limits.patches:
+            return None
+        place, gap, triangle = place[near], gap[near], triangle[near]
+        corners = nodes[self._triangles[triangle]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        turn = np.cross(place - nodes.mean(axis=0), normal) / self._size
+        rows = np.hstack([turn, normal])
+        weight = np.ones(len(gap))
+        step = np.zeros(6)
+        for _ in range(3):  # Huber weights: points of what lies near the robot are outliers
+            step = np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0]
+            left = gap - rows @ step
+            scale = 1.483 * float(np.median(np.abs(left))) + 1e-9
+            weight = np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(left), 1e-12)))
+        patch = self._patch[triangle]
+        counts = np.bincount(patch, minlength=self.limits.patches)
+        sums = np.bincount(patch, weights=left, minlength=self.limits.patches)
+        shape = np.where(counts > 5, sums / np.maximum(counts, 1), np.nan)
+        return np.concatenate([step[:3] / self._size, step[3:], shape])
+
+
+def _patches(middles: FloatArray, count: int) -> FloatArray:
+    """Return the patch of each triangle: the nearest of points that are spread evenly over the surface."""
+    from scipy.spatial import cKDTree
+
+    from femsense.xr.skeleton import farthest_points
+
+    seeds = middles[farthest_points(middles, min(count, len(middles)))]
+    return np.asarray(cKDTree(seeds).query(middles)[1])
