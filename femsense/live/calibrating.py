@@ -42,10 +42,10 @@ class Coverage:
             limits: what is needed.
         """
         self.limits = limits or CoverageLimits()
-        self._columns, self._largest = tuple(columns), np.asarray(largest, dtype=np.float64)
+        self.columns, self._largest = tuple(columns), np.asarray(largest, dtype=np.float64)
         self._taken: list[FloatArray] = []
-        self._low = np.full(len(self._columns), np.inf)
-        self._high = np.full(len(self._columns), -np.inf)
+        self._low = np.full(len(self.columns), np.inf)
+        self._high = np.full(len(self.columns), -np.inf)
         self._last_s = float("-inf")
         self.wanted = self.limits.frames
 
@@ -69,16 +69,16 @@ class Coverage:
     def unmoved(self) -> tuple[str, ...]:
         """Inputs that have moved by less than `apart` of what they may reach, or not at all."""
         if not self._taken:
-            return self._columns
+            return self.columns
         span = self._high - self._low
         needed = np.where(np.isfinite(self._largest), self.limits.apart * self._largest, 0.0)
-        return tuple(name for name, s, n in zip(self._columns, span, needed) if s <= max(n, 1e-12))
+        return tuple(name for name, s, n in zip(self.columns, span, needed) if s <= max(n, 1e-12))
 
     @property
     def suffices(self) -> bool:
         """Whether a calibration may be tried: enough frames, and every input moved, or was waited for in vain."""
         given_up = self.count >= self.limits.patience * self.wanted
-        return self.count >= self.wanted and (not self.unmoved or given_up or not self._columns)
+        return self.count >= self.wanted and (not self.unmoved or given_up)
 
     def want_more(self, frames: int) -> None:
         """Ask for more frames: the calibration did not suffice."""

@@ -19,16 +19,18 @@ DEGREE = np.pi / 180.0
 class DriftLimits:
     """When drift is worth saying."""
 
-    position_m: float = 1e-3
-    rotation_rad: float = 0.5 * DEGREE
-    shape_m: float = 1e-3
-    """Root mean square over the patches of the surface."""
+    share: float = 0.01
+    """Of the body's diagonal, by which camera or surface have to have moved; smaller changes are within the error of the model."""
+    significance: float = 4.0
+    """Standard errors of the mean over `frames` that a change has to exceed."""
     frames: int = 5
     """Over which a measurement is averaged, and the reference too."""
     every_s: float = 1.0
     reach: float = 0.05
     """Points farther from the surface than this share of the body's diagonal are not the robot's."""
     patches: int = 24
+    fewest: int = 20
+    """Points that a patch needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +42,20 @@ class Drift:
     rotation_rad: float
     shape_m: float
     """What the pose cannot account for: root mean square change of the distance between cloud and modelled surface [m]."""
+    is_moved: bool
+    """Whether shift or rotation pass their limits."""
+    is_deformed: bool
+    """Whether the change of shape does."""
 
-    def text(self, limits: DriftLimits) -> str:
-        """Return in words what has passed its limit; empty where nothing has."""
+    @property
+    def text(self) -> str:
+        """In words what has passed its limit; empty where nothing has."""
         parts = []
-        if self.position_m > limits.position_m or self.rotation_rad > limits.rotation_rad:
+        if self.is_moved:
             parts.append(f"the pose by {1e3 * self.position_m:.1f} mm and {self.rotation_rad / DEGREE:.1f}°: camera or base moved")
-        if self.shape_m > limits.shape_m:
+        if self.is_deformed:
             parts.append(f"the rest shape by {1e3 * self.shape_m:.1f} mm: creep, warmth or another zero of the inputs")
-        return "; ".join(parts) + (" – t takes the present state as reference" if parts else "")
+        return "; ".join(parts) + ("; t takes the present state as reference" if parts else "")
 
 
 class DriftWatch:
@@ -66,7 +73,7 @@ class DriftWatch:
         self._size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
         self._patch = _patches(middles, self.limits.patches)
         self._recent: deque[FloatArray] = deque(maxlen=self.limits.frames)
-        self._reference: FloatArray | None = None
+        self._reference: tuple[FloatArray, FloatArray] | None = None
         self._last_s = float("-inf")
 
     def is_due(self, time_s: float) -> bool:
@@ -88,15 +95,23 @@ class DriftWatch:
         self._recent.append(found)
         if len(self._recent) < self.limits.frames:
             return None
-        mean = np.nanmean(self._recent, axis=0)
+        mean, error = self._mean()
         if self._reference is None:
-            self._reference = mean
+            self._reference = mean, error
             self._recent.clear()
             return None
-        change = mean - self._reference
-        shape = change[6:][np.isfinite(change[6:])]
-        rms = float(np.sqrt((shape**2).mean())) if len(shape) else 0.0
-        return Drift(float(np.linalg.norm(change[3:6])), float(np.linalg.norm(change[:3])), rms)
+        change = mean - self._reference[0]
+        error = np.hypot(error, self._reference[1])
+        sizes, errors = (np.array([_rms(v[:3]) * np.sqrt(3.0), _rms(v[3:6]) * np.sqrt(3.0), _rms(v[6:])]) for v in (change, error))
+        limits = self.limits.share * np.array([1.0, self._size, self._size])  # an angle moves a body by its size
+        passed = (sizes > limits) & (sizes > self.limits.significance * errors)
+        rotation, position, shape = (float(size) for size in sizes)
+        return Drift(position, rotation, shape, bool(passed[:2].any()), bool(passed[2]))
+
+    def _mean(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean of the recent measurements and its standard error; nan for patches that were not always seen."""
+        found = np.array(self._recent)
+        return found.mean(axis=0), found.std(axis=0, ddof=1) / np.sqrt(len(found))
 
     def _fit(self, points: FloatArray, nodes: FloatArray) -> FloatArray | None:
         """Return pose step (6) and distances of the patches [m], shape (6 + patches,); nan for patches that are not seen."""
@@ -121,8 +136,14 @@ class DriftWatch:
         patch = self._patch[triangle]
         counts = np.bincount(patch, minlength=self.limits.patches)
         sums = np.bincount(patch, weights=left, minlength=self.limits.patches)
-        shape = np.where(counts > 5, sums / np.maximum(counts, 1), np.nan)
+        shape = np.where(counts >= self.limits.fewest, sums / np.maximum(counts, 1), np.nan)
         return np.concatenate([step[:3] / self._size, step[3:], shape])
+
+
+def _rms(values: FloatArray) -> float:
+    """Return the root mean square of the values that are known; 0 where none is."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
 
 
 def _patches(middles: FloatArray, count: int) -> FloatArray:

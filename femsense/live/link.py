@@ -129,11 +129,17 @@ class Link:
             self._enter(LinkState.TIMED_OUT, now_s, f"no frame for {limits.time_out_s:g} s")
         elif status.state is LinkState.TIMED_OUT and now_s - status.since_s > limits.restart_s:
             return self._retry(now_s, LinkState.RECONNECTING, "no frame came any more")
-        elif status.state in (LinkState.WARMING_UP, LinkState.RECONNECTING) and now_s - self._started_s > limits.warm_up_s:
-            return self._retry(now_s, LinkState.RECONNECTING, f"no frame in {limits.warm_up_s:g} s of warm-up")
         elif now_s >= self._next_try_s:
             return self._retry(now_s, status.state, status.reason)
+        elif self._is_starting and now_s - self._started_s > limits.warm_up_s:
+            return self._retry(now_s, LinkState.RECONNECTING, f"no frame in {limits.warm_up_s:g} s of warm-up")
         return False
+
+    @property
+    def _is_starting(self) -> bool:
+        """Whether the camera was started and has given nothing yet."""
+        waits = self._next_try_s < float("inf")
+        return not waits and self.status.state not in (*FINAL, LinkState.STREAMING, LinkState.TIMED_OUT)
 
     def _retry(self, now_s: float, state: LinkState, reason: str) -> bool:
         """Count a retry; give up after the last one."""

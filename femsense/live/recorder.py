@@ -12,6 +12,7 @@ import json
 import os
 import queue
 import shutil
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -106,16 +107,14 @@ class Recorder:
         self._lock = Lock()
         self._lost = Lost()
         self._waiting = 0
+        self._has_skipped = False
         self._views = empty.camera_names
         self.error = ""
         """Why nothing is written any more; empty while all is well."""
         (folder / RUN).mkdir(parents=True)
-        document = recording_document(empty)
         self._files: dict[str, BinaryIO] = {}
-        for place in (folder, folder / SKIPPED):
-            place.mkdir(exist_ok=True)
-            write_toml(place / "recording.toml", document)
-            self._append(place / "frames.csv", ["frame", "time_s", *self._columns, *(["free"] if place == folder else [])])
+        self._document = recording_document(empty)
+        self._begin(folder, "free")
         self._append(folder / EVENTS, ["time_s", "kind", "text"])
         write_json(folder / DESCRIPTION, {"format": SESSION_FORMAT, **about})
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
@@ -139,6 +138,9 @@ class Recorder:
         """Record a frame that is not sensed; its inputs where they are known. Return whether there was room for it."""
         known = np.full(len(self._columns), np.nan) if values is None else values
         row = [frame.number, frame.time_s, *known.tolist()]
+        if not self._has_skipped:
+            self._has_skipped = True
+            self._put(_Job(lambda: self._begin(self.folder / SKIPPED), False), self._most)
         if not self._put(_Job(lambda: self._frame(self.folder / SKIPPED, frame, row), True), self._most // 2):
             self._lost = replace(self._lost, skipped=self._lost.skipped + 1)
             return False
@@ -186,6 +188,11 @@ class Recorder:
                 self.error = f"nothing is recorded any more: {error.strerror or error}"
             with self._lock:
                 self._waiting -= job.has_image
+
+    def _begin(self, folder: Path, *more: str) -> None:
+        folder.mkdir(exist_ok=True)
+        write_toml(folder / "recording.toml", self._document)
+        self._append(folder / "frames.csv", ["frame", "time_s", *self._columns, *more])
 
     def _frame(self, folder: Path, frame: StampedFrame, row: Sequence[object]) -> None:
         for image in frame.raw.images:
@@ -235,7 +242,10 @@ def finish_session(folder: Path) -> bool:
     journal, states = folder / RUN / JOURNAL, folder / RUN / STATES
     if not journal.is_file() or not states.is_file():
         return False
-    robot = load_robot(json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["robot"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # who runs a session was told
+        robot = load_robot(json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["robot"])
+        recording, calibration = load_recording(folder), read_calibration(folder / CALIBRATION)
     nodes = robot.body.mesh.nodes
     whole = journal.read_bytes().rpartition(b"\n")[0].splitlines()
     moved = np.fromfile(states, dtype="<f4")
@@ -246,7 +256,6 @@ def finish_session(folder: Path) -> bool:
     answers = [json.loads(line) for line in whole[:count]]
     reports = [FrameReport(**answer["report"]) for answer in answers]
     contacts = tuple(ContactForce(**_arrays(row)) for answer in answers for row in answer["contacts"])
-    recording, calibration = load_recording(folder), read_calibration(folder / CALIBRATION)
     run = Run(
         contacts=contacts,
         frames=tuple(reports),

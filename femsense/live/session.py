@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -16,7 +15,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.calib.calibration import Calibration
 from femsense.calib.files import read_calibration, write_calibration
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import DataError, FemsenseError, InputError
+from femsense.core.errors import DataError
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.recording_tables import GRAVITY_COLUMNS
 from femsense.live.actuation import Actuation, FrameActuation, columns_of
@@ -123,6 +122,13 @@ class Session:
         """Take the present state as contact-free reference, from the next frame on."""
         self._tare.set()
 
+    def note(self, notice: Notice, text: str) -> None:
+        """Show something that is wrong outside of the session; empty: it is over."""
+        if text:
+            self._notices[notice] = text
+        else:
+            self._notices.pop(notice, None)
+
     def skipped(self, frame: StampedFrame) -> None:
         """Record a frame that nobody took; called by the feed."""
         recorder = self._recorder
@@ -226,8 +232,9 @@ class Session:
             self._calibration = read_calibration(options.calibration)
         limits = options.coverage
         if self._calibration is not None:
-            limits = replace(limits, frames=max(1, options.contact_free_frames), wait_s=0.0, patience=1.0)
-        self._coverage = Coverage(self._actuation.columns, _largest(self.robot), limits)
+            limits = replace(limits, frames=max(1, options.contact_free_frames), wait_s=0.0)
+        moving = () if self._calibration is not None else self._actuation.columns  # with a calibration the inputs may rest
+        self._coverage = Coverage(moving, _largest(self.robot)[: len(moving)], limits)
         self._phase = Phase.COLLECTING
 
     def _collect(self, frame: StampedFrame, values: FloatArray) -> None:
@@ -235,7 +242,7 @@ class Session:
         coverage, growing = self._coverage, self._growing
         assert coverage is not None and growing is not None
         known = self._calibration is not None
-        told = frame.raw.contact_free is not False and coverage.offer(frame.time_s, values[: len(self._actuation.columns)])
+        told = frame.raw.contact_free is not False and coverage.offer(frame.time_s, values[: len(coverage.columns)])
         if told:
             self._keep(frame, values, contact_free=True)
         else:
@@ -327,11 +334,8 @@ class Session:
             cloud = read_frame_cloud(recording, k, view=view)
             points += [] if cloud is None else [cloud.points @ T[:3, :3].T + T[:3, 3]]
         drift = self._drift.measure(time_s, np.vstack(points), answer.positions) if points else None
-        text = "" if drift is None else drift.text(self.options.drift)
-        if text:
-            self._notices[Notice.DRIFT] = text
-        elif drift is not None:
-            self._notices.pop(Notice.DRIFT, None)
+        if drift is not None:
+            self.note(Notice.DRIFT, drift.text)
 
     # What is said
 
@@ -364,10 +368,3 @@ def _largest(robot: Robot) -> Sequence[float]:
     cables = [cable.max_tension for cable in robot.body.cables]
     return [*cables, *(getattr(chamber, "max_pressure", np.inf) for chamber in robot.body.chambers)]
 
-
-def quiet_warnings() -> None:
-    """Leave out what the estimator warns of frame by frame: a session says what matters in its notices."""
-    warnings.simplefilter("ignore")
-
-
-__all__ = ["FemsenseError", "InputError", "Phase", "Session", "SessionOptions"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,10 @@ LARGEST = 1.2
 class Recorded:
     """A recording that poses as a camera."""
 
-    def __init__(self, folder: str, *, as_fast_as_possible: bool = False) -> None:
+    def __init__(self, folder: str, *, as_fast_as_possible: bool = False, is_endless: bool = False) -> None:
+        """Arguments: folder; whether each frame comes when it is asked for; whether the recording begins again at its end."""
         self.folder = Path(folder).expanduser()
-        self.as_fast_as_possible = as_fast_as_possible
+        self.as_fast_as_possible, self.is_endless = as_fast_as_possible, is_endless
         self._recording: Recording | None = None
         self._begun_s = 0.0
         self._next = 0
@@ -52,19 +54,26 @@ class Recorded:
 
     def newest(self, timeout_s: float) -> RawFrame | None:
         """Return the next frame when its time has come; frames whose time passed before are dropped, as a camera drops them."""
-        recording = self.recording
+        count = self.recording.frame_count
         if not self.as_fast_as_possible:
-            due = recording.time_s - recording.time_s[0] + self._begun_s
-            now = time.monotonic()
-            self._next = max(self._next, int(np.searchsorted(due, now, side="right")) - 1)
-            if self._next < len(due) and due[self._next] > now:
-                time.sleep(min(timeout_s, due[self._next] - now))
-                if due[self._next] > time.monotonic():
+            while (self.is_endless or self._next + 1 < count) and self.due_s(self._next + 1) <= time.monotonic():
+                self._next += 1
+            if self.is_endless or self._next < count:
+                wait = self.due_s(self._next) - time.monotonic()
+                time.sleep(max(0.0, min(timeout_s, wait)))
+                if wait > timeout_s:
                     return None
-        if self._next >= recording.frame_count:
+        if self._next >= count and not self.is_endless:
             raise SourceLost(Loss.ENDED, f"{self.folder} is over")
-        k, self._next = self._next, self._next + 1
-        return self.frame(k)
+        number, self._next = self._next, self._next + 1
+        stamp = self.due_s(number) - self._begun_s + float(self.recording.time_s[0])
+        return replace(self.frame(number % count), number=number, stamp_s=stamp)
+
+    def due_s(self, number: int) -> float:
+        """Return when a frame is to come [s, monotonic clock], by its number counted over all repetitions."""
+        times = self.recording.time_s
+        period = float(times[-1] - times[0]) * (1.0 + 1.0 / max(1, len(times) - 1))
+        return self._begun_s + float(times[number % len(times)] - times[0]) + number // len(times) * period
 
     @property
     def recording(self) -> Recording:

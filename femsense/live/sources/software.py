@@ -16,6 +16,7 @@ from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo,
 
 BACK_S, JUMP_S = 5.0, 100.0
 EXPOSURES_S = (4e-3, 12e-3)
+ONCE = "once"
 
 
 class Fault(StrEnum):
@@ -58,18 +59,20 @@ class PlannedFault:
 
 
 class SoftwareCamera:
-    """`RECORDING?unplug=20+2&silent=40+3`: the device is unplugged at frame 20 for 2 s, and silent from frame 40 for 3 s."""
+    """`RECORDING?unplug=20+2&silent=40+3`: the device is unplugged at frame 20 for 2 s, and silent from frame 40 for 3 s.
+
+    As a device it has no end: the recording begins again, unless `once` is among the faults.
+    """
 
     def __init__(self, text: str) -> None:
         folder, _, faults = text.partition("?")
-        self._camera = Recorded(folder)
-        self.faults = tuple(_planned(word, value, text) for word, value in parse_qsl(faults, keep_blank_values=True))
-        self._begun_s = 0.0
+        words = parse_qsl(faults, keep_blank_values=True)
+        self._camera = Recorded(folder, is_endless=(ONCE, "") not in words)
+        self.faults = tuple(_planned(word, value, text) for word, value in words if word != ONCE)
 
     def open(self, opening: Opening) -> SourceInfo:
         """Start, unless it is unplugged or refused just now."""
         info = self._camera.open(opening)
-        self._begun_s = info.begun_s
         self._raise_lost()
         slow = self._active(Fault.USB2) is not None
         return replace(
@@ -119,9 +122,9 @@ class SoftwareCamera:
 
     def _active(self, fault: Fault) -> PlannedFault | None:
         """Return the fault of this kind that acts now; None where none does."""
-        times, now = self._camera.recording.time_s, time.monotonic()
+        now = time.monotonic()
         for planned in self.faults:
-            begins = self._begun_s + float(times[min(planned.frame, len(times) - 1)] - times[0])
+            begins = self._camera.due_s(planned.frame)
             if planned.fault is fault and begins <= now < begins + planned.seconds:
                 return planned
         return None
