@@ -7,7 +7,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -109,7 +109,7 @@ def sense_live(
         undo.callback(hub.close)
         url, brokers = _serve(hub, body.name, options.outlet)
         outlet = Outlet(hub, body) if url or brokers or options.outlet.mcap else None
-        feed = undo.enter_context(CameraFeed(camera, options.feed, on_skipped=skipped))
+        feed = undo.enter_context(CameraFeed(camera, replace(options.feed, ring=scratch.name), on_skipped=skipped))
         session = Session(
             body,
             feed,

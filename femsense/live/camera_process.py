@@ -69,7 +69,7 @@ def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: 
         pipe.send(source.open(opening))
         answer = pipe.recv()
         if isinstance(answer, RingPlace):
-            _stream(source, pipe, Ring(answer.slot_bytes, name=answer.name), asked=as_fast_as_possible)
+            _stream(source, pipe, Ring(answer.slot_bytes, answer.name, is_new=False), asked=as_fast_as_possible)
     except SourceLost as lost:
         _tell(pipe, Lost(lost.loss, lost.text))
     except FemsenseError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from threading import Condition, Event, Thread
 from femsense.core.errors import FemsenseError
 from femsense.live.camera_process import Failed, Lost, Report, Request, RingPlace, run_camera
 from femsense.live.frames import StampedFrame, read_frame
+from femsense.live.growing import PREFIX
 from femsense.live.link import FINAL, Link, LinkEvent, LinkLimits, LinkStatus
 from femsense.live.ring import Ring
 from femsense.live.sources.source import Loss, Opening, SourceInfo
@@ -27,6 +29,8 @@ class FeedOptions:
     """How a camera is read."""
 
     as_fast_as_possible: bool = False
+    ring: str = ""
+    """How the names of its shared memory begin; empty: by the process."""
     link: LinkLimits = field(default_factory=LinkLimits)
     watch: WatchLimits = field(default_factory=WatchLimits)
 
@@ -70,6 +74,7 @@ class CameraFeed:
         self._last_number = -1
         self._asked = False
         """Whether a frame was asked for that has not come yet."""
+        self._rings = 0
         self._ring: Ring | None = None
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
@@ -180,7 +185,8 @@ class CameraFeed:
         if self._ring is None or self._ring.slot_bytes < info.largest_frame:
             if self._ring is not None:
                 self._ring.close()
-            self._ring = Ring(info.largest_frame)
+            self._rings += 1
+            self._ring = Ring(info.largest_frame, f"{self.options.ring or f'{PREFIX}{os.getpid()}-{id(self):x}'}-{self._rings}", is_new=True)
         self._send(RingPlace(self._ring.name, self._ring.slot_bytes))
 
     def _receive(self, ticket: int) -> None:

@@ -114,8 +114,10 @@ class GrowingRecording:
 
 
 def remove_scratch(scratch: Path) -> None:
-    """Remove a scratch folder and all in it."""
+    """Remove a scratch folder, and shared memory whose name begins with the folder's."""
     shutil.rmtree(scratch, ignore_errors=True)
+    for left in MEMORY.glob(f"{scratch.name}-*"):
+        left.unlink(missing_ok=True)
 
 
 def _appended(table: FloatArray, row: Sequence[float]) -> FloatArray:

@@ -20,23 +20,19 @@ SLOTS = 8
 class Ring:
     """A ring of frames in shared memory; one process writes, one reads."""
 
-    def __init__(self, slot_bytes: int, *, name: str | None = None, slots: int = SLOTS) -> None:
-        """Make a ring, or attach to the one of this name.
+    def __init__(self, slot_bytes: int, name: str, *, is_new: bool, slots: int = SLOTS) -> None:
+        """Make a ring, or attach to one that another process made.
 
         Arguments:
             slot_bytes: the largest frame that it takes [bytes].
-            name: of a ring that another process made; None makes one.
+            name: by which both processes know it.
+            is_new: whether to make it.
             slots: frames that it holds.
         """
-        self.slot_bytes, self.slots = slot_bytes, slots
-        self._is_own = name is None
-        self._memory = SharedMemory(name, create=name is None, size=slots * (SLOT.size + slot_bytes))
+        self.slot_bytes, self.slots, self.name = slot_bytes, slots, name
+        self._is_own = is_new
+        self._memory = SharedMemory(name, create=is_new, size=slots * (SLOT.size + slot_bytes))
         self._count = 0
-
-    @property
-    def name(self) -> str:
-        """By which another process attaches."""
-        return self._memory.name
 
     def write(self, data: bytes) -> int:
         """Write a frame over the oldest one; return its ticket for `read`. Raises InputError where it is larger than a slot."""

@@ -73,7 +73,8 @@ class Senser:
         """
         robot = self._sensor.robot
         driven = DrivenRobot(robot, drive_of(robot, recording, initial=self._initial))
-        self._sensor = replace(self._sensor, recording=recording, driven=driven)
+        uncorrected = np.zeros(len(recording.marker_frame))
+        self._sensor = replace(self._sensor, recording=recording, driven=driven, correction_std=uncorrected)
         try:
             with one_blas_thread():
                 frame = sense_frame(self._sensor, k, self._previous)

@@ -14,7 +14,7 @@ from femsense.live.frames import RawFrame
 from femsense.live.sources.recorded import Recorded
 from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo, SourceLost
 
-BACK_S, JUMP_S = 5.0, 100.0
+BACK_S, JUMP_S, APART_S = 5.0, 100.0, 0.08
 EXPOSURES_S = (4e-3, 12e-3)
 ONCE = "once"
 
@@ -38,7 +38,7 @@ class Fault(StrEnum):
     JUMP = "jump"
     """Its clock is set forward by JUMP_S."""
     APART = "apart"
-    """A second camera that is exposed 40 % of the duration later."""
+    """A second camera that is exposed APART_S later."""
     USB2 = "usb2"
     FLICKER = "flicker"
     """Its exposure hunts."""
@@ -52,10 +52,6 @@ class PlannedFault:
     frame: int
     """From which frame of the recording on."""
     seconds: float
-
-    @property
-    def share(self) -> float:
-        return 0.4 * self.seconds
 
 
 class SoftwareCamera:
@@ -74,7 +70,7 @@ class SoftwareCamera:
         """Start, unless it is unplugged or refused just now."""
         info = self._camera.open(opening)
         self._raise_lost()
-        slow = self._active(Fault.USB2) is not None
+        slow = self._active(Fault.USB2)
         return replace(
             info,
             name=f"software camera of {self._camera.folder.name}",
@@ -114,20 +110,16 @@ class SoftwareCamera:
             stamp -= BACK_S
         if self._active(Fault.JUMP):
             stamp += JUMP_S
-        if (apart := self._active(Fault.APART)) is not None:
-            stamps = (stamp, stamp + apart.share)
+        if self._active(Fault.APART):
+            stamps = (stamp, stamp + APART_S)
         if self._active(Fault.FLICKER):
             exposure = EXPOSURES_S[frame.number % 2]
         return replace(frame, stamp_s=stamp, view_stamps_s=stamps, exposure_s=exposure)
 
-    def _active(self, fault: Fault) -> PlannedFault | None:
-        """Return the fault of this kind that acts now; None where none does."""
-        now = time.monotonic()
-        for planned in self.faults:
-            begins = self._camera.due_s(planned.frame)
-            if planned.fault is fault and begins <= now < begins + planned.seconds:
-                return planned
-        return None
+    def _active(self, fault: Fault) -> bool:
+        """Return whether a fault of this kind acts now."""
+        elapsed = [(one.seconds, time.monotonic() - self._camera.due_s(one.frame)) for one in self.faults if one.fault is fault]
+        return any(0.0 <= since < seconds for seconds, since in elapsed)
 
 
 def _planned(word: str, value: str, text: str) -> PlannedFault:
