@@ -199,15 +199,16 @@ class Recorder:
             file = folder / image_file(image, frame.number, self._views)
             file.parent.mkdir(parents=True, exist_ok=True)
             self._write(file, image.data)
-        if frame.raw.markers:
+        if any(isinstance(value, float) and np.isnan(value) for value in row):
+            return  # its inputs are not known: an image without a row
+        self._append(folder / "frames.csv", row)
+        if frame.raw.markers:  # after the row: a marker of a frame that is not there would be an error
             named = self._views != ("",)
             if str(folder / "markers.csv") not in self._files:
                 self._append(folder / "markers.csv", ["frame", *(["camera"] if named else []), "marker", "x_m", "y_m", "z_m"])
             for one in frame.raw.markers:
                 view = [self._views[one.view]] if named else []
                 self._append(folder / "markers.csv", [frame.number, *view, one.name, *one.xyz_m])
-        if not any(isinstance(value, float) and np.isnan(value) for value in row):
-            self._append(folder / "frames.csv", row)
 
     def _answer(self, line: bytes, states: bytes) -> None:
         for name, data in ((STATES, states), (JOURNAL, line)):

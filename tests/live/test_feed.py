@@ -83,7 +83,7 @@ def test_a_camera_that_is_lost_comes_back_by_itself(recording: Path, fault: str,
 
 
 def test_a_driver_that_hangs_for_good_is_ended_and_started_anew(recording: Path) -> None:
-    limits = LinkLimits(warm_up_s=6.0, time_out_s=0.3, restart_s=0.2, retries=1)
+    limits = LinkLimits(warm_up_s=4.0, time_out_s=0.3, restart_s=0.2, retries=1)
     with CameraFeed(f"software:{recording}?hang=2+600", FeedOptions(link=limits)) as feed:
         _, states, _ = watched(feed, lambda _frames, _states: False)
         assert states[-1] is LinkState.GAVE_UP and LinkState.RECONNECTING in states
