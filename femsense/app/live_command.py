@@ -72,7 +72,12 @@ class LiveOptions:
 
 
 def sense_live(
-    robot: str | Path, camera: str, options: LiveOptions, *, say: Callable[[str], None], on_url: Callable[[str], None] = lambda _: None
+    robot: str | Path,
+    camera: str,
+    options: LiveOptions,
+    *,
+    say: Callable[[str], None],
+    on_url: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Run a session until the camera ends, a person ends it, or its time is over; return its figures.
 

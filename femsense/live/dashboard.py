@@ -56,7 +56,9 @@ def _contacts(snapshot: Snapshot, now_s: float) -> RenderableType:
         return Text("no forces yet", style="dim")
     age = now_s - snapshot.taken_s
     fresh = age < FRESH_S
-    table = Table(title=f"{answer.report.status}, {1e3 * age:.0f} ms ago" if fresh else f"{age:.1f} s old: {answer.report.status}")
+    table = Table(
+        title=f"{answer.report.status}, {1e3 * age:.0f} ms ago" if fresh else f"{age:.1f} s old: {answer.report.status}"
+    )
     for name in ("track", "force [N]", "95 % interval", "at [mm]", "by"):
         table.add_column(name, justify="right")
     for c in answer.contacts:
@@ -85,7 +87,9 @@ def lines(before: Snapshot | None, now: Snapshot, now_s: float) -> Iterator[str]
 
 
 @contextmanager
-def shown(snapshot: Callable[[], Snapshot], on_key: Callable[[str], None], say: Callable[[str], None], url: str) -> Iterator[None]:
+def shown(
+    snapshot: Callable[[], Snapshot], on_key: Callable[[str], None], say: Callable[[str], None], url: str
+) -> Iterator[None]:
     """Show a session while the block works: drawn on a terminal, in lines elsewhere.
 
     Arguments:

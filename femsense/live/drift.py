@@ -52,7 +52,9 @@ class Drift:
         """In words what has passed its limit; empty where nothing has."""
         parts = []
         if self.is_moved:
-            parts.append(f"the pose by {1e3 * self.position_m:.1f} mm and {self.rotation_rad / DEGREE:.1f}°: camera or base moved")
+            parts.append(
+                f"the pose by {1e3 * self.position_m:.1f} mm and {self.rotation_rad / DEGREE:.1f}°: camera or base moved"
+            )
         if self.is_deformed:
             parts.append(f"the rest shape by {1e3 * self.shape_m:.1f} mm: creep, warmth or another zero of the inputs")
         return "; ".join(parts) + ("; t takes the present state as reference" if parts else "")
@@ -102,7 +104,9 @@ class DriftWatch:
             return None
         change = mean - self._reference[0]
         error = np.hypot(error, self._reference[1])
-        sizes, errors = (np.array([_rms(v[:3]) * np.sqrt(3.0), _rms(v[3:6]) * np.sqrt(3.0), _rms(v[6:])]) for v in (change, error))
+        sizes, errors = (
+            np.array([_rms(v[:3]) * np.sqrt(3.0), _rms(v[3:6]) * np.sqrt(3.0), _rms(v[6:])]) for v in (change, error)
+        )
         limits = self.limits.share * np.array([1.0, self._size, self._size])  # an angle moves a body by its size
         passed = (sizes > limits) & (sizes > self.limits.significance * errors)
         rotation, position, shape = (float(size) for size in sizes)
@@ -126,7 +130,7 @@ class DriftWatch:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         turn = np.cross(place - nodes.mean(axis=0), normal) / self._size
         rows = np.hstack([turn, normal])
-        weight = np.ones(len(gap))
+        weight: FloatArray = np.ones(len(gap))
         step = np.zeros(6)
         for _ in range(3):  # Huber weights: points of what lies near the robot are outliers
             step = np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0]

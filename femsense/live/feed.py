@@ -186,7 +186,9 @@ class CameraFeed:
             if self._ring is not None:
                 self._ring.close()
             self._rings += 1
-            self._ring = Ring(info.largest_frame, f"{self.options.ring or f'{PREFIX}{os.getpid()}-{id(self):x}'}-{self._rings}", is_new=True)
+            self._ring = Ring(
+                info.largest_frame, f"{self.options.ring or f'{PREFIX}{os.getpid()}-{id(self):x}'}-{self._rings}", is_new=True
+            )
         self._send(RingPlace(self._ring.name, self._ring.slot_bytes))
 
     def _receive(self, ticket: int) -> None:

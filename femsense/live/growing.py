@@ -34,7 +34,9 @@ def image_file(image: Image, number: int, names: Sequence[str]) -> str:
     return "/".join([image.kind, *([view] if view else []), f"{number:06d}{image.suffix}"])
 
 
-def empty_recording(robot: Robot, info: SourceInfo, *, actuation: str, actuation_zero: str, folder: Path, gravity: bool) -> Recording:
+def empty_recording(
+    robot: Robot, info: SourceInfo, *, actuation: str, actuation_zero: str, folder: Path, gravity: bool
+) -> Recording:
     """Return a recording without frames.
 
     Arguments:

@@ -13,12 +13,12 @@ import os
 import queue
 import shutil
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from threading import Lock, Thread
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class Recorder:
         folder: Path,
         empty: Recording,
         columns: Sequence[str],
-        about: dict[str, object],
+        about: Mapping[str, object],
         *,
         most_waiting: int = 256,
         write: Callable[[Path, bytes], None] = write_whole,
@@ -281,9 +281,9 @@ def session_run(folder: str | Path) -> Path:
     return root / RUN
 
 
-def _plain(table: dict[str, object]) -> dict[str, object]:
+def _plain(table: dict[str, Any]) -> dict[str, Any]:
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in table.items()}
 
 
-def _arrays(table: dict[str, object]) -> dict[str, object]:
+def _arrays(table: dict[str, Any]) -> dict[str, Any]:
     return {name: freeze(value) if isinstance(value, list) else value for name, value in table.items()}

@@ -38,7 +38,10 @@ class Ring:
         """Write a frame over the oldest one; return its ticket for `read`. Raises InputError where it is larger than a slot."""
         if len(data) > self.slot_bytes:
             raise InputError(
-                "a frame is larger than the ring's slots", where="ring", found=f"{len(data)} bytes", expected=f"≤ {self.slot_bytes}"
+                "a frame is larger than the ring's slots",
+                where="ring",
+                found=f"{len(data)} bytes",
+                expected=f"≤ {self.slot_bytes}",
             )
         ticket, at = self._count, self._place(self._count)
         memory = self._buffer

@@ -142,7 +142,9 @@ class Session:
         lost = None if recorder is None else recorder.lost
         if recorder is not None and (recorder.lost.count or recorder.error):
             text = recorder.error or f"{recorder.lost.count} frames: the disk is too slow"
-            sensed = f"; {recorder.lost.sensed} of them were sensed: a replay differs from there on" if recorder.lost.sensed else ""
+            sensed = (
+                f"; {recorder.lost.sensed} of them were sensed: a replay differs from there on" if recorder.lost.sensed else ""
+            )
             notices[Notice.RECORDING_LOST] = text + sensed
         shown = Snapshot(
             phase=self._phase,
@@ -367,4 +369,3 @@ def _largest(robot: Robot) -> Sequence[float]:
     """Return what each input may reach [N] or [Pa]; inf where nothing is declared."""
     cables = [cable.max_tension for cable in robot.body.cables]
     return [*cables, *(getattr(chamber, "max_pressure", np.inf) for chamber in robot.body.chambers)]
-

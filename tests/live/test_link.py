@@ -49,7 +49,9 @@ def test_a_frame_after_a_time_out_is_a_stream_again() -> None:
     assert link.status.state is LinkState.STREAMING and link.status.attempts == 0
 
 
-@pytest.mark.parametrize(("event", "words"), [(LinkEvent.UNPLUGGED, "plug the camera in again"), (LinkEvent.REFUSED, "other programs")])
+@pytest.mark.parametrize(
+    ("event", "words"), [(LinkEvent.UNPLUGGED, "plug the camera in again"), (LinkEvent.REFUSED, "other programs")]
+)
 def test_a_lost_camera_is_tried_again_at_longer_and_longer_intervals(event: LinkEvent, words: str) -> None:
     link = streaming()
     link.feed(event, 5.0, "gone")

@@ -101,5 +101,3 @@ def test_a_session_replaces_nothing(recorder_of) -> None:
     recorder_of().close()
     with pytest.raises(InputError, match="a session replaces nothing"):
         recorder_of()
-
-

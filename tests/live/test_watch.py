@@ -11,7 +11,9 @@ from femsense.live.watch import FrameWatch, Notice
 
 def test_a_delayed_message_does_not_move_the_clock() -> None:
     clock = ClockMap()
-    times = [clock.host_time(stamp, stamp + 100.0 + delay) for stamp, delay in ((0.0, 0.02), (1.0, 0.01), (2.0, 0.5), (3.0, 0.01))]
+    times = [
+        clock.host_time(stamp, stamp + 100.0 + delay) for stamp, delay in ((0.0, 0.02), (1.0, 0.01), (2.0, 0.5), (3.0, 0.01))
+    ]
     assert times == pytest.approx([100.02, 101.01, 102.01, 103.01], abs=1e-3)
 
 

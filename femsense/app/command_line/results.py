@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, say
-from femsense.app.command_line.parameters import Json, RunPath
+from femsense.app.command_line.parameters import Json, RunPath, run_of
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def export(
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF, USDZ)."""
+    run = run_of(run)
     if mcap is not None:
         from dataclasses import asdict
 
@@ -85,6 +86,10 @@ def view(
         str | None,
         typer.Option("--stream", metavar="URL", help="Show what streams there instead: http:// or mqtt://.", show_default=False),
     ] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option("--live", metavar="SESSION", help="Show the session that is recorded there now.", show_default=False),
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = True,
     output: Annotated[
@@ -102,6 +107,11 @@ def view(
     """Show a run or a stream on a page for browsers and headsets."""
     from femsense.app.stream_options import is_encrypted, need_one, need_with
 
+    if live is not None:
+        from femsense.app.live_command import page_of_session
+
+        need_one([] if run is None and stream is None else [live], str(live))
+        stream = page_of_session(live)
     need_with("--output", output is not None, "RUN", stream is None)
     need_with("--password-file", password_file is not None, "--stream", stream is not None)
     need_with("--authority", authority is not None, "--stream https:// or mqtts://", is_encrypted(stream))
@@ -114,7 +124,8 @@ def view(
 
         return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
     if run is None:
-        raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
+        raise InputError("nothing to show", where="femsense view", expected="RUN, --stream URL or --live SESSION")
+    run = run_of(run)
     say(f"reading {run}")
     from femsense.xr.run_contents import has_current_glb
     from femsense.xr.view import serve, write_static_page
@@ -179,7 +190,8 @@ def stream(
     """Send bone poses and forces over MQTT and WebSocket."""
     from femsense.app.stream_options import is_encrypted, need_model, need_stream, need_with
 
-    need_stream(runs or [], sensors, drag=drag)
+    runs = [run_of(run) for run in runs or []]
+    need_stream(runs, sensors, drag=drag)
     need_model(sensors, model)
     need_with("--commands", commands, "--drag", drag)
     need_with("--drag", drag, "RUN", bool(runs))
@@ -240,5 +252,5 @@ def report(
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    page = write_report(folder)
+    page = write_report(run_of(folder))
     return Answer({"report": str(page)}, f"written: {page}")

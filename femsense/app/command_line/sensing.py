@@ -152,22 +152,27 @@ def live(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="SESSION", help="Record into this folder.", show_default=False)
     ] = None,
-    fast: Annotated[bool, typer.Option("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")] = False,
+    fast: Annotated[
+        bool, typer.Option("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
+    ] = False,
     delay: Annotated[float, typer.Option("--delay", metavar="SECONDS", min=0.0, help="From an input to its effect.")] = 0.0,
-    inputs: Annotated[Inputs, typer.Option("--inputs", help="What the inputs of cables are; a recording says it itself.")] = Inputs.tension,
+    inputs: Annotated[
+        Inputs, typer.Option("--inputs", help="What the inputs of cables are; a recording says it itself.")
+    ] = Inputs.tension,
     zero: Annotated[Zero, typer.Option("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute,
     contact_free: Annotated[
         int, typer.Option("--contact-free", metavar="N", min=0, help="Contact-free frames first, with -c and after a zero.")
     ] = 8,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.0, help="End after this time.", show_default=False)
-    ] = None,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0.0, help="End after this time.", show_default=False)] = None,
     page: Annotated[bool, typer.Option("--page/--no-page", help="Serve the page.")] = True,
     host: Annotated[str, typer.Option("--host", help="Of the page; beyond this machine a password is needed.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0 takes a free one.")] = 0,
-    mqtt: Annotated[str | None, typer.Option("--mqtt", metavar="URL", help="Send to this broker too.", show_default=False)] = None,
+    mqtt: Annotated[
+        str | None, typer.Option("--mqtt", metavar="URL", help="Send to this broker too.", show_default=False)
+    ] = None,
     broker: Annotated[
-        int | None, typer.Option("--broker", metavar="PORT", help="Serve a broker of our own; 0: a free port.", show_default=False)
+        int | None,
+        typer.Option("--broker", metavar="PORT", help="Serve a broker of our own; 0: a free port.", show_default=False),
     ] = None,
     mcap: Annotated[
         Path | None, typer.Option("--mcap", metavar="FILE", help="Write the messages to this file too.", show_default=False)

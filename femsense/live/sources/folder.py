@@ -86,7 +86,9 @@ class GrowingFolder:
         """Return a frame; None where one of its files is still being written."""
         images, stamp = [], 0.0
         for kind in (self._kind, ImageKind.COLOR):
-            file = next((f for end in FOLDERS[kind] for f in (self.folder / kind).glob(f"*{number}{end}") if int(f.stem) == number), None)
+            file = next(
+                (f for end in FOLDERS[kind] for f in (self.folder / kind).glob(f"*{number}{end}") if int(f.stem) == number), None
+            )
             if file is None:
                 continue
             written = file.stat().st_mtime

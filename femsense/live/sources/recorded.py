@@ -120,4 +120,3 @@ class Recorded:
     def _size(self, k: int) -> int:
         files = [*self.recording.cloud_files[k], *self.recording.color_files[k]]
         return sum(file.stat().st_size for file in files if file is not None)
-
