@@ -34,7 +34,9 @@ def camera_checks(listing: Callable[[], Listing] = list_cameras) -> list[dict[st
         hint = "a recording can be replayed: femsense live ROBOT --camera RECORDING"
         checks.append(Check("cameras", "warning", looked, hint))
     for word, text in missing.items():
-        checks.append(Check(f"cameras: {word}", "warning", "its package is not installed", text.partition("try:")[2].strip() or text))
+        checks.append(
+            Check(f"cameras: {word}", "warning", "its package is not installed", text.partition("try:")[2].strip() or text)
+        )
     needed = sum(camera.needed_mbit_s for camera in cameras)
     limit = USB2_MBIT_S if any(camera.is_slow_link for camera in cameras) else USB3_MBIT_S
     if len(cameras) > 1 and needed > limit:

@@ -106,7 +106,5 @@ def _end_with_parent() -> None:
 
 
 def _tell(pipe: Connection, report: Report) -> None:
-    try:
+    with contextlib.suppress(OSError):  # the session is gone
         pipe.send(report)
-    except OSError:
-        pass  # the session is gone

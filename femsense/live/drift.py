@@ -136,7 +136,7 @@ class DriftWatch:
             step = np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0]
             left = gap - rows @ step
             scale = 1.483 * float(np.median(np.abs(left))) + 1e-9
-            weight = np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(left), 1e-12)))
+            weight = np.asarray(np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(left), 1e-12))))
         patch = self._patch[triangle]
         counts = np.bincount(patch, minlength=self.limits.patches)
         sums = np.bincount(patch, weights=left, minlength=self.limits.patches)

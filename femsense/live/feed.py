@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -141,6 +142,8 @@ class CameraFeed:
     def _run(self) -> None:
         while not self._stop.is_set():
             self._read()
+            if self.options.as_fast_as_possible and self._ring is not None and not self._asked:
+                self._link.rest(time.monotonic())
             if self._link.tick(time.monotonic()):
                 self._end_process(patience_s=0.0)
                 self._start(self._link.status.attempts)
@@ -224,10 +227,8 @@ class CameraFeed:
     def _send(self, message: object) -> None:
         pipe = self._pipe
         if pipe is not None:
-            try:
+            with suppress(OSError):  # its end is seen when it is read
                 pipe.send(message)
-            except OSError:
-                pass  # its end is seen when it is read
 
     def _end_process(self, *, patience_s: float) -> None:
         self._send(Request.STOP)

@@ -121,6 +121,10 @@ class Link:
             wait = self.limits.first_retry_s * 2.0 ** min(self.status.attempts, 16)
             self._next_try_s = now_s + min(wait, self.limits.longest_retry_s)
 
+    def rest(self, now_s: float) -> None:
+        """Let time pass in which nobody wanted a frame: it counts for nothing."""
+        self._last_frame_s = self._started_s = now_s
+
     def tick(self, now_s: float) -> bool:
         """Let time pass; return whether the camera is to be started anew now."""
         status, limits = self.status, self.limits

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from femsense.live.link import FINAL, LinkEvent, LinkLimits, LinkState, Link
+from femsense.live.link import FINAL, Link, LinkEvent, LinkLimits, LinkState
 
 LIMITS = LinkLimits(warm_up_s=10.0, time_out_s=1.0, restart_s=2.0, first_retry_s=0.5, longest_retry_s=2.0, retries=3)
 
@@ -81,6 +81,13 @@ def test_a_crash_waits_for_its_retry_and_keeps_its_reason() -> None:
     link.feed(LinkEvent.FRAME, 60.0)
     link.feed(LinkEvent.DIED, 60.1, "the driver crashed")
     assert not link.tick(60.2) and link.tick(60.7) and link.status.reason == "the driver crashed"
+
+
+def test_time_in_which_nobody_wants_a_frame_counts_for_nothing() -> None:
+    link = streaming()
+    link.rest(50.0)
+    assert not link.tick(50.5) and link.status.state is LinkState.STREAMING
+    assert not link.tick(51.1) and link.status.state is LinkState.TIMED_OUT
 
 
 def test_a_recording_that_is_over_is_no_loss() -> None:

@@ -25,7 +25,7 @@ from femsense.live.sources.foxglove import Foxglove
 from femsense.live.sources.mcap_pipe import McapPipe
 from femsense.live.sources.source import FrameSource, Loss, Opening, SourceLost
 
-CAMERA = '[camera]\nwidth = 8\nheight = 6\nfx = 10.0\nfy = 10.0\ncx = 3.5\ncy = 2.5\ndepth_unit_m = 0.001\n'
+CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10.0\nfy = 10.0\ncx = 3.5\ncy = 2.5\ndepth_unit_m = 0.001\n"
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) + 500
 
 
@@ -136,8 +136,12 @@ def test_a_realsense_software_device_gives_its_images_lens_and_numbers(tmp_path:
 # ROS 2
 
 
-INFO = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n"
-IMAGE = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
+HEADER = "std_msgs/Header header\nuint32 height\nuint32 width\n"
+INFO = (
+    f"{HEADER}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
+    "uint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n"
+)
+IMAGE = f"{HEADER}string encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
 PARTS = (
     f"{'=' * 80}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -149,16 +153,41 @@ SCHEMAS = {"sensor_msgs/msg/CameraInfo": INFO + PARTS, "sensor_msgs/msg/Image": 
 def messages(number: int, depth: np.ndarray, encoding: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
     header = {"stamp": {"sec": 100 + number, "nanosec": 500_000_000}, "frame_id": "camera"}
     k = [10.0, 0, 3.5, 0, 11.0, 2.5, 0, 0, 1]
-    yield "/cam/depth/camera_info", "sensor_msgs/msg/CameraInfo", {
-        "header": header, "height": 6, "width": 8, "distortion_model": "plumb_bob", "d": [0.1, 0, 0, 0, 0], "k": k,
-        "r": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "p": [*k[:3], 0, *k[3:6], 0, *k[6:], 0],
-        "binning_x": 0, "binning_y": 0, "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
-    }
-    for topic, image, form in (("/cam/color/image", np.full((6, 8, 3), 9, np.uint8), "rgb8"), ("/cam/depth/image", depth, encoding)):
+    yield (
+        "/cam/depth/camera_info",
+        "sensor_msgs/msg/CameraInfo",
+        {
+            "header": header,
+            "height": 6,
+            "width": 8,
+            "distortion_model": "plumb_bob",
+            "d": [0.1, 0, 0, 0, 0],
+            "k": k,
+            "r": [1.0, 0, 0, 0, 1, 0, 0, 0, 1],
+            "p": [*k[:3], 0, *k[3:6], 0, *k[6:], 0],
+            "binning_x": 0,
+            "binning_y": 0,
+            "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+        },
+    )
+    for topic, image, form in (
+        ("/cam/color/image", np.full((6, 8, 3), 9, np.uint8), "rgb8"),
+        ("/cam/depth/image", depth, encoding),
+    ):
         row = image.shape[1] * image.dtype.itemsize * (3 if image.ndim == 3 else 1)
-        yield topic, "sensor_msgs/msg/Image", {
-            "header": header, "height": 6, "width": 8, "encoding": form, "is_bigendian": 0, "step": row, "data": image.tobytes(),
-        }
+        yield (
+            topic,
+            "sensor_msgs/msg/Image",
+            {
+                "header": header,
+                "height": 6,
+                "width": 8,
+                "encoding": form,
+                "is_bigendian": 0,
+                "step": row,
+                "data": image.tobytes(),
+            },
+        )
 
 
 def check_ros(source: FrameSource, folder: Path, expected: np.ndarray, unit_m: float) -> None:
