@@ -43,7 +43,7 @@ from femsense.sensing.run_files import read_run
 from femsense.xr.stream.hub import Hub
 from femsense.xr.stream.mqtt import EmbeddedBroker, broker_address, make_client
 
-FRAMES, RATE_HZ = 60, 30.0
+FRAMES, FREE, RATE_HZ = 60, 24, 30.0
 TOPIC = "bench/inputs"
 
 
@@ -93,13 +93,17 @@ def _recording(robot: Path, work: Path) -> Path:
     nodes = body.mesh.nodes
     point = nodes[np.linalg.norm(nodes - nodes[body.clamped].mean(axis=0), axis=1).argmax()]
     middle, size = nodes.mean(axis=0), float(np.linalg.norm(np.ptp(nodes, axis=0)))
-    push = [0.0] * 24 + [0.4 * np.sin(np.pi * k / 24) for k in range(24)] + [0.0] * 12
+    push = [0.4 * np.sin(np.pi * k / 24) for k in range(25)] + [0.0] * (FRAMES - FREE - 25)
+    pulls = {name: 0.5 for name in body.cable_names}
     script = {
         "format": "femsense-script-1",
         "seed": 3,
         "dt_s": 1.0 / RATE_HZ,
-        "sweeps": [{"label": "rest", "levels": [1.0] * FRAMES, "cables": {name: 0.5 for name in body.cable_names}}],
-        "contacts": [{"sweep": "rest", "point_m": point.tolist(), "force_n": push, "object": "ball"}],
+        "sweeps": [
+            {"label": "rest", "levels": [1.0] * FREE, "cables": pulls},
+            {"label": "touch", "levels": [1.0] * (FRAMES - FREE), "cables": pulls},
+        ],
+        "contacts": [{"sweep": "touch", "point_m": point.tolist(), "force_n": push, "object": "ball"}],
         "objects": [{"name": "ball", "kind": "ball", "radius_m": 0.05 * size}],
         "truth": {"refinements": 0, "element": "tet4", "law": "corotational"},
         "clouds": {"kind": "depth"},
@@ -127,7 +131,7 @@ def _session(robot: Path, recording: Path, work: Path, seconds: float) -> dict[s
     sender = Thread(target=_send, args=(broker.port, inputs, stop), daemon=True)
     sender.start()
     shutil.rmtree(work / "session", ignore_errors=True)
-    calibration = write_calibration(_true_calibration(body, recording), work / "calibration.json")
+    calibration = write_calibration(_calibration(body, recording), work / "calibration.json")
     ages = Stopwatch(window_s=float("inf"))
     feed = CameraFeed(f"software:{recording}", FeedOptions(ring=scratch.name), on_skipped=lambda frame: session.skipped(frame))
     session = Session(
@@ -163,9 +167,9 @@ def _session(robot: Path, recording: Path, work: Path, seconds: float) -> dict[s
     }
 
 
-def _true_calibration(body: Robot, recording: Path) -> Calibration:
-    """Return the calibration of the first, contact-free frames."""
-    return calibrate(body, load_recording(recording), frames=range(0, 24, 4))
+def _calibration(body: Robot, recording: Path) -> Calibration:
+    """Return the calibration of the contact-free frames."""
+    return calibrate(body, load_recording(recording))
 
 
 def _replay(robot: Path, session: Path) -> str:

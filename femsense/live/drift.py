@@ -131,7 +131,7 @@ class DriftWatch:
         turn = np.cross(place - nodes.mean(axis=0), normal) / self._size
         rows = np.hstack([turn, normal])
         weight: FloatArray = np.ones(len(gap))
-        step = np.zeros(6)
+        step: FloatArray = np.zeros(6)
         for _ in range(3):  # Huber weights: points of what lies near the robot are outliers
             step = np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0]
             left = gap - rows @ step

@@ -146,7 +146,7 @@ class Link:
         return not waits and self.status.state not in (*FINAL, LinkState.STREAMING, LinkState.TIMED_OUT)
 
     def _retry(self, now_s: float, state: LinkState, reason: str) -> bool:
-        """Count a retry; give up after the last one."""
+        """Count a retry; there is an end to them."""
         attempts = self.status.attempts + 1
         self._next_try_s = float("inf")
         if attempts > self.limits.retries:

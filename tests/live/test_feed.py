@@ -106,6 +106,7 @@ def test_a_camera_without_a_first_frame_is_restarted(recording: Path) -> None:
         ("jump=3+600", Notice.STAMPS_JUMP, "by 100"),
         ("apart=0+30", Notice.OUT_OF_STEP, "80 ms of 100 ms"),
         ("drop=3+0.4", Notice.DROPPED, "the device lost"),
+        ("flicker=0+600", Notice.FLICKER, "between 4.0 and 12.0 ms"),
     ],
 )
 def test_what_is_wrong_with_frames_is_said(recording: Path, fault: str, notice: Notice, words: str) -> None:
