@@ -133,7 +133,7 @@ class DriftWatch:
         weight: FloatArray = np.ones(len(gap))
         step: FloatArray = np.zeros(6)
         for _ in range(3):  # Huber weights: points of what lies near the robot are outliers
-            step = np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0]
+            step = np.asarray(np.linalg.lstsq(rows * weight[:, None], gap * weight, rcond=1e-6)[0], dtype=np.float64)
             left = gap - rows @ step
             scale = 1.483 * float(np.median(np.abs(left))) + 1e-9
             weight = np.asarray(np.sqrt(np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(left), 1e-12))))

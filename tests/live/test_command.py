@@ -29,7 +29,19 @@ def femsense(*words: object) -> subprocess.CompletedProcess[str]:
 def test_a_recording_is_replayed_into_a_session_that_every_command_takes(block: tuple[Path, Path], tmp_path: Path) -> None:
     robot, recording = block
     session = tmp_path / "session"
-    words = ["live", robot, "--camera", recording, "--as-fast-as-possible", "-o", session, "--no-page", "--json", "--mqtt", "mqtt://127.0.0.1:1"]
+    words = [
+        "live",
+        robot,
+        "--camera",
+        recording,
+        "--as-fast-as-possible",
+        "-o",
+        session,
+        "--no-page",
+        "--json",
+        "--mqtt",
+        "mqtt://127.0.0.1:1",
+    ]
     done = femsense(*words)
     document = json.loads(done.stdout)
     assert done.returncode == 0 and document["frames_received"] == 15 and document["link"] == "ended", done.stderr
