@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
 import time
 import warnings
 from collections.abc import Callable
@@ -36,6 +37,7 @@ from femsense.xr.view import PAGE, live_page_files
 PASSWORD = "FEMSENSE_PASSWORD"
 TELL_S = 0.2
 """How often the state of the session is sent."""
+KEEPER_S = 10.0
 LIVE_FILE = "live.json"
 """In a session that runs: where its page is."""
 
@@ -101,7 +103,7 @@ def sense_live(
     scratch = make_scratch()
     keeper = start_keeper(scratch, None if folder is None else folder.absolute())
     with contextlib.ExitStack() as undo:
-        undo.callback(keeper.wait, 60.0)
+        undo.callback(_wait_for, keeper)
         undo.callback(lambda: keeper.stdin and keeper.stdin.close())
         undo.callback(remove_scratch, scratch)
         holder: list[Session] = []
@@ -139,6 +141,12 @@ def sense_live(
         if outlet is not None:
             outlet.end()
         return _summary(session)
+
+
+def _wait_for(keeper: subprocess.Popen[bytes]) -> None:
+    """Let the keeper tidy up; one that takes long goes on by itself."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        keeper.wait(KEEPER_S)
 
 
 def page_of_session(folder: Path) -> str:
