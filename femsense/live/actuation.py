@@ -198,14 +198,13 @@ class ReadActuation:
 
 
 class FrameActuation:
-    """Inputs that come with the frames, as those of a recording do."""
+    """Inputs that come with the frames, as those of a recording do. It keeps nothing: frames are asked for from two threads."""
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
-        self._values: FloatArray | None = None
 
-    def set(self, inputs: Mapping[str, float], where: str) -> None:
-        """Take the inputs of the frame that is next. Raises InputError where one is missing."""
+    def of(self, inputs: Mapping[str, float], where: str) -> FloatArray:
+        """Return the inputs that came with a frame, shape (columns,). Raises InputError where one is missing."""
         missing = [name for name in self.columns if name not in inputs]
         if missing:
             raise InputError(
@@ -215,11 +214,7 @@ class FrameActuation:
                 expected=", ".join(missing),
                 hint="--actuation SOURCE, or the recording of this robot",
             )
-        self._values = np.array([inputs[name] for name in self.columns])
-
-    def at(self, taken_s: float) -> FloatArray | None:
-        """Return the inputs of the frame."""
-        return self._values
+        return np.array([inputs[name] for name in self.columns])
 
     def notices(self) -> dict[Notice, str]:
         """Return none: they come with the frames."""

@@ -93,8 +93,7 @@ class Session:
         """
         self.robot, self.feed, self.options = robot, feed, options or SessionOptions()
         self._scratch, self._on_answer = scratch, on_answer
-        self._own = FrameActuation(columns_of(robot)) if actuation is None else None
-        self._actuation: Actuation = actuation if self._own is None else self._own  # type: ignore[assignment]
+        self._actuation: Actuation | FrameActuation = actuation or FrameActuation(columns_of(robot))
         self._stop, self._tare = Event(), Event()
         self._phase, self._todo, self._notices = Phase.CONNECTING, "", dict[Notice, str]()
         self._columns: tuple[str, ...] = ()
@@ -208,10 +207,11 @@ class Session:
 
     def _values(self, frame: StampedFrame) -> FloatArray | None:
         """Return inputs, and gravity where frames bring it, at the time of a frame, shape (columns,); None while unknown."""
-        told = dict(frame.raw.inputs)
-        if self._own is not None:
-            self._own.set(told, self.feed.text)
-        values = self._actuation.at(frame.taken_s)
+        told, source = dict(frame.raw.inputs), self._actuation
+        if isinstance(source, FrameActuation):
+            values: FloatArray | None = source.of(told, self.feed.text)
+        else:
+            values = source.at(frame.taken_s)
         gravity = [told[name] for name in self._columns if name in GRAVITY_COLUMNS]
         return None if values is None else np.append(values, gravity)
 
@@ -223,7 +223,7 @@ class Session:
         assert info is not None
         gravity = GRAVITY_COLUMNS[0] in dict(frame.raw.inputs)
         self._columns = (*self._actuation.columns, *(GRAVITY_COLUMNS if gravity else ()))
-        kind, zero = _actuation_of(info, options, own=self._own is not None)
+        kind, zero = _actuation_of(info, options, own=isinstance(self._actuation, FrameActuation))
         place = self._folder or Path(self._scratch.name)
         empty = empty_recording(self.robot, info, actuation=kind, actuation_zero=zero, folder=place, gravity=gravity)
         self._growing = GrowingRecording(empty, self._scratch)

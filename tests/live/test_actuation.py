@@ -171,7 +171,6 @@ def test_fixed_inputs_are_named_as_the_cables_are(robot: Robot) -> None:
 
 def test_frames_bring_their_inputs_or_it_is_said_which_are_missing() -> None:
     actuation = FrameActuation(COLUMNS)
-    actuation.set({"cable_side": 1.0, "cable_top": 2.0, "more": 3.0}, "camera")
-    assert value(actuation, 0.0) == [2.0, 1.0]
+    assert actuation.of({"cable_side": 1.0, "cable_top": 2.0, "more": 3.0}, "camera").tolist() == [2.0, 1.0]
     with pytest.raises(InputError, match="--actuation SOURCE"):
-        actuation.set({"cable_top": 2.0}, "camera")
+        actuation.of({"cable_top": 2.0}, "camera")
