@@ -27,6 +27,7 @@ ROOMS = (
     ("sensing",),
     ("loop",),
     ("xr",),
+    ("live",),
     ("report",),
     ("app",),
     ("__main__",),

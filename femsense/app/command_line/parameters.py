@@ -49,6 +49,15 @@ RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote
 Json = Annotated[bool, option("--json", help="One JSON object on standard output, nothing else there.")]
 
 
+def run_of(folder: Path) -> Path:
+    """Return the folder of a run: that of a session where one is given, made where a killed session left it unfinished."""
+    if not (folder / "session.json").is_file():
+        return folder
+    from femsense.live.recorder import session_run
+
+    return session_run(folder)
+
+
 def repeat_options(words: list[str]) -> list[str]:
     """Repeat an option for each of the values that follow it: --validation A B is --validation A --validation B."""
     result: list[str] = []

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from femsense.app.command_line.answer import Answer, say
-from femsense.app.command_line.parameters import Json, RunPath, argument, filled, option
+from femsense.app.command_line.parameters import Json, RunPath, argument, filled, option, run_of
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def export(
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF, USDZ)."""
+    run = run_of(run)
     if mcap is not None:
         from dataclasses import asdict
 
@@ -62,6 +63,7 @@ def export(
 def view(
     run: Annotated[Path | None, argument("RUN", "A folder that femsense estimate wrote.")] = None,
     stream: Annotated[str | None, option("--stream", "URL", "Show what streams there instead: http:// or mqtt://.")] = None,
+    live: Annotated[Path | None, option("--live", "SESSION", "Show the session that is recorded there now.")] = None,
     port: Annotated[int, option("--port", help="0 takes a free one.", min=0, max=65535)] = 0,
     browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,
     output: Annotated[Path | None, option("-o --output", "DIR", "Write the page for a web server instead.")] = None,
@@ -72,6 +74,11 @@ def view(
     """Show a run or a stream on a page for browsers and headsets."""
     from femsense.app.stream_options import is_encrypted, need_one, need_with
 
+    if live is not None:
+        from femsense.app.live_command import page_of_session
+
+        need_one([] if run is None and stream is None else [live], str(live))
+        stream = page_of_session(live)
     need_with("--output", output is not None, "RUN", stream is None)
     need_with("--password-file", password_file is not None, "--stream", stream is not None)
     need_with("--authority", authority is not None, "--stream https:// or mqtts://", is_encrypted(stream))
@@ -84,7 +91,8 @@ def view(
 
         return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
     if run is None:
-        raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
+        raise InputError("nothing to show", where="femsense view", expected="RUN, --stream URL or --live SESSION")
+    run = run_of(run)
     say(f"reading {run}")
     from femsense.xr.run_contents import has_current_glb
     from femsense.xr.view import serve, write_static_page
@@ -132,7 +140,8 @@ def stream(
     """Send bone poses and forces over MQTT and WebSocket."""
     from femsense.app.stream_options import is_encrypted, need_model, need_stream, need_with
 
-    need_stream(runs or [], sensors, drag=drag)
+    runs = [run_of(run) for run in runs or []]
+    need_stream(runs, sensors, drag=drag)
     need_model(sensors, model)
     need_with("--commands", commands, "--drag", drag)
     need_with("--drag", drag, "RUN", bool(runs))
@@ -183,5 +192,5 @@ def report(
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    page = write_report(folder)
+    page = write_report(run_of(folder))
     return Answer({"report": str(page)}, f"written: {page}")

@@ -96,6 +96,97 @@ def estimate(
     )
 
 
+class Inputs(StrEnum):
+    """What inputs are that come live."""
+
+    tension = "tension"
+    displacement = "displacement"
+
+
+class Zero(StrEnum):
+    """Whether the zero of live inputs is known."""
+
+    absolute = "absolute"
+    unknown = "unknown"
+
+
+def live(
+    robot: RobotPath,
+    camera: Annotated[
+        str,
+        typer.Option(
+            "--camera",
+            metavar="SOURCE",
+            help="realsense[:SERIAL], orbbec[:SERIAL], oak[:ID], mcap:FILE, foxglove:ws://…, a folder that grows, or a recording.",
+            show_default=False,
+        ),
+    ],
+    actuation: Annotated[
+        str | None,
+        typer.Option(
+            "--actuation",
+            metavar="SOURCE",
+            help="mqtt://HOST/TOPIC, udp://HOST:PORT, ws://…, serial:PORT, a CSV file that grows, or fixed:NAME=VALUE,…",
+            show_default=False,
+        ),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("-c", "--calibration", metavar="FILE", help="Made on the fly where it is not given.", show_default=False),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="SESSION", help="Record into this folder.", show_default=False)
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
+    ] = False,
+    delay: Annotated[float, typer.Option("--delay", metavar="SECONDS", min=0.0, help="From an input to its effect.")] = 0.0,
+    inputs: Annotated[
+        Inputs, typer.Option("--inputs", help="What the inputs of cables are; a recording says it itself.")
+    ] = Inputs.tension,
+    zero: Annotated[Zero, typer.Option("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute,
+    contact_free: Annotated[
+        int, typer.Option("--contact-free", metavar="N", min=0, help="Contact-free frames first, with -c and after a zero.")
+    ] = 8,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0.0, help="End after this time.", show_default=False)] = None,
+    page: Annotated[bool, typer.Option("--page/--no-page", help="Serve the page.")] = True,
+    host: Annotated[str, typer.Option("--host", help="Of the page; beyond this machine a password is needed.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0 takes a free one.")] = 0,
+    mqtt: Annotated[
+        str | None, typer.Option("--mqtt", metavar="URL", help="Send to this broker too.", show_default=False)
+    ] = None,
+    broker: Annotated[
+        int | None,
+        typer.Option("--broker", metavar="PORT", help="Serve a broker of our own; 0: a free port.", show_default=False),
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option("--mcap", metavar="FILE", help="Write the messages to this file too.", show_default=False)
+    ] = None,
+    password_file: Annotated[
+        Path | None, typer.Option("--password-file", metavar="FILE", help="Of page and brokers.", show_default=False)
+    ] = None,
+    json: Json = False,
+) -> Answer:
+    """Calibrate and sense while it happens, from a camera."""
+    from femsense.app.live_command import LiveOptions, OutletOptions, sense_live, summary_text
+    from femsense.live.actuation import ActuationLimits
+    from femsense.live.feed import FeedOptions
+    from femsense.live.link import LinkState
+    from femsense.live.session import SessionOptions
+
+    options = LiveOptions(
+        actuation,
+        ActuationLimits(delay_s=delay),
+        FeedOptions(as_fast_as_possible=fast),
+        SessionOptions(calibration, output, inputs.value, zero.value, contact_free),
+        OutletOptions(page, host, port, mqtt, broker, password_file, mcap),
+        seconds,
+    )
+    document = sense_live(robot, camera, options, say=say)
+    lost = document["link"] == LinkState.GAVE_UP.value
+    return Answer(document, summary_text(document), exit_status=1 if lost else 0)
+
+
 def reach(
     robot: RobotPath,
     target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],

@@ -42,8 +42,10 @@ def inspect(
 
 
 def doctor(json: Json = False) -> Answer:
-    """Check the installation."""
+    """Check the installation, and list the cameras."""
     from femsense.app.doctor import diagnose, doctor_text
+    from femsense.app.doctor_cameras import camera_checks
 
     document = diagnose()
+    document["checks"] += camera_checks()
     return Answer(document, doctor_text(document), exit_status=0 if document["ok"] else 2)
