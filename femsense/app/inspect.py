@@ -27,6 +27,7 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import check_no_pipe, plain
+from femsense.io.importers.formats import CAPTURE_ENDINGS
 from femsense.io.importers.ros_bag import content_ending
 from femsense.io.mesh_files import SURFACE_ENDINGS
 from femsense.io.meshes.reading import file_format
@@ -53,7 +54,6 @@ MESH_ENDINGS = (
     ".med",
     ".vol",
 )
-CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".mkv", ".gz")
 
 
 def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:
@@ -229,6 +229,8 @@ def _kind_of_file(file: Path) -> tuple[str, Inspector]:
         ".jpeg": ("image", inspect_jpeg),
         ".png": ("image", inspect_image),
         ".csv": ("table", inspect_table),
+        ".tsv": ("table", inspect_table),
+        ".txt": ("table", inspect_table),
     }
     return others.get(ending, ("unknown", inspect_unknown))
 

@@ -9,31 +9,31 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.text import plain_name
+from femsense.core.units import Quantity, Unit, unit_named
+from femsense.io.text_numbers import TIMES_READ, Notation, notation_of, number_in
 
-TIMES = ("time", "t", "timestamp", "seconds", "secs", "sec")
-"""Names of columns of time, with or without a unit behind."""
-SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Seconds in one unit of time."""
-LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
-FORCES = {"n": 1.0, "mn": 1e-3, "kn": 1e3}
-PRESSURES = {"pa": 1.0, "hpa": 1e2, "mbar": 1e2, "kpa": 1e3, "mpa": 1e6, "bar": 1e5, "psi": 6894.757}
-SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-"""A time without a unit that is as large as this cannot be seconds (10¹¹ s is the year 5138): seconds in one unit of it."""
-DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
-BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*([A-Za-zµ]+)\s*[\])]")
-ENDED = re.compile(r"(.+?)[_ ](mm|cm|m|ms|us|ns|s|MPa|[hk]?[pP]a|m?bar|psi|m?[nN])")
+TIMES = ("time", "t", "timestamp", "time stamp", "ts", "elapsed", "elapsed time", "date time", "datetime", "clock", "epoch", "utc")
+"""Names of columns of time in small letters with blanks, with or without a unit behind; names of units of time are some too."""
+FUSED = re.compile(r"(?:time|timestamp|elapsed)(ms|us|ns|s|sec)")
+BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*(.+?)\s*[\])]")
+ENDED = re.compile(
+    r"(.+?)[_ ./]([uµμmc]?m|[munµμ]?s|secs?|seconds|millis(?:econds)?|micros(?:econds)?|days"
+    r"|(?:[hkM]?Pa|m?bar|psi)[_ ]?(?:a|g|abs|gauge)?|pascals?|mmHg|[mk]?N|newtons?|k?gf|lbf|rad|deg|degrees|radians|ticks|counts|mA)",
+    re.IGNORECASE,
+)
+"""A unit behind a name without brackets: not those that are words or parts of a robot, such as in, min, g, a."""
 NO_TEXT = bytes([*range(9), *range(14, 27), *range(28, 32)])
 """Bytes that stand in no text."""
 EMPTY = ("", "na", "n/a", "null", "none")
 """What stands in a cell without a number, in small letters; float() reads "nan" itself."""
-DAY = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 MARKS = "\t;,"
 LOOKED_AT = 20
 """So many first lines tell what stands between the cells."""
@@ -49,29 +49,68 @@ def open_text(path: Path) -> Iterator[io.TextIOBase]:
         raise InputError("cannot be read", where=path, found=error.strerror) from None
     try:
         with raw as stream:
-            head = stream.read(256)
-            wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")
-            if not wide and any(byte in NO_TEXT for byte in head.rstrip(b"\0")):
+            head = stream.read(1 << 16)
+            encoding = _encoding(head)
+            if encoding is None:
                 raise InputError("no text", where=path, found=f"a file that begins {head[:8]!r}", expected="a table such as CSV")
             stream.seek(0)
-            with io.TextIOWrapper(stream, encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
+            with io.TextIOWrapper(stream, encoding=encoding, errors="replace", newline="") as text:
                 yield text
     except (EOFError, gzip.BadGzipFile, OSError) as error:
         raise InputError("a broken compressed file", where=path, found=str(error), expected="a whole gzip file") from None
 
 
-def rows_of(path: Path) -> Iterator[list[str]]:
-    """Yield the rows of a table as text; tabs, semicolons or commas between, and beside the first two decimal commas.
+def _encoding(head: bytes) -> str | None:
+    """Return the encoding of a text by its first bytes: UTF-8, UTF-16 with or without a mark, else that of Windows; None for no text."""
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if len(head) > 3 and not any(head[1:256:2]) and all(head[:256:2]):
+        return "utf-16-le"
+    if len(head) > 3 and not any(head[:256:2]) and all(head[1:256:2]):
+        return "utf-16-be"
+    if any(byte in NO_TEXT for byte in head[:256].rstrip(b"\0")):
+        return None
+    try:
+        head[: head.rfind(b"\n") + 1 or len(head)].decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a table is written."""
+
+    mark: str
+    """Between the cells."""
+    notation: Notation
+
+
+def layout_of(path: Path) -> Layout:
+    """Return what stands between the cells of a table, and how its numbers are written."""
+    with open_text(path) as stream:
+        return _layout(stream.read(8192))
+
+
+def _layout(head: str) -> Layout:
+    lines = [line for line in head.splitlines()[:LOOKED_AT] if line.strip() and not _is_comment(line)]
+    mark = next((m for m in MARKS if 2 * sum(m in line for line in lines) >= len(lines)), ",") if lines else ","
+    cells = (cell for row in csv.reader(lines, delimiter=mark) for cell in row)
+    return Layout(mark, notation_of(cells, default="." if mark == "," else ","))
+
+
+def rows_of(path: Path) -> Iterator[list[str]]:
+    """Yield the rows of a table as text, numbers with decimal points; tabs, semicolons or commas between the cells.
+
+    Decimal commas and marks between thousands are those of the table's first lines (see `notation_of`).
     Lines of comment before the table come as empty rows, but for one that names its columns (as NumPy writes them).
     """
     with open_text(path) as stream:
-        lines = [line for line in stream.read(8192).splitlines()[:LOOKED_AT] if line.strip() and not _is_comment(line)]
+        layout = _layout(stream.read(8192))
         stream.seek(0)
-        mark = next((m for m in MARKS if 2 * sum(m in line for line in lines) >= len(lines)), ",") if lines else ","
         begun, said = False, list[str]()
-        for row in csv.reader(stream, delimiter=mark):
-            cells = row if mark == "," else [_with_point(cell) for cell in row]
+        for row in csv.reader(stream, delimiter=layout.mark):
+            cells = [layout.notation.plain(cell) for cell in row]
             if begun:
                 yield cells
             elif cells and _is_comment(cells[0]):
@@ -87,11 +126,6 @@ def rows_of(path: Path) -> Iterator[list[str]]:
 
 def _is_comment(text: str) -> bool:
     return text.lstrip().startswith(("#", "%"))
-
-
-def _with_point(cell: str) -> str:
-    """Return a number with a decimal comma as one with a point, anything else as it is."""
-    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell
 
 
 def is_cut_off(path: Path) -> bool:
@@ -114,7 +148,7 @@ def header_of(path: Path) -> tuple[list[str], bool]:
         raise InputError("an empty table", where=path, found=f"{path.stat().st_size} bytes", expected="rows of numbers")
     if all(number_in(cell) is not None or not cell.strip() for cell in first):
         return [str(i + 1) for i in range(len(first))], False
-    names, units = [cell.strip() for cell in first], next(rows, [])
+    names, units = [plain_name(cell) for cell in first], next(rows, [])
     if _are_units(units):
         bare = [cell.strip().strip("[]()") for cell in units]
         names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, bare)] + names[len(bare) :]
@@ -123,9 +157,8 @@ def header_of(path: Path) -> tuple[list[str], bool]:
 
 def _are_units(cells: Sequence[str]) -> bool:
     """Whether the row below the names says units: words where numbers should stand, one of them a unit."""
-    words = [cell.strip().strip("[]()").lower() for cell in cells if cell.strip()]
-    known = SECONDS.keys() | LENGTHS.keys() | FORCES.keys() | PRESSURES.keys()
-    return any(word in known for word in words) and all(number_in(word) is None for word in words)
+    words = [cell.strip().strip("[]()") for cell in cells if cell.strip()]
+    return all(number_in(word) is None for word in words) and any(unit_named(word) is not None for word in words)
 
 
 def read_numbers(path: Path) -> tuple[list[str], FloatArray]:
@@ -163,52 +196,54 @@ def number_rows(path: Path) -> Iterator[list[float]]:
             where=f"{path}, line {line}",
             found=bad,
             expected=f"{len(names)} numbers",
-            hint="decimal points, not commas" if "," in bad else None,
+            hint=_row_hint(cells, bad, len(names)),
         )
 
 
-def split_unit(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit in small letters; "" where it names none."""
-    match = BRACKETED.fullmatch(name.strip()) or ENDED.fullmatch(name.strip())
-    if match is None:
-        return name.strip(), ""
-    return match[1].strip(), match[2] if match[2] == "mPa" else match[2].lower()
+def _row_hint(cells: Sequence[str], bad: str, width: int) -> str | None:
+    """Return what is probably wrong with a row that is no row of numbers."""
+    if len(cells) == 2 * width - 1 or len(cells) == 2 * width:
+        return "decimal commas between commas? Export with points, or with semicolons between the cells"
+    if ":" in bad or re.search(r"\d[./-]\d+[./-]\d", bad):
+        return f"times are read as {TIMES_READ}"
+    return "decimal points, not commas" if "," in bad else None
 
 
-def time_column(names: Sequence[str], path: Path) -> tuple[int, float]:
-    """Return the column of time and seconds in one unit of it. Raises InputError."""
+def column_unit(name: str) -> tuple[str, Unit | None]:
+    """Return a column's name without its unit, and the unit that stands behind it, in brackets or after "_"; None where there is none.
+
+    Raises:
+        InputError: a unit that can be read in two ways.
+    """
+    text = name.strip()
+    for match in (BRACKETED.fullmatch(text), ENDED.fullmatch(text)):
+        unit = unit_named(match[2].replace("_", " ")) if match else None
+        if match and unit is not None:
+            return match[1].strip(), unit
+    return text, None
+
+
+def time_column(names: Sequence[str], path: Path) -> tuple[int, Unit | None]:
+    """Return the column of time, and its unit; None where its name says none. Raises InputError."""
     for j, name in enumerate(names):
-        bare, unit = split_unit(name)
-        if bare.lower() in TIMES and unit in ("", *SECONDS):
-            return j, SECONDS[unit] if unit else time_scale(path, j)
-    wanted = ", ".join((*TIMES, "time_s", "time_ms", "time [ms]"))
+        found = _as_time(name)
+        if found is not None:
+            return j, found[0]
+    wanted = ", ".join((*TIMES[:5], "time_s", "time_ms", "time [ms]"))
     raise InputError("no column of time", where=path, found=", ".join(names[:12]), expected=wanted)
 
 
 def is_time(name: str) -> bool:
     """Whether a column's name says that it holds times."""
-    bare, unit = split_unit(name)
-    return bare.lower() in TIMES and unit in ("", *SECONDS)
+    return _as_time(name) is not None
 
 
-def time_scale(path: Path, column: int) -> float:
-    """Return seconds in one unit of a time without a unit, by its size."""
-    first = next(number_rows(path), None)
-    if first is None:
-        return 1.0
-    return next((scale for least, scale in SINCE_1970 if first[column] > least), 1.0)
-
-
-def number_in(cell: str) -> float | None:
-    """Return the number in a cell, of a date and time the seconds since 1970 (UTC where no zone is named); None else."""
-    try:
-        return float(cell)
-    except ValueError:
-        pass
-    if not DAY.fullmatch(cell.strip()):
-        return None
-    try:
-        moment = datetime.fromisoformat(cell.strip())
-    except ValueError:
-        return None
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+def _as_time(name: str) -> tuple[Unit | None] | None:
+    """Return the unit (or None) of a column of time as a tuple; None for any other column."""
+    bare, unit = column_unit(name)
+    words = re.sub(r"[_\s.-]+", " ", bare).strip().lower()
+    if words in TIMES and (unit is None or unit.quantity is Quantity.TIME):
+        return (unit,)
+    fused = FUSED.fullmatch(words.replace(" ", ""))
+    alone = unit_named(fused[1] if fused else bare) if fused or len(bare) > 2 else None
+    return (alone,) if alone is not None and alone.quantity is Quantity.TIME and unit is None else None

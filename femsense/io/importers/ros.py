@@ -108,6 +108,11 @@ def list_ros(path: Path) -> dict[str, Any]:
         return {"topics": rows, "other_topics": sum(t.count > 0 for t in bag.topics) - len(rows)}
 
 
+def topics_of(path: Path) -> set[str]:
+    """Return the names of the topics that can be taken."""
+    return {row["topic"] for row in list_ros(path)["topics"]}
+
+
 @dataclass(eq=False, slots=True)
 class _Track:
     """What a secondary stream said lately."""
@@ -231,8 +236,8 @@ def _frame(
         picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
     now = {topic: one.at(time)[0] for topic, one in samples.items()}
-    pairs = ((c, v) for topic in plan.columns if topic in now for (c, _, _), v in zip(plan.columns[topic].values(), now[topic]))
-    inputs = {column: float(value) for column, value in pairs if np.isfinite(value)}
+    pairs = ((one, v) for topic in plan.columns if topic in now for one, v in zip(plan.columns[topic].values(), now[topic]))
+    inputs = {one.target.name: float(value) for one, value in pairs if np.isfinite(value)}
     loads = [(point, now[topic]) for topic, point in plan.load_points.items()]
     return Frame(time if device is None else device, picture, markers=named, unlabelled=unnamed, inputs=inputs, loads=loads)
 
@@ -311,4 +316,5 @@ def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:
         return np.array(place(decoded.wrench.force))
     columns = plan.columns[message.topic]
     given = named_values(decoded, message.type)
-    return np.array([factor * given.get((name, fld), np.nan) for name, (_, fld, factor) in columns.items()])
+    scaled = ((one.target, given.get((name, one.field), np.nan)) for name, one in columns.items())
+    return np.array([target.factor * value + target.offset for target, value in scaled])

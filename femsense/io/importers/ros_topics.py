@@ -80,8 +80,13 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
     primary = depth or cloud or next(iter(of["markers"]), None) or next(iter(of["inputs"]), None)
     if primary is None:
         found = ", ".join(f"{s.topic.name} ({s.topic.type})" for s in streams[:12]) or "no messages"
+        lost = [s.topic.name for s in streams if s.kind in ("grey", "color") and "depth" in s.topic.name]
         raise InputError(
-            "nothing that can be taken", where=bag.path, found=found, expected="depth images, PointCloud2, markers or inputs"
+            "nothing that can be taken",
+            where=bag.path,
+            found=found,
+            expected="depth images, PointCloud2, markers or inputs",
+            hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
         )
     choice = Choice(primary, None, tuple(of["markers"]), tuple(of["inputs"]), tuple(of["loads"]), None, None, None, 0.001)
     if depth is None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
+from femsense.core.errors import FemsenseError, InputError
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_csv, write_json, write_toml
 from femsense.io.folder_lock import only_writer
 from femsense.io.importers.actuation import ActuationLog, align
@@ -24,8 +24,10 @@ from femsense.io.importers.input_samples import spans
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
 from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.summary import summary
+from femsense.io.recording_folder import load_recording
 from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
 from femsense.io.recording_toml import FORMAT
+from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
@@ -80,16 +82,92 @@ def write_recording(
         _actuation(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
-    with only_writer(final):
+    made = [parent for parent in final.parents if not parent.exists()]
+    try:
+        with only_writer(final):
+            return _write_and_name(source, part, final, identity, actuation, zero, log, offset, replace, progress)
+    except FemsenseError:
+        for parent in made:
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+        raise
+
+
+def _write_and_name(
+    source: Source,
+    part: Path,
+    final: Path,
+    identity: Mapping[str, Any],
+    actuation: str | None,
+    zero: str | None,
+    log: ActuationLog | None,
+    offset: float | None,
+    replace: bool,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """Write the unfinished folder and give it its name; what is refused leaves nothing, what is stopped is gone on with."""
+    try:
         _prepare(part, identity)
         with Journal(part, identity) as journal:
             counts = _write_frames(source, part, journal, progress)
+        _check_counts(source, counts, len(journal.times()))
         found = _finish(source, part, journal, counts, actuation, zero, log, offset)
+        found |= _accepted(part, final, found)
         tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
         write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
         (part / JOURNAL).unlink()
         _give_name(part, final, replace)
+    except FemsenseError:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
     return found
+
+
+def _accepted(part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, str]:
+    """Load what was written as the other commands will, and warn of what it can hardly hold.
+
+    Raises:
+        InputError: they would refuse it; the message names the places as the finished folder has them.
+    """
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            recording = load_recording(part)
+            warn_of(doubts_of_recording(recording))
+    except InputError as problem:
+        if not found.get("unlabelled_markers"):
+            where = str(problem.where).replace(str(part), str(final))
+            raise type(problem)(
+                problem.what, where=where, found=problem.found, expected=problem.expected, hint=problem.hint
+            ) from None
+        return {"not_ready": " ".join(str(problem).split())}
+    for item in caught:
+        warnings.warn(str(item.message).replace(str(part), str(final)), stacklevel=4)
+    return {}
+
+
+def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
+    """Warn of frames whose time does not go on, and of fewer or more frames than a file announces.
+
+    Raises:
+        InputError: most of the frames are out of order: that clock is none.
+    """
+    lost = counts["out_of_order"]
+    if lost:
+        first = f"first after frame {counts['first_back'] - 1}"
+        hint = "stamps that were rounded stand still; a clock that was set back begins anew: export the times with all digits"
+        if lost > kept:
+            raise InputError(
+                "the time does not go on",
+                where=source.path,
+                found=f"{lost} of {lost + kept} frames are not later than the one before them, {first}",
+                expected="frames in order of time",
+                hint=hint,
+            )
+        text = f"{lost} of {lost + kept} frames are dropped, since the time stands still or goes back, {first}"
+        warnings.warn(f"{source.path}: {text}; {hint}", stacklevel=4)
+    if source.count is not None and abs(lost + kept - source.count) > max(1, source.count // 100):
+        warnings.warn(f"{source.path}: {source.count} frames are announced, {lost + kept} were read", stacklevel=4)
 
 
 def _give_name(part: Path, final: Path, replace: bool) -> None:
@@ -136,9 +214,10 @@ def _write_frames(source: Source, part: Path, journal: Journal, progress: Progre
     """Write what comes after the frames that the journal holds; return the count of frames that were left out."""
     done = journal.done or 0
     last = -np.inf if not done else float(journal.times()[-1])
-    number, counts = done, {"out_of_order": 0, "resumed": done}
+    number, counts = done, {"out_of_order": 0, "resumed": done, "first_back": 0}
     for frame in _after(source.frames(), done, counts):
         if not frame.time > last:
+            counts["first_back"] = counts["first_back"] or number
             counts["out_of_order"] += 1
             continue
         journal.add(_write_frame(source, frame, part, number))

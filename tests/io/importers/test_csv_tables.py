@@ -11,7 +11,7 @@ from imported import imported
 from femsense.core.errors import InputError
 from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.io.importers.actuation import read_actuation_log
-from femsense.io.importers.csv_tables import split_unit
+from femsense.io.importers.csv_tables import column_unit
 from femsense.io.importers.frames import Options
 from femsense.model.recording import marker_grid
 
@@ -64,7 +64,7 @@ def test_units_of_inputs(tmp_path: Path) -> None:
     assert log.columns == ("cable_north", "chamber_a", "cable_arm_n") and log.actuation == "displacement"
     np.testing.assert_allclose(log.values, [[5e-3, 20e3, 1], [6e-3, 30e3, 2]])
     np.testing.assert_allclose(log.time_s, [0, 1])
-    assert split_unit("x_in") == ("x_in", "")  # an input, and no inch
+    assert column_unit("x_in") == ("x_in", None)  # an input, and no inch
 
 
 def test_a_broken_line_within_a_table_is_no_cut(tmp_path: Path) -> None:

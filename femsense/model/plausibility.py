@@ -1,0 +1,345 @@
+"""What recordings and robots can physically hold: one list of ranges, used where files are imported, inspected and computed with.
+
+Numbers outside of a range can be computed with, but are hardly meant: the usual cause is another unit, clock, sign or frame.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.core.pose import invert_pose, transform_points
+from femsense.core.units import ATMOSPHERE_PA, Quantity, likely_units
+from femsense.fem.body import BodyModel
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """Limits of what soft robots and their sensors do."""
+
+    step_s: tuple[float, float] = (5e-4, 5.0)
+    """Between frames: motion capture takes up to 1000 a second, a patient experimenter one each few seconds."""
+    scene_m: tuple[float, float] = (0.05, 10.0)
+    """Median distance of what a depth camera sees."""
+    assumed_scene_m: float = 0.25
+    """The nearest scene where the unit of depth images is only that of their layout: those cameras see from 0.4 m on."""
+    behind: float = 0.2
+    """Largest share of points behind a camera."""
+    pressure_pa: tuple[float, float] = (500.0, 5e6)
+    """Largest pressure of a chamber that does something."""
+    pressure_share: float = 1e-3
+    """… and as a share of its max_pressure_pa."""
+    absolute_pa: tuple[float, float] = (80e3, 108e3)
+    """Lowest pressure of a chamber that was measured against a vacuum: from 2000 m above the sea to a high at the sea."""
+    tension_n: tuple[float, float] = (1e-3, 120.0)
+    """Largest tension of a cable."""
+    displacement_m: float = 0.5
+    """Largest displacement of a cable."""
+    focal_share: tuple[float, float] = (0.05, 50.0)
+    """Focal length over the width of the image."""
+    distortion: float = 10.0
+    """Largest coefficient of a polynomial lens; a rational one (8 numbers) may have ten times more."""
+    poisson_ratio: float = 0.4999
+    """Beyond it the equations are nearly singular."""
+    doubling_rad: float = 2.6
+    """A cable that turns farther than this at one point doubles back."""
+    coincident: float = 1e-6
+    """Nodes nearer than this, over the diagonal, are at one place."""
+    camera_m: float = 20.0
+    """Distance of a camera from its robot."""
+
+
+RANGES = Ranges()
+
+
+# Recordings
+
+
+def doubts_of_recording(recording: Recording) -> list[str]:
+    """Return what of a recording can be computed with, but is hardly meant: times, inputs, lenses, poses, places behind a camera."""
+    return [
+        *doubts_of_times(recording),
+        *doubts_of_displacements(recording),
+        *doubts_of_tensions(recording),
+        *doubts_of_pressures(recording),
+        *doubts_of_cameras(recording),
+        *doubts_of_marker_places(recording),
+    ]
+
+
+def doubts_of_times(recording: Recording) -> list[str]:
+    """Return whether frames follow each other as no camera takes them."""
+    steps = np.diff(recording.time_s)
+    where = place_of(recording, "frames.csv", "time_s")
+    column = "the column time_s" if recording.folder else "time_s"
+    if not len(steps):
+        return []
+    step, (low, high) = float(np.median(steps)), RANGES.step_s
+    if step > high:
+        return [f"{where}: one frame every {step:.4g} s by {column}; is it in milliseconds?"]
+    if step < low:
+        unit = "days" if 86400.0 * step < high else "hours"
+        return [f"{where}: one frame every {step:.3g} s by {column}, {1.0 / step:.3g} a second; is it in {unit}?"]
+    return []
+
+
+def doubts_of_displacements(recording: Recording) -> list[str]:
+    """Return displacements of cables that are too long, or mostly negative."""
+    r, where, found = recording, place_of(recording, "frames.csv", "inputs"), []
+    for name, pulled in zip(r.cable_names, r.inputs.T) if r.actuation == "displacement" else ():
+        longest = float(np.abs(pulled).max(initial=0.0))
+        if longest > RANGES.displacement_m:
+            unit = "millimetres" if 1e-3 * longest < RANGES.displacement_m else "ticks or degrees of a motor"
+            found.append(f"{where}: cable {name!r} moves by up to {longest:.4g} m; are displacements in {unit}?")
+        back, forth = int((pulled < 0).sum()), int((pulled > 0).sum())
+        if r.actuation_zero == "absolute" and back > forth:
+            text = f"slack in {len(pulled) - forth} of {len(pulled)} frames, its displacement below zero in {back}"
+            found.append(f"{where}: cable {name!r} is {text}; is the sign right? > 0 shortens")
+    return found
+
+
+def doubts_of_tensions(recording: Recording) -> list[str]:
+    """Return cables whose largest tension no cable of a soft robot has."""
+    r, where, (low, high) = recording, place_of(recording, "frames.csv", "inputs"), RANGES.tension_n
+    found = []
+    for name, tension in zip(r.cable_names, r.inputs.T) if r.actuation == "tension" else ():
+        largest = float(np.abs(tension).max(initial=0.0))
+        if largest > high:
+            units = _meant(largest, 0.05, high, Quantity.FORCE, "milliampere of a motor")
+            found.append(f"{where}: cable {name!r} reaches {largest:.4g} N; is it in {units}?")
+        if 0.0 < largest < low:
+            found.append(f"{where}: cable {name!r} never exceeds {largest:.3g} N; is it in {_meant(largest, 0.05, high, Quantity.FORCE)}?")
+    return found
+
+
+def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> list[str]:
+    """Return chambers whose pressures are absolute, or so small that they are in another unit than pascals."""
+    r, where, (low, high) = recording, place_of(recording, "frames.csv", "pressures"), RANGES.pressure_pa
+    limits = {c.name: c.max_pressure for c in robot.body.chambers} if robot is not None else {}
+    found = []
+    for name, pressure in zip(r.chamber_names, r.pressures.T):
+        largest, least = float(np.abs(pressure).max(initial=0.0)), float(pressure.min(initial=np.inf))
+        most = limits.get(name, np.inf)
+        bound = max(low, RANGES.pressure_share * most) if np.isfinite(most) else low
+        if 0.0 < largest < bound:
+            of = f" of its max_pressure_pa of {most:.6g}" if np.isfinite(most) else ""
+            units = _meant(largest, 2e3, min(most, high), Quantity.PRESSURE)
+            found.append(f"{where}: chamber {name!r} reaches {largest:.4g} Pa{of}; is it in {units}? The column holds pascals")
+        elif RANGES.absolute_pa[0] < least < RANGES.absolute_pa[1]:
+            found.append(_absolute(where, name, least))
+        elif least < -ATMOSPHERE_PA:
+            found.append(f"{where}: chamber {name!r} falls to {least:.6g} Pa, below a vacuum; is its unit or sign right?")
+        elif largest > high:
+            found.append(f"{where}: chamber {name!r} reaches {largest:.4g} Pa; is the column in another unit than pascals?")
+    return found
+
+
+def _absolute(where: str, name: str, least: float) -> str:
+    return (
+        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take what is above the "
+        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*1-{ATMOSPHERE_PA:.0f})"
+    )
+
+
+def doubts_of_cameras(recording: Recording) -> list[str]:
+    """Return lenses that cannot be those of their images, and cameras far from their robot."""
+    where, found = place_of(recording, "recording.toml", "cameras"), []
+    for name, camera, pose in zip(recording.camera_names, recording.cameras, recording.T_robot_camera):
+        key = f"cameras.{name}" if name else "camera"
+        if camera is not None:
+            c = camera
+            problem = lens_problem(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), c.distortion, c.distortion_model)
+            found += [f"{where}, {key}: {problem}"] if problem else []
+        away = 0.0 if pose is None else float(np.linalg.norm(pose[:3, 3]))
+        if away > RANGES.camera_m:
+            found.append(f"{where}, {key}: T_robot_camera puts the camera {away:.4g} m away; is its translation in millimetres?")
+    return found
+
+
+def doubts_of_marker_places(recording: Recording) -> list[str]:
+    """Return whether markers lie behind the camera that saw them."""
+    z = np.concatenate([recording.marker_xyz[:, 2], recording.unnamed_xyz[:, 2]])
+    behind = float((z <= 0).mean()) if len(z) else 0.0
+    images = any(camera is not None for camera in recording.cameras)
+    if behind <= RANGES.behind or not (images or recording.has_clouds):
+        return []  # a motion capture has no front
+    where = place_of(recording, "markers.csv", "markers")
+    return [f"{where}: {100 * behind:.0f} % of the markers lie behind the camera (z ≤ 0): are they in the camera's frame, z forward?"]
+
+
+def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
+    """Return whether points (n, 3) [m] lie behind or on the camera, or nearer than cameras see."""
+    if not len(points):
+        return []
+    behind = float((points[:, 2] <= 0).mean())
+    if behind > RANGES.behind:
+        text = f"{100 * behind:.0f} % of the points lie behind the camera (z ≤ 0)"
+        return [f"{where}: {text}: the clouds are not in the camera's frame (x right, y down, z forward)"]
+    away = float(np.median(np.linalg.norm(points, axis=1)))
+    if away < RANGES.scene_m[0]:
+        return [f"{where}: the clouds are {1e3 * away:.3g} mm away, nearer than depth cameras see: {unit_question(away)}"]
+    return []
+
+
+def unit_question(distance: float) -> str:
+    """Return, as a question, what a distance that is too short would be [m] in other units."""
+    return f"are they in another unit than metres? Ten times larger they would be {10 * distance:.3g} m away, 1000 times {1e3 * distance:.3g} m"
+
+
+# Lenses
+
+
+def lens_problem(
+    width: int, height: int, numbers: Sequence[float], distortion: npt.ArrayLike, model: str = "brown_conrady"
+) -> str | None:
+    """Return why fx, fy, cx, cy [px] and distortion are no lens of images of a size [px]; None where they can be one."""
+    fx, fy, cx, cy = numbers
+    bent = np.abs(np.asarray(distortion, dtype=np.float64)).max(initial=0.0)
+    rational = np.any(np.asarray(distortion, dtype=np.float64)[5:] != 0.0) and model != "kannala_brandt"
+    if fx > 0 > fy:
+        return f"fy = {fy:g} < 0: that lens counts rows upwards; depth images count them downwards: write {-fy:g} if the images do"
+    if fx <= 0 or fy <= 0:
+        return f"fx = {fx:g}, fy = {fy:g}: focal lengths are above zero"
+    low, high = RANGES.focal_share
+    for name, value, size in (("fx", fx, width), ("fy", fy, height)):
+        if not low < value / size < high:
+            return f"{name} = {value:g} for images of {width} × {height}: is it in another unit than pixels, or in another order?"
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        other = f"; a lens of images of about {2 * cx + 1:.0f} × {2 * cy + 1:.0f}?" if min(cx, cy) > 0 else ""
+        return f"the principal point {cx:g}, {cy:g} lies outside of images of {width} × {height}{other}"
+    if bent > RANGES.distortion * (10.0 if rational else 1.0):
+        return f"a coefficient of distortion of {bent:g}: is it the size of the images, or another number?"
+    return None
+
+
+# Robots
+
+
+def doubts_of_body(body: BodyModel) -> list[str]:
+    """Return what of a body can be computed with, but is hardly meant: its Poisson ratio, cracks, cables that double back."""
+    return [*_doubts_of_ratio(body), *_doubts_of_cracks(body), *_doubts_of_cables(body)]
+
+
+def _doubts_of_ratio(body: BodyModel) -> list[str]:
+    ratio = float(np.max(body.material.poisson_ratio))
+    if ratio <= RANGES.poisson_ratio:
+        return []
+    return [
+        f"material.poisson_ratio: {ratio:.7g} makes the equations nearly singular, and solves may fail; 0.49 and 0.4999 move a body of "
+        "rubber alike to a few per cent"
+    ]
+
+
+def _doubts_of_cracks(body: BodyModel) -> list[str]:
+    """Return nodes of the surface that stand at one place and are not joined."""
+    from scipy.spatial import cKDTree
+
+    mesh = body.mesh
+    corners = np.unique(mesh.tets[:, :4])
+    counts = []
+    for nodes in (corners, np.arange(len(mesh.nodes))):
+        points = mesh.nodes[nodes]
+        near = RANGES.coincident * float(np.linalg.norm(np.ptp(points, axis=0)))
+        pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
+        counts.append(len(np.unique(pairs[:, 1])) if len(pairs) else 0)
+    if not counts[1]:
+        return []
+    all_nodes = f" ({counts[1]} nodes of the quadratic mesh)" if counts[1] > counts[0] else ""
+    return [
+        f"mesh: {counts[0]} corner nodes{all_nodes} stand at the places of others without being joined to them: a crack, which makes the "
+        "body softer; merge duplicate nodes where the mesh is made"
+    ]
+
+
+def _doubts_of_cables(body: BodyModel) -> list[str]:
+    found = []
+    for cable in body.cables:
+        path = cable.path.positions(body.mesh.nodes)
+        points = np.vstack([path, cable.pull_point])
+        turns = _turns(points)
+        if not len(turns) or turns.max() <= RANGES.doubling_rad:
+            continue
+        k = int(turns.argmax())
+        other = _turns(np.vstack([path[::-1], cable.pull_point]))
+        hint = "is its far end first?" if other.max(initial=0.0) < RANGES.doubling_rad else "are two points exchanged?"
+        found.append(f"cable {cable.name!r} doubles back: it turns by {np.degrees(turns[k]):.0f}° at point {k + 1} of path_m; {hint}")
+    return found
+
+
+def _turns(points: FloatArray) -> FloatArray:
+    """Return the angles [rad] between the legs of a path (n, 3), shape (n − 2,) less legs without length."""
+    legs = np.diff(points, axis=0)
+    length = np.linalg.norm(legs, axis=1)
+    units = legs[length > 0] / length[length > 0, None]
+    return np.asarray(np.arccos(np.clip(np.einsum("ic,ic->i", units[:-1], units[1:]), -1.0, 1.0)))
+
+
+# Poses
+
+
+def doubts_of_poses(robot: Robot, recording: Recording) -> list[str]:
+    """Return given poses of cameras that put the markers away from the robot, with the reading of the pose that puts them onto it."""
+    r, number = recording, {name: i for i, name in enumerate(robot.marker_names)}
+    size = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
+    found = []
+    for v, T in enumerate(r.T_robot_camera):
+        rows = np.flatnonzero(r.marker_view == v)
+        rows = rows[[r.marker_names[i] in number for i in r.marker_index[rows]]] if len(rows) else rows
+        if T is None or not len(rows):
+            continue
+        rest = np.array([robot.marker_points[number[r.marker_names[i]]] for i in r.marker_index[rows]])
+
+        def off(pose: FloatArray) -> float:
+            return float(np.median(np.linalg.norm(transform_points(pose, r.marker_xyz[rows]) - rest, axis=1)))  # noqa: B023
+
+        given = off(T)
+        if given < 0.5 * size:
+            continue
+        name, best = min(((name, off(pose)) for name, pose in other_poses(T)), key=lambda item: item[1])
+        meant = f"; {name} would put them {1e3 * best:.3g} mm from there: is it that?" if best < 0.25 * size else ""
+        where = place_of(r, "recording.toml", "T_robot_camera")
+        found.append(f"{where}: T_robot_camera puts the markers {given:.3g} m from their places on the robot{meant}")
+    return found
+
+
+def other_poses(T: FloatArray) -> Iterable[tuple[str, FloatArray]]:
+    """Yield the usual misreadings of a pose T_robot_camera: name, and the pose that was meant."""
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    small = T.copy()
+    small[:3, 3] *= 1e-3
+    turned = T.copy()
+    turned[:3, :3] = T[:3, :3].T
+    for scale, pose in (("", T), (" with its translation in millimetres", small)):
+        yield f"the inverse (T_camera_robot){scale}", invert_pose(pose)
+        yield f"OpenGL's axes (y up, z backwards){scale}", pose @ flip
+        yield f"the inverse with OpenGL's axes{scale}", invert_pose(pose) @ flip
+        yield f"the inverse of OpenGL's view matrix{scale}", invert_pose(flip @ pose)
+    yield "a translation in millimetres", small
+    yield "a transposed rotation", turned
+
+
+# Words
+
+
+def warn_of(doubts: Iterable[str], *, stacklevel: int = 3) -> None:
+    """Warn of each doubt."""
+    for text in doubts:
+        warnings.warn(text, stacklevel=stacklevel)
+
+
+def place_of(recording: Recording, file: str, argument: str) -> str:
+    """Return where a part of a recording stands: in a file of its folder, or, made of arrays, in an argument of `from_arrays`."""
+    return str(recording.folder / file) if recording.folder else f"Recording.from_arrays, {argument}"
+
+
+def _meant(value: float, low: float, high: float, quantity: Quantity, *others: str) -> str:
+    """Return the units, joined by "or", in which a value would be plausible."""
+    names = [unit.name for unit in likely_units(value, low, high, quantity)[:2]]
+    return " or ".join([*names, *others]) or "another unit"
