@@ -15,8 +15,8 @@ from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.csv_tables import header_of
-from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.formats import FORMATS, format_of
+from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
 from femsense.io.importers.mapping import INPUT, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
@@ -121,7 +121,13 @@ def import_into(
         replace=again,
         progress=progress,
     )
-    notes = [*source.notes, *(() if log is None else log.notes), *_thinning(found, options), *_free(found, options), *_in_vain(found["format"], options)]
+    notes = [
+        *source.notes,
+        *(() if log is None else log.notes),
+        *_thinning(found, options),
+        *_free(found, options),
+        *_in_vain(found["format"], options),
+    ]
     return {**found, "notes": notes}
 
 

@@ -7,16 +7,15 @@ import warnings
 import numpy as np
 
 from femsense.core.errors import FemsenseError
+from femsense.io.clouds.cloud_files import viewpoint_doubt
 from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.plausibility import RANGES, doubts_of_cloud_places
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 
 CLOUDS_READ = 3
 """So many clouds of a recording are looked at."""
-FAR_CLOUD = 10.0
-"""Clouds that are farther away than this [m] in the median are more likely in centimetres or millimetres:
-depth cameras see less far."""
 OTHER_UNIT = 5.0
 """Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
 
@@ -45,6 +44,11 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
     full = [(k, v, cloud) for k, v, cloud in clouds if len(cloud)]
     if not full:
         return [f"{where}: the clouds of {len(clouds)} frames that were read have no points"]
+    shown = [recording.cloud_files[k][v] for k, v, _ in full]
+    frames = [doubt for doubt in (viewpoint_doubt(file) for file in shown[:1] if file is not None) if doubt is not None]
+    frames += doubts_of_cloud_places(np.vstack([cloud.points for _, _, cloud in full]), where)
+    if frames:
+        return frames
     distance = float(np.median([np.median(np.linalg.norm(cloud.points, axis=1)) for _, _, cloud in full]))
     seen = [_marker_distance(recording, k, v) for k, v, _ in full]
     markers = float(np.median([d for d in seen if d is not None])) if any(d is not None for d in seen) else None
@@ -52,7 +56,7 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
         return [
             f"{where}: clouds {distance:.4g} m away, markers {markers:.4g} m: {_likely(distance / markers)}; clouds are in metres"
         ]
-    if distance > FAR_CLOUD:
+    if distance > RANGES.scene_m[1]:
         return [
             (
                 f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds "

@@ -19,6 +19,10 @@ ATMOSPHERE_PA = 101_325.0
 """Standard atmosphere [Pa]: what is subtracted from absolute pressures."""
 
 
+PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+"""Units that meshes and tools may have. Dividing by these rounds once: 35 mm become the same number as 0.035."""
+
+
 class Quantity(StrEnum):
     """What a unit measures."""
 
@@ -119,7 +123,9 @@ def unit_named(text: str) -> Unit | None:
     if match is None or base is None or base.name not in _CAN_BE_ABSOLUTE:
         return None
     absolute = match[2].lower().startswith("a")
-    return Unit(f"{base.name} {'absolute' if absolute else 'gauge'}", base.quantity, base.size, -ATMOSPHERE_PA if absolute else 0.0)
+    return Unit(
+        f"{base.name} {'absolute' if absolute else 'gauge'}", base.quantity, base.size, -ATMOSPHERE_PA if absolute else 0.0
+    )
 
 
 def length_unit(text: str, *, allowed: Iterable[str] = ()) -> Unit | None:

@@ -10,12 +10,27 @@ from itertools import product
 
 BLANKS = " \u00a0\u202f\u2009'’"
 """What stands between thousands where neither a comma nor a point does."""
-GROUPED = re.compile(rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?")
+GROUPED = re.compile(
+    rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?"
+)
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
-DAY_FORMS = ("%d.%m.%Y", "%d.%m.%y", "%Y/%m/%d", "%Y.%m.%d", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%d-%b-%Y", "%d %b %Y", "%b %d %Y")
+DAY_FORMS = (
+    "%d.%m.%Y",
+    "%d.%m.%y",
+    "%Y/%m/%d",
+    "%Y.%m.%d",
+    "%d/%m/%Y",
+    "%m/%d/%Y",
+    "%d-%m-%Y",
+    "%d-%b-%Y",
+    "%d %b %Y",
+    "%b %d %Y",
+)
 CLOCK_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
 CLOCK = re.compile(r"(?:(\d{1,3}):)?(\d{1,2}):(\d{2}(?:[.,]\d+)?)\s*([AaPp]\.?[Mm]\.?)?")
-TIMES_READ = "seconds, 10:15:00.5, 10:15:00 PM, 2024-01-31T10:15:00, 31.01.2024 10:15:00, 1/31/2024 10:15:00, or days of a spreadsheet"
+TIMES_READ = (
+    "seconds, 10:15:00.5, 10:15:00 PM, 2024-01-31T10:15:00, 31.01.2024 10:15:00, 1/31/2024 10:15:00, or days of a spreadsheet"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,15 +62,19 @@ RANGES = Ranges()
 # Recordings
 
 
-def doubts_of_recording(recording: Recording) -> list[str]:
-    """Return what of a recording can be computed with, but is hardly meant: times, inputs, lenses, poses, places behind a camera."""
+def doubts_of_recording(recording: Recording, robot: Robot | None = None) -> list[str]:
+    """Return what of a recording can be computed with, but is hardly meant: times, inputs, lenses, poses, places behind a camera.
+
+    Pressures are compared with the limits of a robot's chambers, and given poses of cameras with its markers, where there is one.
+    """
     return [
         *doubts_of_times(recording),
         *doubts_of_displacements(recording),
         *doubts_of_tensions(recording),
-        *doubts_of_pressures(recording),
+        *doubts_of_pressures(recording, robot),
         *doubts_of_cameras(recording),
         *doubts_of_marker_places(recording),
+        *(doubts_of_poses(robot, recording) if robot is not None else ()),
     ]
 
 
@@ -115,7 +119,9 @@ def doubts_of_tensions(recording: Recording) -> list[str]:
             units = _meant(largest, 0.05, high, Quantity.FORCE, "milliampere of a motor")
             found.append(f"{where}: cable {name!r} reaches {largest:.4g} N; is it in {units}?")
         if 0.0 < largest < low:
-            found.append(f"{where}: cable {name!r} never exceeds {largest:.3g} N; is it in {_meant(largest, 0.05, high, Quantity.FORCE)}?")
+            found.append(
+                f"{where}: cable {name!r} never exceeds {largest:.3g} N; is it in {_meant(largest, 0.05, high, Quantity.FORCE)}?"
+            )
     return found
 
 
@@ -171,7 +177,9 @@ def doubts_of_marker_places(recording: Recording) -> list[str]:
     if behind <= RANGES.behind or not (images or recording.has_clouds):
         return []  # a motion capture has no front
     where = place_of(recording, "markers.csv", "markers")
-    return [f"{where}: {100 * behind:.0f} % of the markers lie behind the camera (z ≤ 0): are they in the camera's frame, z forward?"]
+    return [
+        f"{where}: {100 * behind:.0f} % of the markers lie behind the camera (z ≤ 0): are they in the camera's frame, z forward?"
+    ]
 
 
 def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
@@ -190,7 +198,7 @@ def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
 
 def unit_question(distance: float) -> str:
     """Return, as a question, what a distance that is too short would be [m] in other units."""
-    return f"are they in another unit than metres? Ten times larger they would be {10 * distance:.3g} m away, 1000 times {1e3 * distance:.3g} m"
+    return f"are they in metres? Ten times larger they would be {10 * distance:.3g} m away, a hundred times {100 * distance:.3g} m"
 
 
 # Lenses
@@ -204,7 +212,9 @@ def lens_problem(
     bent = np.abs(np.asarray(distortion, dtype=np.float64)).max(initial=0.0)
     rational = np.any(np.asarray(distortion, dtype=np.float64)[5:] != 0.0) and model != "kannala_brandt"
     if fx > 0 > fy:
-        return f"fy = {fy:g} < 0: that lens counts rows upwards; depth images count them downwards: write {-fy:g} if the images do"
+        return (
+            f"fy = {fy:g} < 0: that lens counts rows upwards; depth images count them downwards: write {-fy:g} if the images do"
+        )
     if fx <= 0 or fy <= 0:
         return f"fx = {fx:g}, fy = {fy:g}: focal lengths are above zero"
     low, high = RANGES.focal_share
@@ -269,7 +279,9 @@ def _doubts_of_cables(body: BodyModel) -> list[str]:
         k = int(turns.argmax())
         other = _turns(np.vstack([path[::-1], cable.pull_point]))
         hint = "is its far end first?" if other.max(initial=0.0) < RANGES.doubling_rad else "are two points exchanged?"
-        found.append(f"cable {cable.name!r} doubles back: it turns by {np.degrees(turns[k]):.0f}° at point {k + 1} of path_m; {hint}")
+        found.append(
+            f"cable {cable.name!r} doubles back: it turns by {np.degrees(turns[k]):.0f}° at point {k + 1} of path_m; {hint}"
+        )
     return found
 
 

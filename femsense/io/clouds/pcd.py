@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.pose import make_pose
 
 Column = npt.NDArray[np.generic]
 
@@ -37,6 +39,7 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     if not file.is_file():
         raise InputError("no such file", where=file, expected="a PCD file")
     lines, body = _split(file.read_bytes(), file)
+    _check_points(lines, file)
     header = _header(lines, file)
     if header.data == "ascii":
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines() if line.strip())
@@ -49,6 +52,39 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     if len(rows) != header.points:
         raise _short(file, f"{len(rows)} rows", f"{header.points} rows of {sum(header.count)} numbers")
     return {name: _column(rows, name, header) for name in header.fields if not name.startswith(PADDING)}
+
+
+def pcd_viewpoint(path: str | Path) -> FloatArray | None:
+    """Return where the header says that the sensor stood, T_cloud_sensor, shape (4, 4), translation in the file's unit;
+    None where it is the origin of the cloud. Raises InputError."""
+    from scipy.spatial.transform import Rotation
+
+    file = Path(path)
+    with file.open("rb") as stream:
+        words = _split(stream.read(MOST_OF_A_LINE), file)[0].get("VIEWPOINT", [])
+    try:
+        x, y, z, qw, qx, qy, qz = (float(word) for word in words)
+        T = make_pose(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), [x, y, z])
+    except ValueError:  # not seven numbers, or a quaternion of zeros: it says nothing
+        return None
+    return None if np.allclose(T, np.eye(4), atol=1e-9) else T
+
+
+def _check_points(words: dict[str, list[str]], file: Path) -> None:
+    """Refuse a header whose WIDTH × HEIGHT are not its POINTS. Raises InputError."""
+    sides, points = [*words.get("WIDTH", []), *words.get("HEIGHT", [])], words.get("POINTS", [])
+    if (
+        len(sides) == 2
+        and len(points) == 1
+        and "".join([*sides, *points]).isdigit()
+        and int(sides[0]) * int(sides[1]) != int(points[0])
+    ):
+        raise InputError(
+            "a PCD header that contradicts itself",
+            where=file,
+            found=f"WIDTH {sides[0]}, HEIGHT {sides[1]}, POINTS {points[0]}",
+            expected="WIDTH × HEIGHT = POINTS",
+        )
 
 
 PADDING = "#$%&~~"

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.pose import make_pose
 
 Column = npt.NDArray[np.generic]
 
@@ -75,6 +77,28 @@ def read_ply_vertices(path: str | Path) -> dict[str, Column]:
         return _read_ascii(body, sum(element.count for element in elements[:index]), vertex, file)
     order = _ORDERS[storage]
     return _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in elements[:index]), vertex, order, file)
+
+
+def ply_viewpoint(path: str | Path) -> FloatArray | None:
+    """Return where an element `camera`, as PCL writes it, says that the sensor stood: T_cloud_sensor, shape (4, 4), in the file's unit;
+    None where there is none or it is the origin. Raises InputError."""
+    file = Path(path)
+    storage, elements, body = _parse(file.read_bytes(), file)
+    index = next((i for i, element in enumerate(elements) if element.name == "camera" and element.count), None)
+    if index is None or not all(element.regular for element in elements[: index + 1]):
+        return None
+    camera, before = elements[index], elements[:index]
+    if storage == "ascii":
+        row = _read_ascii(body, sum(element.count for element in before), camera, file)
+    else:
+        order = _ORDERS[storage]
+        row = _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in before), camera, order, file)
+    keys = [f"{axis}_axis{part}" for part in "xyz" for axis in "xyz"]
+    if not {"view_px", "view_py", "view_pz", *keys} <= set(row):
+        return None
+    R = np.array([float(row[key][0]) for key in keys]).reshape(3, 3)
+    T = make_pose(R, [float(row[f"view_p{axis}"][0]) for axis in "xyz"])
+    return None if np.allclose(T, np.eye(4), atol=1e-9) else T
 
 
 def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:

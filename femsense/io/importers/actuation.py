@@ -89,7 +89,9 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
         raise InputError(
             "time does not increase",
             where=file,
-            found=f"{time_s[back[0] + 1]:.6g} s after {time_s[back[0]]:.6g} s in row {row}" if len(back) else f"{len(time_s)} rows",
+            found=f"{time_s[back[0] + 1]:.6g} s after {time_s[back[0]]:.6g} s in row {row}"
+            if len(back)
+            else f"{len(time_s)} rows",
             expected="rows in order of time",
             hint="stamps that stand still were rounded: log more digits" if len(back) > 1 else None,
         )

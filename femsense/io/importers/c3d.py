@@ -248,7 +248,11 @@ def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[i
     for wanted in options.topics:
         if wanted not in (*header.labels, *short):
             raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
-    both = ((k, pair) for k, pair in enumerate(zip(header.labels, short)) if pair[0] not in header.outputs or pair[0] in options.topics)
+    both = (
+        (k, pair)
+        for k, pair in enumerate(zip(header.labels, short))
+        if pair[0] not in header.outputs or pair[0] in options.topics
+    )
     taken = [(k, pair) for k, pair in both if not options.topics or any(name in options.topics for name in pair)]
     wanted_names = options.columns
     renamed = [(k, wanted_names.get(a, wanted_names.get(b, b)).removeprefix("marker.")) for k, (a, b) in taken]

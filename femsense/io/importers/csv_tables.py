@@ -20,7 +20,20 @@ from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit, unit_named
 from femsense.io.text_numbers import TIMES_READ, Notation, notation_of, number_in
 
-TIMES = ("time", "t", "timestamp", "time stamp", "ts", "elapsed", "elapsed time", "date time", "datetime", "clock", "epoch", "utc")
+TIMES = (
+    "time",
+    "t",
+    "timestamp",
+    "time stamp",
+    "ts",
+    "elapsed",
+    "elapsed time",
+    "date time",
+    "datetime",
+    "clock",
+    "epoch",
+    "utc",
+)
 """Names of columns of time in small letters with blanks, with or without a unit behind; names of units of time are some too."""
 FUSED = re.compile(r"(?:time|timestamp|elapsed)(ms|us|ns|s|sec)")
 BRACKETED = re.compile(r"(.+?)\s*[\[(]\s*(.+?)\s*[\])]")

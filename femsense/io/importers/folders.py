@@ -249,7 +249,9 @@ def _warn_of_distance(file: Path, unit: float, said: bool, layout: str) -> None:
     if low <= away <= FARTHEST:
         return
     others = {"millimetres": 1e-3, "0.2 mm": TUM_UNIT, "0.1 mm": 1e-4, "1/256 m": 1 / 256}
-    fits = [f"in {n} it is {s * away / unit:.3g} m (--depth-unit {s:.6g})" for n, s in others.items() if 0.2 < s * away / unit < 5.0]
+    fits = [
+        f"in {n} it is {s * away / unit:.3g} m (--depth-unit {s:.6g})" for n, s in others.items() if 0.2 < s * away / unit < 5.0
+    ]
     begin = f"the scene is {away:.3g} m away where one unit of depth is {1e3 * unit:.3g} mm"
     from_layout = "" if said else f", as {layout} has it"
     text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M says another'}"

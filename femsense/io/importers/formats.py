@@ -99,19 +99,23 @@ _EXPORTS = tuple(
 )
 _ALL = (
     Format("ros", open_ros, _is_bag, ("--rate",), list_ros, ENDINGS, topics_of, whole_depths=True, transforms=True),
-    Format("realsense", open_ros, _never, ("--rate", "--up", "--unit"), list_ros, (), topics_of, whole_depths=True, transforms=True),
+    Format(
+        "realsense", open_ros, _never, ("--rate", "--up", "--unit"), list_ros, (), topics_of, whole_depths=True, transforms=True
+    ),
     Format("kinect", open_kinect, _is_kinect, ("--clock", "--rate", "--up", "--unit", "--topic"), endings=(".mkv",)),
     Format("c3d", open_c3d, _is_c3d, ("--clock", "--rate"), list_c3d, (".c3d",)),
     *_EXPORTS,
     Format(
-        "csv", open_plain_csv, _is_table, ("--clock", "--topic"), list_plain_csv, (".gz",), columns=lambda path: header_of(path)[0]
+        "csv",
+        open_plain_csv,
+        _is_table,
+        ("--clock", "--topic"),
+        list_plain_csv,
+        (".gz",),
+        columns=lambda path: header_of(path)[0],
     ),
-    Format(
-        "tum", open_tum, partial(_is_folder, "tum"), ("--clock", "--rate", "--up", "--unit", "--topic"), whole_depths=True
-    ),
-    Format(
-        "redwood", open_redwood, partial(_is_folder, "redwood"), ("--clock", "--up", "--unit", "--topic"), whole_depths=True
-    ),
+    Format("tum", open_tum, partial(_is_folder, "tum"), ("--clock", "--rate", "--up", "--unit", "--topic"), whole_depths=True),
+    Format("redwood", open_redwood, partial(_is_folder, "redwood"), ("--clock", "--up", "--unit", "--topic"), whole_depths=True),
     Format("clouds", open_clouds, _is_cloud, ("--clock", "--topic")),
 )
 FORMATS = {one.name: one for one in _ALL}

@@ -120,19 +120,19 @@ def read_lens(path: Path, width: int, height: int) -> tuple[Lens, list[str]]:
     order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     named = [numbers.get(key, 0.0) for key in order] if any(key in numbers for key in order) else []
     distortion = np.array([*(found.distortion or named), *[0.0] * 5])[: max(5, len(found.distortion or named))]
-    model = _model(text) if np.any(distortion != 0.0) else "brown_conrady"
-    if model is None:
-        raise InputError("an unknown distortion model", where=path, found=MODEL.search(text)[2], expected=", ".join(sorted(set(MODELS) - {""})))  # type: ignore[index]
-    lens = Lens(width, height, numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion, model)
+    name = _model_name(text) if np.any(distortion != 0.0) else ""
+    if name not in MODELS:
+        known = ", ".join(sorted(set(MODELS) - {""}))
+        raise InputError("an unknown distortion model", where=path, found=name, expected=known)
+    lens = Lens(width, height, numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion, MODELS[name])
     return check_lens(lens, path), [*found.notes, *notes]
 
 
-def _model(text: str) -> str | None:
-    """Return the distortion model that a text names; Brown and Conrady's where it names none, None where it is not known."""
+def _model_name(text: str) -> str:
+    """Return the name of the distortion model in a text, in small letters; "" where it names none, or that of Brown and Conrady."""
     named = max(MODEL.finditer(text), key=lambda match: "distortion" in match[1].lower(), default=None)
-    if named is None or named[2].strip().lower() in ("radtan", "pinhole", "perspective", "opencv"):
-        return "brown_conrady"
-    return MODELS.get(named[2].strip().lower())
+    name = "" if named is None else named[2].strip().lower()
+    return "" if name in ("radtan", "pinhole", "perspective", "opencv") else name
 
 
 def check_lens(lens: Lens, where: str | Path | None) -> Lens:
@@ -161,7 +161,9 @@ def _in_pixels(numbers: dict[str, float], width: int, height: int) -> tuple[dict
     values = [numbers[key] for key in keys]
     if not all(0.0 < v < SHARE for v in values) or max(values[2:]) >= 1.0:
         return numbers, []
-    return numbers | {k: v * n for k, v, n in zip(keys, values, sizes)}, ["its numbers are shares of the images' width and height"]
+    return numbers | {k: v * n for k, v, n in zip(keys, values, sizes)}, [
+        "its numbers are shares of the images' width and height"
+    ]
 
 
 # JSON
@@ -171,7 +173,9 @@ def _in_json(text: str, path: Path) -> _Found | None:
     try:
         data = json.loads(text)
     except ValueError as error:
-        raise InputError("not a lens", where=path, found=str(error), expected="JSON with width, height, intrinsic_matrix") from None
+        raise InputError(
+            "not a lens", where=path, found=str(error), expected="JSON with width, height, intrinsic_matrix"
+        ) from None
     flat: dict[str, list[float]] = {}
     _flatten("", data, flat)
     return _of_names(flat)

@@ -19,7 +19,9 @@ from femsense.io.importers.csv_tables import column_unit
 
 INPUT, MARKER, LOAD, COLUMN = "input", "marker", "load", "input, time, axis"
 """What a name may become."""
-TARGETS = "cable_NAME, chamber_NAME, time (a factor or a unit may follow: *0.001, *kPa, *1-101325), NAME.x, marker.NAME or load@X,Y,Z"
+TARGETS = (
+    "cable_NAME, chamber_NAME, time (a factor or a unit may follow: *0.001, *kPa, *1-101325), NAME.x, marker.NAME or load@X,Y,Z"
+)
 SHAPES = {
     INPUT: "cable_NAME or chamber_NAME",
     MARKER: "marker.NAME",
@@ -116,7 +118,9 @@ def parse_target(target: str) -> Target:
     if match is None and unit is not None and unit.quantity in wanted:
         return Target(name, unit.size, unit.zero, unit, scaled=True)
     units = "|".join(units_of(*wanted))
-    raise InputError("not a factor", where="--map", found=target, expected=f"NAME=TARGET*NUMBER, or *{units}" if units else TARGETS)
+    raise InputError(
+        "not a factor", where="--map", found=target, expected=f"NAME=TARGET*NUMBER, or *{units}" if units else TARGETS
+    )
 
 
 def check_names(columns: Mapping[str, str], known: Mapping[str, str], path: Path, elsewhere: Sequence[str] = ()) -> None:

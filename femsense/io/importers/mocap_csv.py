@@ -191,7 +191,9 @@ def _optitrack(head: list[list[str]], path: Path) -> Export:
 def _trc(head: list[list[str]], path: Path) -> Export:
     """Read the header of a TRC file (Motion Analysis, OpenSim): keys and values in lines 2 and 3, names in line 4, axes in line 5."""
     if len(head) < 5:
-        raise InputError("a TRC file without its header", where=path, found=f"{len(head)} lines", expected="five lines, then frames")
+        raise InputError(
+            "a TRC file without its header", where=path, found=f"{len(head)} lines", expected="five lines, then frames"
+        )
     said = dict(zip((cell.strip() for cell in head[1]), (cell.strip() for cell in head[2])))
     names = [(j, plain_name(cell)) for j, cell in enumerate(head[3]) if j > 1 and cell.strip()]
     found = tuple((name, (j, j + 1, j + 2)) for j, name in names)
@@ -202,7 +204,9 @@ def _trc(head: list[list[str]], path: Path) -> Export:
 
 def _qualisys(head: list[list[str]], path: Path) -> Export:
     """Read the header of a TSV file of Qualisys Track Manager: a key and its values a line, then perhaps names of columns; millimetres."""
-    said = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in head if row and re.fullmatch(r"[A-Z_0-9]+", row[0].strip())}
+    said = {
+        row[0].strip(): [cell.strip() for cell in row[1:]] for row in head if row and re.fullmatch(r"[A-Z_0-9]+", row[0].strip())
+    }
     kind = " ".join(said.get("DATA_INCLUDED", ["3D"]))
     if kind != "3D" or "MARKER_NAMES" not in said:
         raise InputError(

@@ -119,18 +119,24 @@ def notation_notes(path: Path) -> list[str]:
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
     """Return what was assumed of the units of inputs: absolute pressures that were made gauge pressures, and units that nobody said."""
-    absolute = [column.name for column in inputs if column.offset and not parse_target(columns.get(names[column.index], "")).scaled]
+    absolute = [
+        column.name for column in inputs if column.offset and not parse_target(columns.get(names[column.index], "")).scaled
+    ]
     bare = [
         column.name
         for column in inputs
-        if column.factor == 1.0 and not column.offset and column_unit(names[column.index])[1] is None
+        if column.factor == 1.0
+        and not column.offset
+        and column_unit(names[column.index])[1] is None
         and not parse_target(columns.get(names[column.index], "")).scaled
     ]
     notes = [f"{', '.join(absolute)}: absolute pressures, 101325 Pa are subtracted"] if absolute else []
     units = " and ".join(
         dict.fromkeys("Pa" if name.startswith("chamber_") else "N, or m for --inputs displacement" for name in bare)
     )
-    return notes + ([f"no unit stands beside {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT says another"] if bare else [])
+    return notes + (
+        [f"no unit stands beside {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT says another"] if bare else []
+    )
 
 
 def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> Samples:
@@ -201,7 +207,9 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
     """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
-    units = [unit for unit in (column_unit(names[j])[1] for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH]
+    units = [
+        unit for unit in (column_unit(names[j])[1] for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH
+    ]
     said = sorted({unit.name for unit in units})
     if len(said) > 1 or 0 < len(units) < len(columns):
         raise InputError(

@@ -171,7 +171,13 @@ def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict
             (fld for fld in ("effort", "position", "") if fld in available and (fld != "effort" or given[name, fld] != 0.0)),
             available[0],
         )
-        for key in (*([topic] if _is_pressure(stream) else []), f"{name}.{usual}", name, f"{topic}.{name}", *(f"{name}.{fld}" for fld in available)):
+        for key in (
+            *([topic] if _is_pressure(stream) else []),
+            f"{name}.{usual}",
+            name,
+            f"{topic}.{name}",
+            *(f"{name}.{fld}" for fld in available),
+        ):
             if key in options.columns:
                 fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
                 columns[name] = Taken(fld, parse_target(options.columns[key]))

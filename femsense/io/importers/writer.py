@@ -136,7 +136,7 @@ def _accepted(part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, st
             warn_of(doubts_of_recording(recording))
     except InputError as problem:
         if not found.get("unlabelled_markers"):
-            where = str(problem.where).replace(str(part), str(final))
+            where = None if problem.where is None else str(problem.where).replace(str(part), str(final))
             raise type(problem)(
                 problem.what, where=where, found=problem.found, expected=problem.expected, hint=problem.hint
             ) from None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.io.meshes import tetgen
 from femsense.io.meshes.abaqus import read_abaqus
 from femsense.io.meshes.content import MeshContent, joined
 from femsense.io.meshes.gmsh import read_gmsh
@@ -73,6 +74,8 @@ def _read(path: Path, where: str) -> MeshContent:
         return read_gmsh(path, where)
     if path.suffix.lower() == ".inp" and kind is None:
         return read_abaqus(path, where)
+    if path.suffix.lower() in tetgen.ENDINGS and kind is None:
+        return tetgen.read_tetgen(path, where)
     if kind == "pvtu":
         return joined(read_content(file, str(file)) for file in listed_files(path, where))
     own = read_own(path.read_bytes()) if kind == "vtu" else None
