@@ -44,11 +44,6 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
     full = [(k, v, cloud) for k, v, cloud in clouds if len(cloud)]
     if not full:
         return [f"{where}: the clouds of {len(clouds)} frames that were read have no points"]
-    shown = [recording.cloud_files[k][v] for k, v, _ in full]
-    frames = [doubt for doubt in (viewpoint_doubt(file) for file in shown[:1] if file is not None) if doubt is not None]
-    frames += doubts_of_cloud_places(np.vstack([cloud.points for _, _, cloud in full]), where)
-    if frames:
-        return frames
     distance = float(np.median([np.median(np.linalg.norm(cloud.points, axis=1)) for _, _, cloud in full]))
     seen = [_marker_distance(recording, k, v) for k, v, _ in full]
     markers = float(np.median([d for d in seen if d is not None])) if any(d is not None for d in seen) else None
@@ -71,9 +66,21 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
     return []
 
 
+def cloud_doubts(recording: Recording) -> list[str]:
+    """Return what of a recording's clouds is hardly meant: poses of the sensor in their files, points behind the camera or on it."""
+    full = [(k, v, cloud) for k, v, cloud in some_clouds(recording) if len(cloud)]
+    if not full:
+        return []
+    file = recording.cloud_files[full[0][0]][full[0][1]]
+    doubt = None if file is None else viewpoint_doubt(file)
+    where = f"{recording.folder / 'clouds' if recording.folder else 'clouds'}"
+    points = np.vstack([cloud.points for _, _, cloud in full])
+    return [*([doubt] if doubt else []), *doubts_of_cloud_places(points, where)]
+
+
 def warn_of_clouds(robot: Robot, recording: Recording) -> None:
     """Warn of clouds that cannot be the robot's as they are, and of colours that are missing."""
-    for text in cloud_problems(recording, robot=robot):
+    for text in [*cloud_problems(recording, robot=robot), *cloud_doubts(recording)]:
         warnings.warn(text, stacklevel=3)
     clouds = some_clouds(recording)
     if robot.color_rgb is not None and clouds and all(cloud.colors is None for _, _, cloud in clouds):

@@ -60,7 +60,7 @@ class Notation:
         if rest is not None:
             return rest[0] != mark
         several = match[2].count(mark) > 1
-        return mark in BLANKS or several or (mark != self.decimal and not (match[1].lstrip("+-") == "0"))
+        return mark in BLANKS or several or (mark != self.decimal and match[1].lstrip("+-") != "0")
 
 
 def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.app.input_checks import cloud_problems
+from femsense.app.input_checks import cloud_doubts, cloud_problems
 from femsense.app.inspection.reports import Report, attempt
 from femsense.core.arrays import FloatArray
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
@@ -42,6 +42,7 @@ def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
         problems.append(f"{folder}: neither markers nor clouds: nothing was measured")
     _check_clouds(loaded, report, problems)
     problems += cloud_problems(loaded)
+    warn_of(cloud_doubts(loaded))
     _warn_of_unmatched(loaded, folder)
 
 

@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +266,7 @@ def _of_model(named: Mapping[str, list[float]], width: int, height: int) -> _Fou
 def _named_numbers(lines: Sequence[str]) -> dict[str, list[float]]:
     """Return name → the numbers behind it, to the next name; of a line of names only, those of the line below in its order."""
     flat: dict[str, list[float]] = {}
-    for line, below in zip(lines, lines[1:]):
+    for line, below in pairwise(lines):
         names, values = WORD.findall(line), NUMBER.findall(below)
         if names and not NUMBER.search(line) and len(names) == len(values) and not WORD.search(NUMBER.sub("", below)):
             flat |= {_last(name): [float(value)] for name, value in zip(names, values)}

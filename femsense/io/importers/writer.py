@@ -154,7 +154,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
     """
     lost = counts["out_of_order"]
     if lost:
-        first = f"first after frame {counts['first_back'] - 1}"
+        first = f"the first is number {counts['first_back']} in the file"
         hint = "stamps that were rounded stand still; a clock that was set back begins anew: export the times with all digits"
         if lost > kept:
             raise InputError(
@@ -217,8 +217,8 @@ def _write_frames(source: Source, part: Path, journal: Journal, progress: Progre
     number, counts = done, {"out_of_order": 0, "resumed": done, "first_back": 0}
     for frame in _after(source.frames(), done, counts):
         if not frame.time > last:
-            counts["first_back"] = counts["first_back"] or number
             counts["out_of_order"] += 1
+            counts["first_back"] = counts["first_back"] or number + counts["out_of_order"]
             continue
         journal.add(_write_frame(source, frame, part, number))
         last, number = frame.time, number + 1
