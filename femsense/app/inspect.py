@@ -90,13 +90,13 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
 
 def _compare(target: Path, report: Report, robot: str | Path) -> None:
     """Compare a recording with a robot. Raises InputError where it does not fit."""
-    from femsense.app.input_checks import warn_of_clouds, warn_of_markers
+    from femsense.app.input_checks import warn_of_markers, warn_of_pictures
 
     if report["kind"] != "recording":
         raise InputError("--robot is about recordings", where=target, found=report["kind"], expected="a recording")
     loaded, body = load_recording(target), load_robot(robot)
     check_against(body, loaded)
-    warn_of_clouds(body, loaded)
+    warn_of_pictures(body, loaded)
     warn_of_markers(body, loaded)
     report["robot"] = body.name
 

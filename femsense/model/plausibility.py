@@ -16,6 +16,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.core.units import ATMOSPHERE_PA, Quantity, likely_units
 from femsense.fem.body import BodyModel
+from femsense.fem.mesh import embed_points
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -150,7 +151,7 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
 def _absolute(where: str, name: str, least: float) -> str:
     return (
         f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take what is above the "
-        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*1-{ATMOSPHERE_PA:.0f})"
+        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*Pa_abs does)"
     )
 
 
@@ -198,7 +199,9 @@ def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
 
 def unit_question(distance: float) -> str:
     """Return, as a question, what a distance that is too short would be [m] in other units."""
-    return f"are they in metres? Ten times larger they would be {10 * distance:.3g} m away, a hundred times {100 * distance:.3g} m"
+    return (
+        f"are they in metres? Ten times larger they would be {10 * distance:.3g} m away, a hundred times {100 * distance:.3g} m"
+    )
 
 
 # Lenses
@@ -302,6 +305,7 @@ def doubts_of_poses(robot: Robot, recording: Recording) -> list[str]:
     size = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
     found = []
     for v, T in enumerate(r.T_robot_camera):
+        found += _camera_in_body(robot, recording, T)
         rows = np.flatnonzero(r.marker_view == v)
         rows = rows[[r.marker_names[i] in number for i in r.marker_index[rows]]] if len(rows) else rows
         if T is None or not len(rows):
@@ -319,6 +323,14 @@ def doubts_of_poses(robot: Robot, recording: Recording) -> list[str]:
         where = place_of(r, "recording.toml", "T_robot_camera")
         found.append(f"{where}: T_robot_camera puts the markers {given:.3g} m from their places on the robot{meant}")
     return found
+
+
+def _camera_in_body(robot: Robot, recording: Recording, T: FloatArray | None) -> list[str]:
+    """Return whether a camera stands within the body."""
+    if T is None or embed_points(robot.body.mesh, T[None, :3, 3]).outside[0] > 0.0:
+        return []
+    where = place_of(recording, "recording.toml", "T_robot_camera")
+    return [f"{where}: T_robot_camera puts the camera into the body: are clouds and markers in the robot's frame already?"]
 
 
 def other_poses(T: FloatArray) -> Iterable[tuple[str, FloatArray]]:

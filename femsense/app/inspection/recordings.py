@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.app.input_checks import cloud_doubts, cloud_problems
 from femsense.app.inspection.reports import Report, attempt
 from femsense.core.arrays import FloatArray
+from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
 from femsense.io.clouds.images import read_color, read_png
 from femsense.io.recording_folder import load_recording

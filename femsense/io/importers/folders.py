@@ -17,7 +17,7 @@ from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud
 from femsense.io.clouds.images import png_header, read_png
 from femsense.io.importers.array_clouds import read_array_cloud
 from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Options, Source, unit_of
-from femsense.io.importers.intrinsics import FILES, JSON_NAMES, lens_text, read_lens
+from femsense.io.importers.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
 from femsense.io.importers.pictures import decoded_image
 from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
@@ -59,7 +59,7 @@ def open_tum(folder: Path, options: Options) -> Source:
     _warn_of_distance(folder / depth[0][1], unit, said, "TUM")
     pairs = _associated(depth, color)
     lost = sum(c is None for _, _, c in pairs) if color else 0
-    found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": lens_text(lens)}
+    found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": lens_line(lens)}
     frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs], lens)
     return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=unit, count=len(pairs), notes=notes)
 
@@ -85,7 +85,7 @@ def open_redwood(folder: Path, options: Options) -> Source:
     items = [(clock[i], file, color_of.get(file)) for i, file in enumerate(depth)]
     found = {
         "depth_unit_m": unit,
-        "lens": lens_text(lens),
+        "lens": lens_line(lens),
         "times": "in the names of the files" if times is not None else f"{options.rate:g} a second",
     }
     return Source(

@@ -155,6 +155,11 @@ def lens_text(lens: Lens) -> str:
     return f"fx {lens.fx:.6g}, fy {lens.fy:.6g}, cx {lens.cx:.6g}, cy {lens.cy:.6g}{bent}"
 
 
+def lens_line(lens: Lens) -> str:
+    """Return size, model and numbers of a lens as text, for the table of what was imported."""
+    return f"{lens.width} × {lens.height}, {lens.model}, {lens_text(lens)}"
+
+
 def _in_pixels(numbers: dict[str, float], width: int, height: int) -> tuple[dict[str, float], list[str]]:
     """Return focal lengths and principal point in pixels where they are shares of the image's size (as LSD-SLAM has them)."""
     keys, sizes = ("fx", "fy", "cx", "cy"), (width, height, width, height)

@@ -17,6 +17,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
 from femsense.io.importers.input_samples import NEAR_S, Samples, samples_of
+from femsense.io.importers.intrinsics import lens_line
 from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.pictures import depth_of_metres
 from femsense.io.importers.ros_bag import Bag, Message, open_bag
@@ -79,7 +80,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
         "marker_topics": [s.topic.name for s in choice.markers] or None,
         "depth_unit_m": plan.unit if choice.lens else None,
-        "lens": None if choice.lens is None else f"{choice.lens.width} × {choice.lens.height}, {choice.lens.model}",
+        "lens": None if choice.lens is None else lens_line(choice.lens),
         "camera_frame": choice.primary.frame or None,
     }
     return Source(

@@ -121,8 +121,9 @@ FIELDS = {
     "effort": "effort, which is N or N m by its message, is taken as newtons",
     "position": "position, which is m or rad by its message, is taken as metres",
     "velocity": "velocity is taken as it is",
-    "": "values without a unit are taken as they are: newtons or metres, pressures in pascals above the surroundings",
+    "": "values without a unit are taken as they are, in newtons or metres",
 }
+PRESSURES = "pressures are taken as pascals above the surroundings; FluidPressure is absolute by its definition"
 
 
 def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
@@ -131,7 +132,9 @@ def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
     for topic, values in columns.items():
         for field in FIELDS:
             names = [one.target.name for one in values.values() if one.field == field and not one.target.scaled]
-            if names:
+            if names and names[0].startswith("chamber_"):
+                notes.append(f"{topic} → {', '.join(names)}: {PRESSURES}: --map NAME={names[0]}*Pa_abs makes them relative")
+            elif names:
                 begin = f"{topic} → {', '.join(names)}: {FIELDS[field]}"
                 notes.append(f"{begin}; motors count ticks, radians or milliampere: --map NAME={names[0]}*FACTOR")
     return notes

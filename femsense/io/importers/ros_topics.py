@@ -13,6 +13,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.frames import Lens, Options
+from femsense.io.importers.intrinsics import check_lens
 from femsense.io.importers.ros_bag import Bag, Topic
 from femsense.io.importers.ros_messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
 
@@ -263,6 +264,7 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
     if frame and stream.frame and frame != stream.frame and not first.topic.startswith((f"{folder}/", "/device_")):
         return None  # another camera's
     lens = lens_of(info, f"{bag.path}, topic {first.topic}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
+    check_lens(lens, f"{bag.path}, topic {first.topic}")
     model = _sdk_model(bag, stream.topic.name)
     return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
 

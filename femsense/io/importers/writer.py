@@ -16,6 +16,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError, InputError
+from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_csv, write_json, write_toml
 from femsense.io.folder_lock import only_writer
 from femsense.io.importers.actuation import ActuationLog, align
@@ -133,7 +134,7 @@ def _accepted(part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, st
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             recording = load_recording(part)
-            warn_of(doubts_of_recording(recording))
+            warn_of([*doubts_of_recording(recording), *cloud_problems(recording), *cloud_doubts(recording)])
     except InputError as problem:
         if not found.get("unlabelled_markers"):
             where = None if problem.where is None else str(problem.where).replace(str(part), str(final))
