@@ -20,6 +20,7 @@ from femsense.core.errors import InputError
 from femsense.io.importers.frames import Lens
 from femsense.io.importers.ros_messages import MODELS
 from femsense.io.tables import read_text
+from femsense.io.text_numbers import notation_of
 from femsense.model.plausibility import lens_problem
 
 JSON_NAMES = ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json", "camera.json", "camera_info.json", "calibration.json")
@@ -64,6 +65,8 @@ NAMES = {
     "k6": ("k6",),
 }
 """What numbers of a lens are called, in small letters."""
+PAIRS = {"focal_length": ("fx", "fy"), "focal": ("fx", "fy"), "principal_point": ("cx", "cy"), "center": ("cx", "cy")}
+"""Names of two numbers."""
 BY_MODEL = {"pinhole": 4, "simple_pinhole": 3, "opencv": 8, "radtan": 8}
 """Models of COLMAP and DSO whose numbers are read in their order, and how many they have."""
 MATRICES = ("k", "cam_k", "intrinsic_matrix", "camera_matrix", "intrinsics", "intrinsic", "m1", "k_depth")
@@ -74,7 +77,7 @@ KNOWN = {name: key for key, names in NAMES.items() for name in names}
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 WORD = re.compile(r"[A-Za-z_][\w./-]*")
 MODEL = re.compile(r"(?i)\b((?:distortion_|camera[_.])?(?:model|type))[\"']?\s*[:=]\s*[\"']?([A-Za-z][\w ]*)")
-COMMENT = re.compile(r"(?:#|//|%(?!YAML)|;\s).*$")
+COMMENT = re.compile(r"(?:#|//|%|^\s*;).*$|!!\S+|\bdt:\s*\w+")
 SHARE = 4.0
 """A focal length below this is a share of the image's size: of lenses with less than 14° no depth camera is known [1]."""
 CENTRED, SQUARE = 0.2, 0.15
@@ -215,6 +218,8 @@ def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
     size = dict(zip(("width", "height"), sizes)) if sizes else {}
     size |= {key: single[key] for key in ("width", "height") if key in single}
     distortion = next((flat[name] for name in DISTORTIONS if len(flat.get(name, ())) >= 4), [])
+    for name, keys in PAIRS.items():
+        single |= dict(zip(keys, flat[name])) if len(flat.get(name, ())) == 2 else {}
     if "f" in single:
         single = {"fx": single["f"], "fy": single["f"]} | single
     if {"fx", "cx", "cy"} <= set(single):
@@ -225,7 +230,8 @@ def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
             numbers = dict(zip(("fx", "fy", "cx", "cy"), flat[name]))
         if numbers is not None:
             return _Found(numbers | size, () if name in PROJECTIONS else distortion)
-    matrices = [numbers for values in flat.values() if (numbers := _matrix(np.array(values))) is not None]
+    found = [_matrix(np.array(values)) for values in flat.values()]
+    matrices = [numbers for numbers in found if numbers is not None and (numbers["fx"], numbers["fy"]) != (1.0, 1.0)]
     same = matrices and all(one == matrices[0] for one in matrices)
     return _Found(matrices[0] | size, distortion) if same else None
 
@@ -250,6 +256,8 @@ def _matrix(values: FloatArray) -> dict[str, float] | None:
 def _in_text(text: str, width: int, height: int) -> _Found | None:
     lines = [COMMENT.sub("", line).strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
+    if notation_of(word for line in lines for word in line.split()).decimal == ",":
+        lines = [re.sub(r"(?<=\d),(?=\d)", ".", line) for line in lines]
     named = _named_numbers(lines)
     found = _of_names(named) or _of_model(named, width, height) or _of_shape(lines) or _of_order(lines, width, height)
     if found is not None or "fx" in named:
@@ -275,17 +283,15 @@ def _named_numbers(lines: Sequence[str]) -> dict[str, list[float]]:
         names, values = WORD.findall(line), NUMBER.findall(below)
         if names and not NUMBER.search(line) and len(names) == len(values) and not WORD.search(NUMBER.sub("", below)):
             flat |= {_last(name): [float(value)] for name, value in zip(names, values)}
-    name, rows = "", ("rows", "cols", "dt", "data")
-    for line in lines:
-        for token in re.finditer(rf"{NUMBER.pattern}|{WORD.pattern}", line):
-            if NUMBER.fullmatch(token[0]):
-                if name:
-                    flat.setdefault(name, []).append(float(token[0]))
-            elif _last(token[0]) == "data":
-                name = ".data"
-                flat.pop(name, None)
-            else:
-                name = _last(token[0]) if _last(token[0]) not in rows else ""
+    name = owner = ""  # of a matrix as OpenCV and ROS write it, which has rows, cols and data below its name
+    for token in re.finditer(rf"{NUMBER.pattern}|{WORD.pattern}", "\n".join(lines)):
+        if NUMBER.fullmatch(token[0]):
+            if name:
+                flat.setdefault(name, []).append(float(token[0]))
+            continue
+        word = _last(token[0])
+        owner = owner if word in ("rows", "cols", "data") else word
+        name = "" if word in ("rows", "cols") else owner
     return flat
 
 
