@@ -28,6 +28,7 @@ DAY_FORMS = (
 )
 CLOCK_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
 CLOCK = re.compile(r"(?:(\d{1,3}):)?(\d{1,2}):(\d{2}(?:[.,]\d+)?)\s*([AaPp]\.?[Mm]\.?)?")
+DAY = re.compile(r"\d{1,2}([./-])\d{1,2}\1\d{4}|\d{4}([./-])\d{1,2}\2\d{1,2}")
 TIMES_READ = (
     "seconds, 10:15:00.5, 10:15:00 PM, 2024-01-31T10:15:00, 31.01.2024 10:15:00, 1/31/2024 10:15:00, or days of a spreadsheet"
 )
@@ -105,6 +106,8 @@ def moment_in(cell: str) -> float | None:
     Of 01/02/2024 the day stands first, unless that is no date; differences of times are the same either way within a month.
     """
     text = cell.strip()
+    if DAY.fullmatch(text):
+        text += " 00:00:00"
     if ":" not in text and not re.fullmatch(r"\d{8}T\d{4,6}.*", text):
         return None
     clock = CLOCK.fullmatch(text)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +140,9 @@ def _check_size(body: bytes, header: Any, file: Path) -> None:
     size = header.points * header.build_dtype().itemsize
     if header.data == "binary" and len(body) < size:
         raise _short(file, f"{len(body)} bytes of data", f"{size} bytes")
+    if header.data == "binary" and body[size:].strip(b"\0\r\n "):
+        text = f"{len(body) - size} bytes more than the header announces are not read: is POINTS right?"
+        warnings.warn(f"{file}: {text}", stacklevel=5)
     if header.data == "binary_compressed":
         packed, unpacked = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
         if unpacked != size or len(body) < 8 + packed:

@@ -6,6 +6,7 @@ whatever was in memory.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,6 +74,7 @@ def read_ply_vertices(path: str | Path) -> dict[str, Column]:
             "lists in or before the vertices", where=file, found="property list", expected="vertices of plain numbers first"
         )
     vertex = elements[index]
+    _warn_of_more(storage, elements, body, file)
     if storage == "ascii":
         return _read_ascii(body, sum(element.count for element in elements[:index]), vertex, file)
     order = _ORDERS[storage]
@@ -129,6 +131,20 @@ def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
     if storage not in _ORDERS:
         raise InputError("unknown storage", where=file, found=f"format {storage}", expected=", ".join(_ORDERS))
     return storage, elements, data[line_end + 1 :]
+
+
+def _warn_of_more(storage: str, elements: list[_Element], body: bytes, file: Path) -> None:
+    """Warn of a file that holds more than its header announces."""
+    if not all(element.regular for element in elements):
+        return
+    if storage == "ascii":
+        more = sum(bool(line.strip()) for line in body.splitlines()) - sum(element.count for element in elements)
+        unit = "lines"
+    else:
+        more = len(body) - sum(e.count * e.row_type(_ORDERS[storage]).itemsize for e in elements)
+        more, unit = (0 if not body[len(body) - more :].strip() else more, "bytes")
+    if more > 0:
+        warnings.warn(f"{file}: {more} {unit} more than the header announces are not read: is its count right?", stacklevel=5)
 
 
 def _with_property(element: _Element, name: str, kind: str) -> _Element:

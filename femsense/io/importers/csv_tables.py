@@ -197,13 +197,14 @@ def number_rows(path: Path) -> Iterator[list[float]]:
         if headed and k == 0 and _are_units(cells):
             continue
         values = [np.nan if cell.strip().lower() in EMPTY else number_in(cell) for cell in cells[: len(names)]]
-        if len(values) == len(names) and all(value is not None for value in values):
+        more = [cell for cell in cells[len(names) :] if cell.strip()]
+        if len(values) == len(names) and not more and all(value is not None for value in values):
             yield [float(value) for value in values if value is not None]
             continue
         if is_cut_off(path) and next(rows, None) is None:
             warnings.warn(f"{path}: the last line was cut off and is left out", stacklevel=2)
             return
-        bad = next((cell for cell, value in zip(cells, values) if value is None), f"{len(cells)} cells")
+        bad = f"{len(cells)} cells" if more else next((c for c, value in zip(cells, values) if value is None), f"{len(cells)} cells")
         raise InputError(
             "not a row of numbers",
             where=f"{path}, line {line}",
@@ -215,7 +216,7 @@ def number_rows(path: Path) -> Iterator[list[float]]:
 
 def _row_hint(cells: Sequence[str], bad: str, width: int) -> str | None:
     """Return what is probably wrong with a row that is no row of numbers."""
-    if len(cells) == 2 * width - 1 or len(cells) == 2 * width:
+    if len(cells) > width and ("," not in "".join(cells)):
         return "decimal commas between commas? Export with points, or with semicolons between the cells"
     if ":" in bad or re.search(r"\d[./-]\d+[./-]\d", bad):
         return f"times are read as {TIMES_READ}"
@@ -230,7 +231,10 @@ def column_unit(name: str) -> tuple[str, Unit | None]:
     """
     text = name.strip()
     for match in (BRACKETED.fullmatch(text), ENDED.fullmatch(text)):
-        unit = unit_named(match[2].replace("_", " ")) if match else None
+        try:
+            unit = unit_named(match[2].replace("_", " ")) if match else None
+        except InputError as problem:
+            raise InputError(problem.what, where=f"column {name}", found=problem.found, expected=problem.expected) from None
         if match and unit is not None:
             return match[1].strip(), unit
     return text, None

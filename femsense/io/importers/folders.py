@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud
+from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud, viewpoint_doubt
 from femsense.io.clouds.images import png_header, read_png
 from femsense.io.importers.array_clouds import read_array_cloud
 from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Options, Source, unit_of
@@ -106,6 +106,9 @@ def open_clouds(folder: Path, options: Options) -> Source:
     if not files:
         raise InputError("no clouds", where=folder, expected=", ".join(CLOUDS))
     times = _cloud_times(folder, files, options)
+    doubt = viewpoint_doubt(files[0])
+    if doubt is not None:
+        warnings.warn(doubt, stacklevel=3)
     scale = unit_of(options, _declared_unit(files[0]), files[0], _extent(files[0]))
     frames = [Frame(t, picture=partial(_scaled_cloud, file, scale)) for t, file in zip(times, files)]
     endings = sorted({file.suffix.lower() for file in files})
