@@ -230,14 +230,13 @@ def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
             numbers = dict(zip(("fx", "fy", "cx", "cy"), flat[name]))
         if numbers is not None:
             return _Found(numbers | size, () if name in PROJECTIONS else distortion)
-    found = [_matrix(np.array(values)) for values in flat.values()]
-    matrices = [numbers for numbers in found if numbers is not None and (numbers["fx"], numbers["fy"]) != (1.0, 1.0)]
+    matrices = [numbers for values in flat.values() if (numbers := _matrix(np.array(values))) is not None]
     same = matrices and all(one == matrices[0] for one in matrices)
     return _Found(matrices[0] | size, distortion) if same else None
 
 
 def _matrix(values: FloatArray) -> dict[str, float] | None:
-    """Return fx, fy, cx, cy of a matrix of 3 × 3, 3 × 4 or 4 × 4 by rows or by columns; None for what is none."""
+    """Return fx, fy, cx, cy of a matrix of 3 × 3, 3 × 4 or 4 × 4 by rows or by columns; None for what is none, or a pose."""
     shapes = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
     if values.size not in shapes:
         return None
@@ -245,7 +244,8 @@ def _matrix(values: FloatArray) -> dict[str, float] | None:
     turned = values.reshape(4, 3).T if values.size == 12 else given.T
     for K in (given, turned):
         below = K[1, 0] == K[2, 0] == K[2, 1] == 0.0
-        if below and K[2, 2] == 1.0 and K[0, 0] != 0.0 and K[1, 1] != 0.0:
+        rotation = max(abs(K[0, 0]), abs(K[1, 1])) <= 1.0 and not (0.2 < K[0, 2] < 0.8 and 0.2 < K[1, 2] < 0.8)
+        if below and K[2, 2] == 1.0 and K[0, 0] != 0.0 and K[1, 1] != 0.0 and not rotation:
             return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
     return None
 
