@@ -114,7 +114,8 @@ def _with_points(path: Path, where: str) -> io.BytesIO | None:
     changed, first = [], 0
     for number, line in enumerate(data.splitlines(), start=1):
         words = [word for word in line.split() if word[:1] in b"+-,.0123456789"]
-        commas = any(b"," in word for word in words) and all(NUMBERS.fullmatch(word) for word in words)
+        named = line.lower().startswith((b"solid", b"endsolid", b"#", b"g ", b"o ", b"comment"))
+        commas = not named and len(words) > 1 and any(b"," in w for w in words) and all(NUMBERS.fullmatch(w) for w in words)
         first = first or (number if commas else 0)
         changed.append(re.sub(rb"(?<=\d),(?=\d)|(?<![\w,.]),(?=\d)", b".", line) if commas else line)
     if not first:

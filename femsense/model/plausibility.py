@@ -343,8 +343,7 @@ def other_poses(T: FloatArray) -> Iterable[tuple[str, FloatArray]]:
     for scale, pose in (("", T), (" with its translation in millimetres", small)):
         yield f"the inverse (T_camera_robot){scale}", invert_pose(pose)
         yield f"OpenGL's axes (y up, z backwards){scale}", pose @ flip
-        yield f"the inverse with OpenGL's axes{scale}", invert_pose(pose) @ flip
-        yield f"the inverse of OpenGL's view matrix{scale}", invert_pose(flip @ pose)
+        yield f"the inverse of OpenGL's view matrix{scale}", invert_pose(pose) @ flip
     yield "a translation in millimetres", small
     yield "a transposed rotation", turned
 
