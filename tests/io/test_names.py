@@ -28,7 +28,9 @@ def test_both_spellings_are_one_name_in_robot_recording_and_import(tmp_path: Pat
     markers = RECORDING_FILES["markers.csv"]
     recording = load_recording(write_small_recording(tmp_path / "r", markers_csv=markers.replace("tip", SPLIT)))
     assert NAME in load_robot(folder).marker_names and NAME in recording.marker_names
-    (tmp_path / "take.csv").write_text(f"time,{SPLIT}_x_m,{SPLIT}_y_m,{SPLIT}_z_m\n0,0.1,0.2,0.3\n1,0.1,0.2,0.3\n", encoding="utf-8")
+    (tmp_path / "take.csv").write_text(
+        f"time,{SPLIT}_x_m,{SPLIT}_y_m,{SPLIT}_z_m\n0,0.1,0.2,0.3\n1,0.1,0.2,0.3\n", encoding="utf-8"
+    )
     assert set(next(open_source(tmp_path / "take.csv").frames()).markers) == {NAME}
 
 

@@ -114,7 +114,7 @@ def test_lenses_against_the_size_of_images(numbers: tuple[float, ...], distortio
 
 @pytest.mark.parametrize(("shift", "said"), [(-0.5, "behind the camera"), (0.03, "nearer than depth cameras see"), (0.4, None)])
 def test_clouds_behind_or_on_the_camera(shift: float, said: str | None) -> None:
-    points = np.random.default_rng(0).uniform(-0.01, 0.01, (50, 3)) + [0.0, 0.0, shift]
+    points = np.random.default_rng(0).uniform(-0.01, 0.01, (50, 3)) + np.array([0.0, 0.0, shift])
     doubts = doubts_of_cloud_places(points, "clouds")
     assert (doubts == []) if said is None else (len(doubts) == 1 and said in doubts[0])
 

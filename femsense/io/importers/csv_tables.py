@@ -204,7 +204,11 @@ def number_rows(path: Path) -> Iterator[list[float]]:
         if is_cut_off(path) and next(rows, None) is None:
             warnings.warn(f"{path}: the last line was cut off and is left out", stacklevel=2)
             return
-        bad = f"{len(cells)} cells" if more else next((c for c, value in zip(cells, values) if value is None), f"{len(cells)} cells")
+        bad = (
+            f"{len(cells)} cells"
+            if more
+            else next((c for c, value in zip(cells, values) if value is None), f"{len(cells)} cells")
+        )
         raise InputError(
             "not a row of numbers",
             where=f"{path}, line {line}",

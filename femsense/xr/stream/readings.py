@@ -90,7 +90,9 @@ class Readings(Iterator[Reading]):
     @property
     def refused(self) -> str:
         """What was passed over, with the first of it; empty where all were readings."""
-        return f"what comes is no reading of its channels, first {_shown(self._first)}" if self.passed else ""
+        text = self._first.decode("utf-8", "replace").strip() if isinstance(self._first, bytes) else ""
+        comma = ": a decimal comma? Write a point, or semicolons between numbers" if WHOLE_PAIR.fullmatch(text) else ""
+        return f"what comes is no reading of its channels, first {_shown(self._first)}{comma}" if self.passed else ""
 
     def close(self) -> None:
         """Let go of the source."""

@@ -69,9 +69,7 @@ def test_times_of_day_of_a_log_are_laid_onto_frames_in_another_zone(tmp_path: Pa
     (tmp_path / "log.csv").write_text("time,cable_a\n" + "".join(f"2026-11-27T10:15:0{t:.3f},{t}\n" for t in TRUE))
     log = read_actuation_log(tmp_path / "log.csv", Options())
     with pytest.raises(InputError, match=r"local time and the other in UTC, 2 hours apart: --offset -7200"):
-        write_recording(
-            open_sources([file], Options()), tmp_path / "r", identity={}, actuation="tension", log=log, offset=0.0
-        )
+        write_recording(open_sources([file], Options()), tmp_path / "r", identity={}, actuation="tension", log=log, offset=0.0)
 
 
 def test_stamps_that_stand_still_are_said_and_a_clock_that_hardly_goes_is_refused(tmp_path: Path) -> None:

@@ -105,6 +105,7 @@ def test_a_motion_capture_that_was_cut_off_says_so(tmp_path: Path) -> None:
 
 # Numbers and units as people write them
 
+
 def written(scale: float, form: str, mark: str, head: str = "time,tip_x_mm,tip_y_mm,tip_z_mm") -> str:
     """Return the table with marks between thousands: form is what stands between thousands, and the decimal mark."""
 
@@ -160,7 +161,9 @@ def test_what_motors_count_is_no_tension_and_no_length(name: str, tmp_path: Path
     np.testing.assert_allclose(log.values[:, 0], [0.5, 1.0])
 
 
-@pytest.mark.parametrize(("target", "pascals"), [("chamber_a*bar", 2e5), ("chamber_a*1e5-101325", 98675.0), ("chamber_a*bara", 98675.0)])
+@pytest.mark.parametrize(
+    ("target", "pascals"), [("chamber_a*bar", 2e5), ("chamber_a*1e5-101325", 98675.0), ("chamber_a*bara", 98675.0)]
+)
 def test_a_unit_or_an_offset_in_a_mapping(target: str, pascals: float, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("time,p\n0,2\n1,2\n")
     log = read_actuation_log(tmp_path / "log.csv", Options(columns={"p": target}))
@@ -169,7 +172,10 @@ def test_a_unit_or_an_offset_in_a_mapping(target: str, pascals: float, tmp_path:
 
 def test_a_unit_that_nobody_says_is_noted(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("time,chamber_a\n0,2\n1,2\n")
-    assert any("no unit stands beside chamber_a: taken as Pa" in note for note in read_actuation_log(tmp_path / "log.csv", Options()).notes)
+    assert any(
+        "no unit stands beside chamber_a: taken as Pa" in note
+        for note in read_actuation_log(tmp_path / "log.csv", Options()).notes
+    )
 
 
 def test_dates_and_times_in_two_columns(tmp_path: Path) -> None:

@@ -125,7 +125,9 @@ def test_the_table_of_an_import_says_the_lens(tmp_path: Path) -> None:
 
 def test_a_scene_that_is_too_near_for_an_assumed_unit_is_asked_about(tmp_path: Path) -> None:
     folder = redwood(tmp_path / "in", PLAIN["order.txt"], depth=128)
-    with pytest.warns(UserWarning, match=r"0\.128 m away.*as Redwood has it.*in 1/256 m it is 0\.5 m \(--depth-unit 0\.00390625\)"):
+    with pytest.warns(
+        UserWarning, match=r"0\.128 m away.*as Redwood has it.*in 1/256 m it is 0\.5 m \(--depth-unit 0\.00390625\)"
+    ):
         imported(folder, tmp_path, Options(rate=10.0))
 
 

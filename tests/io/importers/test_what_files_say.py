@@ -29,7 +29,9 @@ def text_parameter(group: int, name: str, texts: list[bytes]) -> bytes:
     return struct.pack("<bb", len(name), group) + name.encode() + struct.pack("<h", len(body) + 2) + body
 
 
-def write_c3d(path: Path, labels: list[bytes], frames: np.ndarray, *, unit: bytes = b"mm\0\0", more: bytes = b"", used: int = 0) -> Path:
+def write_c3d(
+    path: Path, labels: list[bytes], frames: np.ndarray, *, unit: bytes = b"mm\0\0", more: bytes = b"", used: int = 0
+) -> Path:
     """Write floats (frames, points, 3) of 100 frames a second, texts padded with NUL."""
     group = struct.pack("<bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
     number = struct.pack("<bb", 4, 1) + b"USED" + struct.pack("<hbBh", 7, 2, 0, used) + b"\0" if used else b""
@@ -238,7 +240,9 @@ def test_ticks_are_refused_as_no_length_and_leave_nothing(tmp_path: Path) -> Non
     assert sorted(item.name for item in tmp_path.iterdir()) == ["bag"]
 
 
-@pytest.mark.parametrize(("field", "said"), [("position", "m or rad by its message, is taken as metres"), ("effort", "taken as newtons")])
+@pytest.mark.parametrize(
+    ("field", "said"), [("position", "m or rad by its message, is taken as metres"), ("effort", "taken as newtons")]
+)
 def test_the_field_and_the_unit_that_are_assumed_of_motors_are_noted(field: str, said: str, tmp_path: Path) -> None:
     file = motors(tmp_path / "bag", **{field: 0.2})
     assert any(said in note and "--map NAME=cable_top*FACTOR" in note for note in open_source(file).notes)

@@ -21,7 +21,8 @@ def text_of(kind: str) -> str:
     if kind == "off":
         return "\n".join(["OFF", "4 4 0", *rows, *(f"3 {a} {b} {c}" for a, b, c in FACES)]) + "\n"
     facets = [
-        f"facet normal 0.0 0.0 1.0\nouter loop\n{''.join(f'vertex {rows[i]}' + chr(10) for i in face)}endloop\nendfacet" for face in FACES
+        f"facet normal 0.0 0.0 1.0\nouter loop\n{''.join(f'vertex {rows[i]}' + chr(10) for i in face)}endloop\nendfacet"
+        for face in FACES
     ]
     return "\n".join(["solid part 1,5", *facets, "endsolid part 1,5"]) + "\n"
 

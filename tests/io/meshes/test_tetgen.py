@@ -16,7 +16,9 @@ TETGEN_EDGES = (2, 3, 1, 5, 4, 0)
 """Places of the nodes of TetGen's edges among those of VTK, for a file whose elements are as TetGen writes them."""
 
 
-def write(path: Path, mesh: TetMesh, *, first: int = 1, attribute: float | None = None, order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Path:
+def write(
+    path: Path, mesh: TetMesh, *, first: int = 1, attribute: float | None = None, order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+) -> Path:
     nodes = "\n".join(f"  {k + first} " + " ".join(map(repr, point)) for k, point in enumerate(mesh.nodes.tolist()))
     path.with_suffix(".node").write_text(f"# nodes\n{len(mesh.nodes)}  3  0  0\n{nodes}\n# end\n")
     tets = mesh.tets + first
