@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import tomllib
 import types
 import typing
@@ -51,6 +52,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         hint = "text needs quotes; a [table] goes on until the next one"
         if "\\" in str(error) or "escape" in str(error).lower() or "hex" in str(error).lower():
             hint = "a backslash begins an escape: write paths with / or in single quotes"
+        if re.search("[“”„‘’]", text):
+            hint = "typographic quotes are no quotes in TOML: write straight ones"
         raise InputError("not valid TOML", where=path, found=str(error), hint=hint) from None
     return document
 

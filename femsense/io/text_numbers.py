@@ -42,6 +42,8 @@ class Notation:
     """"." or ","."""
     grouped: bool = False
     """Whether some numbers have marks between their thousands."""
+    commas: bool = False
+    """Whether decimal commas were seen."""
 
     def plain(self, cell: str) -> str:
         """Return a number with a decimal point and without marks between thousands; any other cell as it is."""
@@ -71,8 +73,8 @@ def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
         cells: of a table's first lines.
         default: the decimal mark where none of them tells it.
     """
-    votes, grouped = {".": 0, ",": 0}, False
-    for cell in (cell.strip() for cell in cells):
+    votes, grouped, cells = {".": 0, ",": 0}, False, [cell.strip() for cell in cells]
+    for cell in cells:
         if not cell or not re.fullmatch(rf"[-+−]?[\d.,{BLANKS}]+(?:[eE][-+]?\d+)?", cell):
             continue
         match = GROUPED.fullmatch(cell.replace("−", "-"))
@@ -88,7 +90,7 @@ def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
             votes["," if "," in cell else "."] += 1
     if bool(votes["."]) != bool(votes[","]):
         default = "." if votes["."] else ","
-    return Notation(default, grouped)
+    return Notation(default, grouped, votes[","] > 0 or (default == "," and any("," in cell for cell in cells)))
 
 
 def number_in(cell: str) -> float | None:

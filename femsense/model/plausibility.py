@@ -43,6 +43,12 @@ class Ranges:
     """Largest tension of a cable."""
     displacement_m: float = 0.5
     """Largest displacement of a cable."""
+    load_n: float = 120.0
+    """Largest known load."""
+    marker_noise_m: float = 0.01
+    """What a marker repeats to."""
+    young_modulus_pa: float = 2e9
+    """Stiffest material of a soft robot."""
     focal_share: tuple[float, float] = (0.05, 50.0)
     """Focal length over the width of the image."""
     distortion: float = 10.0
@@ -75,6 +81,7 @@ def doubts_of_recording(recording: Recording, robot: Robot | None = None) -> lis
         *doubts_of_pressures(recording, robot),
         *doubts_of_cameras(recording),
         *doubts_of_marker_places(recording),
+        *doubts_of_loads(recording),
         *(doubts_of_poses(robot, recording) if robot is not None else ()),
     ]
 
@@ -183,6 +190,20 @@ def doubts_of_marker_places(recording: Recording) -> list[str]:
     ]
 
 
+def doubts_of_loads(recording: Recording) -> list[str]:
+    """Return known loads that are too large, and a marker noise in another unit."""
+    r, found = recording, []
+    largest = float(np.linalg.norm(r.load_forces, axis=1).max(initial=0.0))
+    if largest > RANGES.load_n:
+        units = _meant(largest, 0.05, RANGES.load_n, Quantity.FORCE)
+        found.append(f"{place_of(r, 'loads.csv', 'loads')}: a known load of {largest:.4g} N; is it in {units}?")
+    noise = r.marker_noise_m
+    if noise is not None and noise > RANGES.marker_noise_m:
+        text = f"marker_noise_m: markers that repeat to {noise:.3g} m; is it in millimetres?"
+        found.append(f"{place_of(r, 'recording.toml', 'marker_noise_m')}: {text}")
+    return found
+
+
 def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
     """Return whether points (n, 3) [m] lie behind or on the camera, or nearer than cameras see."""
     if not len(points):
@@ -236,8 +257,28 @@ def lens_problem(
 
 
 def doubts_of_body(body: BodyModel) -> list[str]:
-    """Return what of a body can be computed with, but is hardly meant: its Poisson ratio, cracks, cables that double back."""
-    return [*_doubts_of_ratio(body), *_doubts_of_cracks(body), *_doubts_of_cables(body)]
+    """Return what of a body can be computed with, but is hardly meant: its material, cracks, cables that double back, limits."""
+    return [*_doubts_of_material(body), *_doubts_of_cracks(body), *_doubts_of_cables(body), *_doubts_of_limits(body)]
+
+
+def _doubts_of_limits(body: BodyModel) -> list[str]:
+    """Return limits of chambers and cables in another unit."""
+    (low, high), found = RANGES.pressure_pa, []
+    for chamber in body.chambers:
+        if not low <= chamber.max_pressure <= high:
+            units = _meant(chamber.max_pressure, 2e3, high, Quantity.PRESSURE)
+            found.append(f"chamber {chamber.name!r}: max_pressure_pa of {chamber.max_pressure:.4g} Pa; is it in {units}?")
+    for cable in body.cables:
+        if np.isfinite(cable.max_tension) and cable.max_tension > 10.0 * RANGES.tension_n[1]:
+            units = _meant(cable.max_tension, 0.05, RANGES.tension_n[1], Quantity.FORCE)
+            found.append(f"cable {cable.name!r}: max_tension_n of {cable.max_tension:.4g} N; is it in {units}?")
+    return found
+
+
+def _doubts_of_material(body: BodyModel) -> list[str]:
+    modulus = float(np.max(body.material.young_modulus))
+    stiff = f"material.young_modulus_pa: {modulus:.4g} Pa is stiffer than any soft robot; is it in another unit than pascals?"
+    return [*([stiff] if modulus > RANGES.young_modulus_pa else []), *_doubts_of_ratio(body)]
 
 
 def _doubts_of_ratio(body: BodyModel) -> list[str]:

@@ -82,6 +82,14 @@ def test_paths_with_backslashes_are_explained(written: str, said: str, tmp_path:
     assert said in str(error.value)
 
 
+def test_typographic_quotes_are_named(tmp_path: Path) -> None:
+    folder = write_block_robot(tmp_path)
+    toml = folder / "robot.toml"
+    toml.write_text(toml.read_text().replace('"block"', "“block”"), encoding="utf-8")
+    with pytest.raises(InputError, match="typographic quotes"):
+        load_robot(folder)
+
+
 def test_a_mesh_whose_file_name_is_spelt_otherwise_is_found_and_saved(tmp_path: Path) -> None:
     folder = write_block_robot(tmp_path / "robot")
     (folder / "block.vtu").rename(folder / f"{SPLIT}.vtu")

@@ -205,6 +205,15 @@ def test_a_cable_that_doubles_back_is_doubted() -> None:
     assert len(exchanged) == 1 and "doubles back" in exchanged[0]
 
 
+def test_limits_and_moduli_in_another_unit_are_doubted() -> None:
+    stiff = make_body(block_mesh(), young_modulus=150e9, poisson_ratio=0.45, density=1e3, clamped=[0, 1, 2])
+    assert "stiffer than any soft robot" in doubts_of_body(stiff)[0]
+    mesh = block_mesh()
+    cable = tie_cable(mesh, "top", [[0.05, 0.015, 0.03]], [-0.01, 0.015, 0.03], max_tension=5000.0)
+    pulled = make_body(mesh, young_modulus=1e5, poisson_ratio=0.45, density=1e3, clamped=[0, 1, 2], cables=(cable,))
+    assert "max_tension_n of 5000 N; is it in mN or gf?" in doubts_of_body(pulled)[0]
+
+
 def test_a_robot_that_is_loaded_says_its_doubts(tmp_path: Path) -> None:
     folder = write_block_robot(tmp_path, material__poisson_ratio=0.499999)
     with pytest.warns(UserWarning, match=r"robot\.toml: material\.poisson_ratio: 0\.499999"):

@@ -113,7 +113,7 @@ def list_plain_csv(path: Path) -> dict[str, Any]:
 def notation_notes(path: Path) -> list[str]:
     """Return what was assumed of how a table writes its numbers."""
     notation = layout_of(path).notation
-    decimal = ["numbers are read with decimal commas"] if notation.decimal == "," else []
+    decimal = ["numbers are read with decimal commas"] if notation.commas else []
     return decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
 
 

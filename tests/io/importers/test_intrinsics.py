@@ -64,7 +64,8 @@ DISTORTED = {
     "opencv.yaml": f"%YAML:1.0\n---\nimage_width: 160\nimage_height: 120\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
     f"   data: [ {FX}, 0., {CX}, 0.,\n       {FY}, {CY}, 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n   rows: 5\n   cols: 1\n"
     f"   dt: d\n   data: [ {BENT.replace(' ', ', ')} ]\n",
-    "ros.yaml": f"image_width: 160\nimage_height: 120\ncamera_name: cam_2\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [{FX}, 0, {CX}, 0, {FY}, {CY}, 0, 0, 1]\n"
+    "ros.yaml": "image_width: 160\nimage_height: 120\ncamera_name: cam_2\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+    f"  data: [{FX}, 0, {CX}, 0, {FY}, {CY}, 0, 0, 1]\n"
     f"distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [{BENT.replace(' ', ', ')}]\n"
     "projection_matrix:\n  rows: 3\n  cols: 4\n  data: [130, 0, 80, 0, 0, 130, 60, 0, 0, 0, 1, 0]\n",
 }
