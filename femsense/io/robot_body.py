@@ -33,7 +33,8 @@ from femsense.io.robot_tables import (
     plain_dictionary,
 )
 from femsense.io.tables import beside
-from femsense.model.plausibility import doubts_of_body, warn_of
+from femsense.model.body_doubts import doubts_of_body
+from femsense.model.plausibility import warn_of
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.core.units import ATMOSPHERE_PA, Quantity, likely_units
-from femsense.fem.body import BodyModel
 from femsense.fem.mesh import embed_points
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -124,11 +123,11 @@ def doubts_of_tensions(recording: Recording) -> list[str]:
     for name, tension in zip(r.cable_names, r.inputs.T) if r.actuation == "tension" else ():
         largest = float(np.abs(tension).max(initial=0.0))
         if largest > high:
-            units = _meant(largest, 0.05, high, Quantity.FORCE, "milliampere of a motor")
+            units = likely_meant(largest, 0.05, high, Quantity.FORCE, "milliampere of a motor")
             found.append(f"{where}: cable {name!r} reaches {largest:.4g} N; is it in {units}?")
         if 0.0 < largest < low:
             found.append(
-                f"{where}: cable {name!r} never exceeds {largest:.3g} N; is it in {_meant(largest, 0.05, high, Quantity.FORCE)}?"
+                f"{where}: cable {name!r} never exceeds {largest:.3g} N; is it in {likely_meant(largest, 0.05, high, Quantity.FORCE)}?"
             )
     return found
 
@@ -144,7 +143,7 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
         bound = max(low, RANGES.pressure_share * most) if np.isfinite(most) else low
         if 0.0 < largest < bound:
             of = f" of its max_pressure_pa of {most:.6g}" if np.isfinite(most) else ""
-            units = _meant(largest, 2e3, min(most, high), Quantity.PRESSURE)
+            units = likely_meant(largest, 2e3, min(most, high), Quantity.PRESSURE)
             found.append(f"{where}: chamber {name!r} reaches {largest:.4g} Pa{of}; is it in {units}? The column holds pascals")
         elif RANGES.absolute_pa[0] < least < RANGES.absolute_pa[1]:
             found.append(_absolute(where, name, least))
@@ -195,7 +194,7 @@ def doubts_of_loads(recording: Recording) -> list[str]:
     r, found = recording, []
     largest = float(np.linalg.norm(r.load_forces, axis=1).max(initial=0.0))
     if largest > RANGES.load_n:
-        units = _meant(largest, 0.05, RANGES.load_n, Quantity.FORCE)
+        units = likely_meant(largest, 0.05, RANGES.load_n, Quantity.FORCE)
         found.append(f"{place_of(r, 'loads.csv', 'loads')}: a known load of {largest:.4g} N; is it in {units}?")
     noise = r.marker_noise_m
     if noise is not None and noise > RANGES.marker_noise_m:
@@ -251,90 +250,6 @@ def lens_problem(
     if bent > RANGES.distortion * (10.0 if rational else 1.0):
         return f"a coefficient of distortion of {bent:g}: is it the size of the images, or another number?"
     return None
-
-
-# Robots
-
-
-def doubts_of_body(body: BodyModel) -> list[str]:
-    """Return what of a body can be computed with, but is hardly meant: its material, cracks, cables that double back, limits."""
-    return [*_doubts_of_material(body), *_doubts_of_cracks(body), *_doubts_of_cables(body), *_doubts_of_limits(body)]
-
-
-def _doubts_of_limits(body: BodyModel) -> list[str]:
-    """Return limits of chambers and cables in another unit."""
-    (low, high), found = RANGES.pressure_pa, []
-    for chamber in body.chambers:
-        if not low <= chamber.max_pressure <= high:
-            units = _meant(chamber.max_pressure, 2e3, high, Quantity.PRESSURE)
-            found.append(f"chamber {chamber.name!r}: max_pressure_pa of {chamber.max_pressure:.4g} Pa; is it in {units}?")
-    for cable in body.cables:
-        if np.isfinite(cable.max_tension) and cable.max_tension > 10.0 * RANGES.tension_n[1]:
-            units = _meant(cable.max_tension, 0.05, RANGES.tension_n[1], Quantity.FORCE)
-            found.append(f"cable {cable.name!r}: max_tension_n of {cable.max_tension:.4g} N; is it in {units}?")
-    return found
-
-
-def _doubts_of_material(body: BodyModel) -> list[str]:
-    modulus = float(np.max(body.material.young_modulus))
-    stiff = f"material.young_modulus_pa: {modulus:.4g} Pa is stiffer than any soft robot; is it in another unit than pascals?"
-    return [*([stiff] if modulus > RANGES.young_modulus_pa else []), *_doubts_of_ratio(body)]
-
-
-def _doubts_of_ratio(body: BodyModel) -> list[str]:
-    ratio = float(np.max(body.material.poisson_ratio))
-    if ratio <= RANGES.poisson_ratio:
-        return []
-    return [
-        f"material.poisson_ratio: {ratio:.7g} makes the equations nearly singular, and solves may fail; 0.49 and 0.4999 move a body of "
-        "rubber alike to a few per cent"
-    ]
-
-
-def _doubts_of_cracks(body: BodyModel) -> list[str]:
-    """Return nodes of the surface that stand at one place and are not joined."""
-    from scipy.spatial import cKDTree
-
-    mesh = body.mesh
-    corners = np.unique(mesh.tets[:, :4])
-    counts = []
-    for nodes in (corners, np.arange(len(mesh.nodes))):
-        points = mesh.nodes[nodes]
-        near = RANGES.coincident * float(np.linalg.norm(np.ptp(points, axis=0)))
-        pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
-        counts.append(len(np.unique(pairs[:, 1])) if len(pairs) else 0)
-    if not counts[1]:
-        return []
-    all_nodes = f" ({counts[1]} nodes of the quadratic mesh)" if counts[1] > counts[0] else ""
-    return [
-        f"mesh: {counts[0]} corner nodes{all_nodes} stand at the places of others without being joined to them: a crack, which makes the "
-        "body softer; merge duplicate nodes where the mesh is made"
-    ]
-
-
-def _doubts_of_cables(body: BodyModel) -> list[str]:
-    found = []
-    for cable in body.cables:
-        path = cable.path.positions(body.mesh.nodes)
-        points = np.vstack([path, cable.pull_point])
-        turns = _turns(points)
-        if not len(turns) or turns.max() <= RANGES.doubling_rad:
-            continue
-        k = int(turns.argmax())
-        other = _turns(np.vstack([path[::-1], cable.pull_point]))
-        hint = "is its far end first?" if other.max(initial=0.0) < RANGES.doubling_rad else "are two points exchanged?"
-        found.append(
-            f"cable {cable.name!r} doubles back: it turns by {np.degrees(turns[k]):.0f}° at point {k + 1} of path_m; {hint}"
-        )
-    return found
-
-
-def _turns(points: FloatArray) -> FloatArray:
-    """Return the angles [rad] between the legs of a path (n, 3), shape (n − 2,) less legs without length."""
-    legs = np.diff(points, axis=0)
-    length = np.linalg.norm(legs, axis=1)
-    units = legs[length > 0] / length[length > 0, None]
-    return np.asarray(np.arccos(np.clip(np.einsum("ic,ic->i", units[:-1], units[1:]), -1.0, 1.0)))
 
 
 # Poses
@@ -403,7 +318,7 @@ def place_of(recording: Recording, file: str, argument: str) -> str:
     return str(recording.folder / file) if recording.folder else f"Recording.from_arrays, {argument}"
 
 
-def _meant(value: float, low: float, high: float, quantity: Quantity, *others: str) -> str:
+def likely_meant(value: float, low: float, high: float, quantity: Quantity, *others: str) -> str:
     """Return the units, joined by "or", in which a value would be plausible."""
     names = [unit.name for unit in likely_units(value, low, high, quantity)[:2]]
     return " or ".join([*names, *others]) or "another unit"

@@ -14,7 +14,8 @@ from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, tra
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.mesh import TetMesh, to_quadratic
 from femsense.io.robot_toml import load_robot
-from femsense.model.plausibility import doubts_of_body, doubts_of_cloud_places, doubts_of_recording, lens_problem
+from femsense.model.body_doubts import doubts_of_body
+from femsense.model.plausibility import doubts_of_cloud_places, doubts_of_recording, lens_problem
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import Drives, MarkerRows, Timeline, Views
 from femsense.model.robot import Robot
