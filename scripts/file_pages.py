@@ -33,7 +33,7 @@ right-handed. `T_a_b` takes points of frame b to frame a: 4 rows of 4 numbers. A
 ROBOT = """## A robot: a folder with `robot.toml` and a mesh
 
 The mesh file stands beside `robot.toml`. It holds tetrahedra, or a closed surface (STL, OBJ, PLY, OFF) that is filled on first use. Tetrahedra come as
-VTU in one or more pieces, VTK, Gmsh 1 to 4.1, Abaqus with one part or instance, Medit, TetGen (.node with .ele), Nastran, XDMF and MED (`pip install h5py`) and what else
+VTU in one or more pieces, VTK, Gmsh 1 to 4.1, Abaqus with one part or instance, Medit, TetGen, Nastran, XDMF and MED (`pip install h5py`) and what else
 meshio reads.
 A tetrahedron that stands twice is used once.
 """

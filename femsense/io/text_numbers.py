@@ -14,6 +14,8 @@ GROUPED = re.compile(
     rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?"
 )
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+FORTRAN = re.compile(r"^(\s*[-+]?\d*\.?\d*)[dD]([-+]?\d+\s*)$")
+"""A double-precision number as Fortran writes it: 1.0D-03."""
 DAY_FORMS = (
     "%d.%m.%Y",
     "%d.%m.%y",
@@ -97,7 +99,7 @@ def number_in(cell: str) -> float | None:
     """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
     the seconds since midnight; None for all else."""
     try:
-        return float(cell)
+        return float(FORTRAN.sub(r"\1e\2", cell))
     except ValueError:
         return moment_in(cell)
 

@@ -47,6 +47,7 @@ def test_marks_within_numbers(cells: list[str], default: str, plain: list[str]) 
         ("20261127T101500", DAY + MORNING),
         ("2026-11-27T10:15:00+02:00", DAY + MORNING - 7200.0),
         ("27.11.2026", DAY),
+        (" 1.5D+01", 15.0),
     ],
 )
 def test_dates_and_times_of_day(cell: str, seconds: float) -> None:

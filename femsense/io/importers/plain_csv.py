@@ -207,9 +207,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
     """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
-    units = [
-        unit for unit in (column_unit(names[j])[1] for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH
-    ]
+    units = [unit for unit in (_place_unit(names[j]) for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH]
     said = sorted({unit.name for unit in units})
     if len(said) > 1 or 0 < len(units) < len(columns):
         raise InputError(
@@ -221,20 +219,33 @@ def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> 
     return said[0] if said else None
 
 
+def _place_unit(name: str) -> Unit | None:
+    """Return the unit of a column of places, which stands behind its name or before the axis (tip_mm_x)."""
+    place, unit = _as_place(name), column_unit(name)[1]
+    return unit if unit is not None or place is None else place[2]
+
+
+def _as_place(full: str) -> tuple[str, str, Unit | None] | None:
+    """Return the marker, the axis and the unit of a column whose name has x, y or z at its end or beginning; None for any other."""
+    bare, unit = column_unit(full)
+    match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])", bare) or re.fullmatch(r"([xyzXYZ])[_ ]?(\w+)", bare)
+    if match is None:
+        return None
+    first, second = match[1], match[2]
+    stem, axis = (second, first) if len(first) == 1 and first in "xyzXYZ" and second not in "xyzXYZ" else (first, second)
+    inner, before = column_unit(stem)
+    if unit is None and before is not None and before.quantity is Quantity.LENGTH and before.name != "m":
+        stem, unit = inner, before
+    return stem, axis.lower(), unit
+
+
 def _named_triples(names: Sequence[str]) -> list[tuple[str, tuple[int, int, int]]]:
     """Return markers and their columns where x, y and z differ in one letter of their names."""
     groups: dict[str, dict[str, int]] = {}
     for j, full in enumerate(names):
-        bare, unit = column_unit(full)
-        if unit is not None and unit.quantity is not Quantity.LENGTH:
-            continue
-        name = bare if unit else full
-        match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])", name) or re.fullmatch(r"([xyzXYZ])[_ ]?(\w+)", name)
-        if match is None:
-            continue
-        first, second = match[1], match[2]
-        stem, axis = (second, first) if len(first) == 1 and first in "xyzXYZ" and second not in "xyzXYZ" else (first, second)
-        groups.setdefault(stem, {}).setdefault(axis.lower(), j)
+        place = _as_place(full)
+        if place is not None and (place[2] is None or place[2].quantity is Quantity.LENGTH):
+            groups.setdefault(place[0], {}).setdefault(place[1], j)
     return [
         (stem, (axes["x"], axes["y"], axes["z"]))
         for stem, axes in groups.items()

@@ -103,7 +103,7 @@ def _write_and_name(
             counts = _write_frames(source, part, journal, progress)
         _check_counts(source, counts, len(journal.times()))
         found = write_tables(source, part, journal, counts, wanted)
-        found |= _accepted(part, final, found)
+        found |= _accepted(source.path, part, final, found)
         tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
         write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
         (part / JOURNAL).unlink()
@@ -114,11 +114,11 @@ def _write_and_name(
     return found
 
 
-def _accepted(part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, str]:
+def _accepted(path: Path, part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, str]:
     """Load what was written as the other commands will, and warn of what it can hardly hold.
 
     Raises:
-        InputError: they would refuse it; the message names the places as the finished folder has them.
+        InputError: they would refuse it; the message names the source, and the place that the finished folder would have.
     """
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -127,7 +127,8 @@ def _accepted(part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, st
             warn_of([*doubts_of_recording(recording), *cloud_problems(recording), *cloud_doubts(recording)])
     except InputError as problem:
         if not found.get("unlabelled_markers"):
-            where = None if problem.where is None else str(problem.where).replace(str(part), str(final))
+            place = str(problem.where).replace(f"{part}/", "")
+            where = f"{path}, as {final.name}/{place}" if str(part) in str(problem.where) else problem.where
             raise type(problem)(
                 problem.what, where=where, found=problem.found, expected=problem.expected, hint=problem.hint
             ) from None

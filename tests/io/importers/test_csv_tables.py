@@ -35,6 +35,10 @@ TABLES = {
     "names in a comment": "# " + table(HEAD),
     "units in brackets": table("Time [ms],tip_x [mm],tip_y [mm],tip_z [mm]", scale=MM, times=1000 * TIMES),
     "units behind the names": table("t_s,tip_x_mm,tip_y_mm,tip_z_mm", scale=MM),
+    "units before the axes": table("time,tip_mm_x,tip_mm_y,tip_mm_z", scale=MM),
+    "units in capitals": table("TIME [MS],tip_x [MM],tip_y [MM],tip_z [MM]", scale=MM, times=1000 * TIMES).replace(
+        "[MM]", "[Mm]"
+    ),
     "units in a row of their own": table(HEAD + "\ns,mm,mm,mm", scale=MM),
     "microseconds since 1970": table(HEAD, times=[f"{1.7e15 + 1e6 * t:.0f}" for t in TIMES]),
     "dates": table(HEAD, times=[f"2024-01-02T03:04:{5 + t:09.6f}" for t in TIMES]),
@@ -47,7 +51,7 @@ TABLES = {
 @pytest.mark.filterwarnings("ignore:.*cut off")
 def test_tables(name: str, encoding: str, tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text(TABLES[name], encoding=encoding)
-    unit = None if "mm" in TABLES[name] else "m"
+    unit = None if "mm" in TABLES[name].lower() else "m"
     recording, _ = imported(tmp_path / "take.csv", tmp_path, Options(unit=unit))
     np.testing.assert_allclose(np.asarray(recording.time_s), TIMES, atol=1e-6)
     np.testing.assert_allclose(marker_grid(recording)[:, 0], PLACES, atol=1e-9)
