@@ -8,7 +8,7 @@ import numpy as np
 
 from femsense.calib.from_images import find_tags
 from femsense.core.arrays import FloatArray
-from femsense.io.clouds.cloud_checks import CLOUDS_READ, cloud_doubts, cloud_problems, some_clouds
+from femsense.io.clouds.cloud_checks import CLOUDS_READ, cloud_doubts, cloud_problems, doubts_of_cloud_poses, some_clouds
 from femsense.io.clouds.images import read_color
 from femsense.io.robot_tables import DICTIONARIES
 from femsense.model.recording import Recording
@@ -18,7 +18,7 @@ from femsense.model.robot import Robot
 def warn_of_pictures(robot: Robot, recording: Recording) -> None:
     """Warn of clouds that cannot be the robot's as they are, of colours that are missing, and of tags of another dictionary."""
     warn_of_tags(robot, recording)
-    for text in [*cloud_problems(recording, robot=robot), *cloud_doubts(recording)]:
+    for text in [*cloud_problems(recording, robot=robot), *cloud_doubts(recording), *doubts_of_cloud_poses(robot, recording)]:
         warnings.warn(text, stacklevel=3)
     clouds = some_clouds(recording)
     if robot.color_rgb is not None and clouds and all(cloud.colors is None for _, _, cloud in clouds):

@@ -12,6 +12,7 @@ from helpers import RECORDING_FILES, write_block_robot, write_small_recording
 
 from femsense.app.input_checks import warn_of_tags
 from femsense.app.inspect import inspect_path
+from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 
@@ -58,3 +59,25 @@ def test_clouds_that_are_not_in_the_cameras_frame(tmp_path: Path) -> None:
     assert report["problems"] == []
     assert any("sensor stood at 0, 0, 0.5" in text for text in report["warnings"])
     assert any("lie behind the camera" in text for text in report["warnings"])
+
+
+def clouded(folder: Path, points: np.ndarray, pose: np.ndarray) -> Path:
+    toml = f"T_robot_camera = {pose.tolist()}\n" + RECORDING_FILES["recording.toml"]
+    write_small_recording(folder, recording_toml=toml, markers_csv=None)
+    (folder / "clouds").mkdir()
+    (folder / "clouds" / "000000.xyz").write_text("\n".join(" ".join(f"{v:.6f}" for v in point) for point in points) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("written", "said"), [("right", None), ("inverse", "the inverse"), ("millimetres", "a translation in millimetres")]
+)
+def test_a_given_pose_that_leaves_no_cloud_near_the_robot_is_named(written: str, said: str | None, tmp_path: Path) -> None:
+    folder = write_block_robot(tmp_path / "robot")
+    pose = make_pose(rotation_from_vector([2.0, 0.5, -0.3]), [0.1, -0.4, 0.5])
+    points = transform_points(invert_pose(pose), load_robot(folder).body.mesh.nodes)
+    given = invert_pose(pose) if written == "inverse" else pose
+    given = make_pose(given[:3, :3], (1e3 if written == "millimetres" else 1.0) * given[:3, 3])
+    recording = clouded(tmp_path / "r", points, given)
+    found = [text for text in inspect_path(recording, robot=folder)["warnings"] if "near the robot" in text]
+    assert (found == []) if said is None else (len(found) == 1 and said in found[0] and "is it that?" in found[0])

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
+from femsense.core.pose import transform_points
 from femsense.io.clouds.cloud_files import viewpoint_doubt
 from femsense.io.clouds.frame_clouds import read_frame_cloud
-from femsense.model.plausibility import RANGES, doubts_of_cloud_places
+from femsense.model.plausibility import RANGES, doubts_of_cloud_places, other_poses
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 
 CLOUDS_READ = 3
 """So many clouds of a recording are looked at."""
+NEAR_BODY = 0.25
+"""Points are near a body within its box, grown by this times its diagonal."""
+FEWEST_NEAR = 20
+"""A reading of a pose that brings so many points there is named."""
 OTHER_UNIT = 5.0
 """Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
 
@@ -74,6 +80,30 @@ def cloud_doubts(recording: Recording) -> list[str]:
     where = f"{recording.folder / 'clouds' if recording.folder else 'clouds'}"
     points = np.vstack([cloud.points for _, _, cloud in full])
     return [*([doubt] if doubt else []), *doubts_of_cloud_places(points, where)]
+
+
+def doubts_of_cloud_poses(robot: Robot, recording: Recording) -> list[str]:
+    """Return given poses of cameras that leave no point near the robot, with the reading of the pose that brings them there."""
+    low, high = robot.body.mesh.nodes.min(axis=0), robot.body.mesh.nodes.max(axis=0)
+    margin = NEAR_BODY * float(np.linalg.norm(high - low))
+    found = []
+    for view, T in enumerate(recording.T_robot_camera):
+        clouds = [cloud.points for _, v, cloud in some_clouds(recording) if v == view and len(cloud)]
+        if T is None or not clouds:
+            continue
+        points = np.vstack(clouds)
+
+        def near(pose: FloatArray, seen: FloatArray = points) -> int:
+            placed = transform_points(pose, seen)
+            return int(((placed > low - margin) & (placed < high + margin)).all(axis=1).sum())
+
+        if near(T):
+            continue
+        name, count = max(((name, near(pose)) for name, pose in other_poses(T)), key=lambda item: item[1])
+        meant = f"; {name} would put {count} of {len(points)} there: is it that?" if count >= FEWEST_NEAR else ""
+        where = f"{recording.folder / 'recording.toml' if recording.folder else 'T_robot_camera'}"
+        found.append(f"{where}: T_robot_camera puts no point of the clouds near the robot{meant}")
+    return found
 
 
 def _marker_distance(recording: Recording, k: int, view: int) -> float | None:
