@@ -13,12 +13,12 @@ from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
-from femsense.io.importers.actuation import read_actuation_log
-from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.formats import FORMATS, format_of
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
-from femsense.io.importers.mapping import INPUT, kind_of_target, mappable
+from femsense.io.importers.tables.actuation import read_actuation_log
+from femsense.io.importers.tables.csv_tables import header_of
+from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]

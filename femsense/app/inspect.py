@@ -28,7 +28,7 @@ from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import check_no_pipe, plain
 from femsense.io.importers.formats import CAPTURE_ENDINGS
-from femsense.io.importers.ros_bag import content_ending
+from femsense.io.importers.ros.bag import content_ending
 from femsense.io.mesh_files import SURFACE_ENDINGS
 from femsense.io.meshes.reading import file_format
 from femsense.io.meshing.cad import CAD_READ

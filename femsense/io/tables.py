@@ -23,12 +23,6 @@ from femsense.core.text import did_you_mean, key_path, plain_name, short
 from femsense.core.units import PER_METRE, length_unit
 
 
-class Schema(BaseModel):
-    """Base of the tables of a TOML file: unknown keys, wrong types and numbers that are not finite are refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
 def _usual_unit(value: object) -> object:
     """Return a unit of length as it is usually written (MM and Millimeters are mm); anything else as it is."""
     unit = length_unit(value, allowed=PER_METRE) if isinstance(value, str) else None
@@ -37,6 +31,14 @@ def _usual_unit(value: object) -> object:
 
 LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
 """A unit of lengths in files, in any spelling."""
+
+
+class Schema(BaseModel):
+    """Base of the tables of a TOML file: unknown keys, wrong types and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
 SchemaType = TypeVar("SchemaType", bound=Schema)
 
 

@@ -19,7 +19,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
-from femsense.io.importers.mapping import MARKER
+from femsense.io.importers.tables.mapping import MARKER
 
 BLOCK = 512
 MOST = 65535

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from femsense.io.importers.c3d import list_c3d, open_c3d
-from femsense.io.importers.csv_tables import header_of
-from femsense.io.importers.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.frames import Options, Source
-from femsense.io.importers.kinect import open_kinect
-from femsense.io.importers.mocap_csv import Program, list_mocap_csv, open_mocap_csv, program_of
-from femsense.io.importers.plain_csv import list_plain_csv, open_plain_csv
-from femsense.io.importers.ros import list_ros, open_ros, topics_of
-from femsense.io.importers.ros_bag import BEGINNINGS, ENDINGS
+from femsense.io.importers.images.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
+from femsense.io.importers.images.kinect import open_kinect
+from femsense.io.importers.ros.bag import BEGINNINGS, ENDINGS
+from femsense.io.importers.ros.source import list_ros, open_ros, topics_of
+from femsense.io.importers.tables.csv_tables import header_of
+from femsense.io.importers.tables.mocap_csv import Program, list_mocap_csv, open_mocap_csv, program_of
+from femsense.io.importers.tables.plain_csv import list_plain_csv, open_plain_csv
 
 TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".trc")
 HEAD = 512

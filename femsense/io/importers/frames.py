@@ -93,7 +93,7 @@ class Source:
     """What was found in a file or a folder."""
 
     format: str
-    """A name of `guess.FORMATS`."""
+    """A name of `formats.FORMATS`."""
     path: Path
     frames: Callable[[], Iterator[Frame]]
     """Starts from the first frame at each call; a live source may go on for ever."""

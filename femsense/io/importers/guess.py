@@ -12,11 +12,11 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
-from femsense.io.importers.folders import PAIRS, folder_kind
 from femsense.io.importers.formats import FORMATS, Format, contents_of, format_of
 from femsense.io.importers.frames import Options, Source
-from femsense.io.importers.mapping import check_names, check_taken, check_targets, resolved
+from femsense.io.importers.images.folders import PAIRS, folder_kind
 from femsense.io.importers.several import camera_names, joined
+from femsense.io.importers.tables.mapping import check_names, check_taken, check_targets, resolved
 
 PACKED = (".zstd", ".zst", ".zip", ".7z", ".tar", ".tgz", ".bz2", ".xz")
 UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is read by its folder, which holds metadata.yaml"

@@ -17,11 +17,11 @@ from femsense.core.errors import FemsenseError, InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
 from femsense.io.folder_lock import only_writer
-from femsense.io.importers.actuation import ActuationLog
 from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.images.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
-from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
-from femsense.io.importers.tables import Wanted, actuation_of, another_kind, write_tables
+from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
+from femsense.io.importers.tables.actuation import ActuationLog
 from femsense.io.recording_folder import load_recording
 from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud

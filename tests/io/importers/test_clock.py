@@ -10,9 +10,9 @@ from imported import imported
 
 from femsense.core.errors import InputError
 from femsense.core.units import unit_named
-from femsense.io.importers.actuation import read_actuation_log
-from femsense.io.importers.clock import seconds_of
 from femsense.io.importers.frames import Options
+from femsense.io.importers.tables.actuation import read_actuation_log
+from femsense.io.importers.tables.clock import seconds_of
 
 STEP, COUNT = 0.05, 40
 TRUE = STEP * np.arange(COUNT)

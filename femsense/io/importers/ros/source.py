@@ -16,13 +16,12 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
-from femsense.io.importers.input_samples import NEAR_S, Samples, samples_of
-from femsense.io.importers.intrinsics import lens_line
-from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
-from femsense.io.importers.pictures import depth_of_metres
-from femsense.io.importers.ros_bag import Bag, Message, open_bag
-from femsense.io.importers.ros_messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
-from femsense.io.importers.ros_plan import (
+from femsense.io.importers.images.intrinsics import lens_line
+from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
+from femsense.io.importers.images.pictures import depth_of_metres
+from femsense.io.importers.ros.bag import Bag, Message, open_bag
+from femsense.io.importers.ros.messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
+from femsense.io.importers.ros.plan import (
     LAG_S,
     Plan,
     chosen_streams,
@@ -33,8 +32,9 @@ from femsense.io.importers.ros_plan import (
     named_values,
     plan_of,
 )
-from femsense.io.importers.ros_topics import Stream, cameras_of, choose, robot_pose, streams_of
+from femsense.io.importers.ros.topics import Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
+from femsense.io.importers.tables.input_samples import NEAR_S, Samples, samples_of
 from femsense.pointcloud.cloud import PointCloud
 
 

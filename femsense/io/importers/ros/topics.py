@@ -13,9 +13,9 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.frames import Lens, Options
-from femsense.io.importers.intrinsics import check_lens
-from femsense.io.importers.ros_bag import Bag, Topic
-from femsense.io.importers.ros_messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
+from femsense.io.importers.images.intrinsics import check_lens
+from femsense.io.importers.ros.bag import Bag, Topic
+from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -14,11 +14,11 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.files import write_csv, write_toml
-from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Source
-from femsense.io.importers.input_samples import spans
 from femsense.io.importers.journal import Journal
 from femsense.io.importers.summary import summary
+from femsense.io.importers.tables.actuation import ActuationLog, align
+from femsense.io.importers.tables.input_samples import spans
 from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
 from femsense.io.recording_toml import FORMAT
 

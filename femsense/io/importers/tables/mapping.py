@@ -15,7 +15,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, plain_name
 from femsense.core.units import Quantity, Unit, unit_named, units_of
-from femsense.io.importers.csv_tables import column_unit
+from femsense.io.importers.tables.csv_tables import column_unit
 
 INPUT, MARKER, LOAD, COLUMN = "input", "marker", "load", "input, time, axis"
 """What a name may become."""

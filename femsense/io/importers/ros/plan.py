@@ -11,12 +11,12 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Options, unit_of
-from femsense.io.importers.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
-from femsense.io.importers.pictures import FINE_UNIT
-from femsense.io.importers.ros_bag import Bag, Message
-from femsense.io.importers.ros_messages import header_of, markers_of, stamp_of
-from femsense.io.importers.ros_topics import Choice, Stream, transform_between, transforms_of
+from femsense.io.importers.images.pictures import FINE_UNIT
+from femsense.io.importers.ros.bag import Bag, Message
+from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
+from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
 from femsense.io.importers.several import camera_names
+from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
 
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""

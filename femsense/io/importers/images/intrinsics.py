@@ -18,7 +18,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Lens
-from femsense.io.importers.ros_messages import MODELS
+from femsense.io.importers.ros.messages import MODELS
 from femsense.io.tables import read_text
 from femsense.io.text_numbers import notation_of
 from femsense.model.plausibility import lens_problem

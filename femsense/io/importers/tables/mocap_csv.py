@@ -16,9 +16,9 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.csv_tables import is_cut_off, rows_of
 from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
-from femsense.io.importers.mapping import MARKER
+from femsense.io.importers.tables.csv_tables import is_cut_off, rows_of
+from femsense.io.importers.tables.mapping import MARKER
 
 HEAD = 20
 """The headers are in the first lines."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Lens
-from femsense.io.importers.pictures import decoded_image
+from femsense.io.importers.images.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
 
 Pixels = npt.NDArray[Any]

@@ -10,13 +10,13 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.clock import seconds_of
-from femsense.io.importers.csv_tables import column_unit, read_numbers, time_column
 from femsense.io.importers.frames import Options
-from femsense.io.importers.input_samples import samples_of
 from femsense.io.importers.journal import Journal
-from femsense.io.importers.mapping import check_targets, resolved
-from femsense.io.importers.plain_csv import input_columns, mapped_time, notation_notes, unit_notes
+from femsense.io.importers.tables.clock import seconds_of
+from femsense.io.importers.tables.csv_tables import column_unit, read_numbers, time_column
+from femsense.io.importers.tables.input_samples import samples_of
+from femsense.io.importers.tables.mapping import check_targets, resolved
+from femsense.io.importers.tables.plain_csv import input_columns, mapped_time, notation_notes, unit_notes
 
 SURE = 0.6
 """A correlation below this does not tell the offset."""
