@@ -57,9 +57,8 @@ def read_frames(path: Path, actuation: str, actuation_zero: str) -> tuple[Timeli
             where=table.place(row, cables[column]),
             found=f"{inputs[row, column]:g} m",
             expected="metres",
-            hint="divide the column by 1000"
-            if likely
-            else f"ticks, degrees or steps of a motor? femsense import --map NAME={cables[column]}*FACTOR says metres in one of them",
+            hint=("divide the column by 1000; or " if likely else "")
+            + f"ticks, degrees or steps of a motor? femsense import --map NAME={cables[column]}*FACTOR says metres in one of them",
         )
     timeline = Timeline(
         time_s,

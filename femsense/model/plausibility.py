@@ -107,7 +107,8 @@ def doubts_of_displacements(recording: Recording) -> list[str]:
     for name, pulled in zip(r.cable_names, r.inputs.T) if r.actuation == "displacement" else ():
         longest = float(np.abs(pulled).max(initial=0.0))
         if longest > RANGES.displacement_m:
-            unit = "millimetres" if 1e-3 * longest < RANGES.displacement_m else "ticks or degrees of a motor"
+            angles = " or radians of a motor" if longest < 20.0 else ""
+            unit = f"millimetres{angles}" if 1e-3 * longest < RANGES.displacement_m else "ticks or degrees of a motor"
             found.append(f"{where}: cable {name!r} moves by up to {longest:.4g} m; are displacements in {unit}?")
         back, forth = int((pulled < 0).sum()), int((pulled > 0).sum())
         if r.actuation_zero == "absolute" and back > forth:

@@ -68,6 +68,7 @@ def recording(
         ({"tension": 250.0}, "milliampere of a motor?"),
         ({"tension": 5e-4}, "is it in kN?"),
         ({"displacement": 20.0}, "in millimetres?"),
+        ({"displacement": 1.2}, "in millimetres or radians of a motor?"),
         ({"displacement": 2048.0}, "in ticks or degrees of a motor?"),
         ({"displacement": -0.02}, "is the sign right?"),
         ({"pose": make_pose(np.eye(3), [0.0, 0.0, 250.0])}, "250 m away; is its translation in millimetres?"),
