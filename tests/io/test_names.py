@@ -99,6 +99,15 @@ def test_a_mesh_whose_file_name_is_spelt_otherwise_is_found_and_saved(tmp_path: 
     assert load_robot(tmp_path / "saved").name == "block"
 
 
+def test_folders_of_a_camera_are_found_in_either_spelling(tmp_path: Path) -> None:
+    toml = f'{RECORDING_FILES["recording.toml"]}\n[cameras."{NAME}"]\n'
+    folder = write_small_recording(tmp_path, recording_toml=toml, markers_csv=None)
+    (folder / "clouds" / SPLIT).mkdir(parents=True)
+    (folder / "clouds" / SPLIT / "000000.xyz").write_text("0 0 0.5\n")
+    recording = load_recording(folder)
+    assert recording.camera_names == (NAME,) and recording.cloud_files[0][0] is not None
+
+
 def test_a_robot_in_utf_16_is_read(tmp_path: Path) -> None:
     folder = write_block_robot(tmp_path)
     text = (folder / "robot.toml").read_text()

@@ -43,6 +43,7 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     _check_points(lines, file)
     header = _header(lines, file)
     if header.data == "ascii":
+        body = body.replace(b",", b".")  # decimal commas: nothing else of PCD has commas
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines() if line.strip())
     _check_size(body, header, file)
     stream = io.BufferedReader(io.BytesIO(header.compose_header().encode() + body))

@@ -6,6 +6,7 @@ whatever was in memory.
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,7 +167,9 @@ def _read_binary(body: bytes, start: int, vertex: _Element, order: str, file: Pa
 
 
 def _read_ascii(body: bytes, skip: int, vertex: _Element, file: Path) -> dict[str, Column]:
-    lines = [line.split() for line in body.decode("ascii", "replace").splitlines() if line.strip()]
+    text = body.decode("ascii", "replace")
+    text = text.replace(",", ".") if re.search(r"\d,\d", text) else text  # decimal commas: nothing else of PLY has commas
+    lines = [line.split() for line in text.splitlines() if line.strip()]
     rows = lines[skip : skip + vertex.count]
     width = len(vertex.properties)
     if len(rows) < vertex.count or any(len(row) != width for row in rows):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import tempfile
 from pathlib import Path
 
@@ -54,6 +55,7 @@ def read_content(path: Path, where: str) -> MeshContent:
             where=where,
             found=reason(error),
             expected="tetrahedra in a format that meshio reads (vtu, vtk, msh, …)",
+            hint="decimal commas? Write points" if _has_decimal_commas(path) else None,
         ) from None
     points = content.points
     if points.ndim != 2 or points.shape[1] != 3:
@@ -101,6 +103,13 @@ def _through_meshio(path: Path, kind: str | None) -> MeshContent:
         mesh = meshio.read(path, file_format=kind)
     cells = {name: np.asarray(data, dtype=np.int64) for name, data in mesh.cells_dict.items()}
     return MeshContent(np.asarray(mesh.points, dtype=np.float64), cells, dict(mesh.cell_data_dict))
+
+
+def _has_decimal_commas(path: Path) -> bool:
+    """Whether lines of a text file are numbers with commas in them."""
+    with path.open("rb") as stream:
+        head = stream.read(65536)
+    return b"\0" not in head and re.search(rb"(?m)^\s*[-+]?\d+,\d+(?:\s+[-+]?\d+,\d+)+\s*$", head) is not None
 
 
 def reason(error: BaseException) -> str:

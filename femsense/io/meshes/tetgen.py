@@ -63,7 +63,8 @@ def in_vtk_order(points: FloatArray, tets: IntArray) -> IntArray:
 
 def _table(file: Path) -> tuple[list[float], FloatArray]:
     """Return the numbers of the first line and the rows after it. Raises InputError."""
-    lines = [line.partition("#")[0].split() for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines()]
+    text = file.read_text(encoding="utf-8-sig", errors="replace").replace(",", ".")  # decimal commas: nothing else has commas
+    lines = [line.partition("#")[0].split() for line in text.splitlines()]
     lines = [line for line in lines if line]
     try:
         head, rows = [float(word) for word in lines[0]], [[float(word) for word in line] for line in lines[1:]]

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from femsense.io.mesh_files import read_triangles
+from femsense.core.errors import InputError
+from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.mesh_files import read_tets, read_triangles
 
 POINTS = np.array([[0.0, 0.0, 0.0], [100.5, 0.0, 0.0], [0.0, 20.25, 0.0], [0.0, 0.0, -0.75]])
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
@@ -43,3 +45,22 @@ def test_points_are_read_without_one(kind: str, tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(read_triangles(tmp_path / f"a.{kind}")[1]) == 4
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_clouds_in_text_with_decimal_commas(kind: str, tmp_path: Path) -> None:
+    rows = "\n".join(" ".join(f"{v:.6f}".replace(".", ",") for v in point) for point in POINTS)
+    heads = {
+        "ply": "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+        "pcd": "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\nDATA ascii\n",
+    }
+    (tmp_path / f"a.{kind}").write_text(heads[kind] + rows + "\n")
+    np.testing.assert_allclose(read_cloud(tmp_path / f"a.{kind}").points, POINTS, atol=1e-5)
+
+
+def test_a_mesh_with_decimal_commas_is_named(tmp_path: Path) -> None:
+    rows = "\n".join(" ".join(f"{v:.6f}".replace(".", ",") for v in point) for point in POINTS)
+    head = "# vtk DataFile Version 3.0\nbar\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 double\n"
+    (tmp_path / "a.vtk").write_text(f"{head}{rows}\nCELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n10\n")
+    with pytest.raises(InputError, match="decimal commas"):
+        read_tets(tmp_path / "a.vtk")
