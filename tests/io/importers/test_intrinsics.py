@@ -54,6 +54,9 @@ PLAIN = {
     "words.txt": f"D435 640x480 cam0: {FX} {FY} {CX} {CY}\n",
     "open3d.json": json.dumps({"width": 160, "height": 120, "intrinsic_matrix": [FX, 0, 0, 0, FY, 0, CX, CY, 1]}),
     "realsense.json": json.dumps({"width": 160, "height": 120, "ppx": CX, "ppy": CY, "fx": FX, "fy": FY, "coeffs": [0.0] * 5}),
+    "two cameras.json": json.dumps(
+        {"color": {"K": [525, 0, 80, 0, 525, 60, 0, 0, 1]}, "depth": {"K": [FX, 0, CX, 0, FY, CY, 0, 0, 1]}}
+    ),
     "bop.json": json.dumps({"cam_K": [FX, 0, CX, 0, FY, CY, 0, 0, 1], "depth_scale": 0.1}),
 }
 DISTORTED = {
@@ -74,7 +77,8 @@ DISTORTED = {
 @pytest.mark.parametrize("name", [*PLAIN, *DISTORTED])
 def test_lenses_as_programs_write_them(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text((PLAIN | DISTORTED)[name])
-    lens, _ = read_lens(tmp_path / name, WIDTH, HEIGHT)
+    lens, notes = read_lens(tmp_path / name, WIDTH, HEIGHT)
+    assert not any("several lenses" in note for note in notes)
     fy = FX if name == "one focal length.txt" else FY
     np.testing.assert_allclose([lens.fx, lens.fy, lens.cx, lens.cy], [FX, fy, CX, CY], rtol=1e-6)
     wanted = [0.1, -0.2, 0.001, 0.002, 0.03] if name in DISTORTED else [0.0] * 5
@@ -89,6 +93,13 @@ def test_a_fisheye_lens_of_kalibr(tmp_path: Path) -> None:
     lens, _ = read_lens(tmp_path / "camchain.yaml", WIDTH, HEIGHT)
     assert lens.model == "kannala_brandt"
     np.testing.assert_allclose(lens.distortion[:4], [0.01, -0.02, 0.003, 0.004])
+
+
+def test_of_two_cameras_of_kalibr_the_first_is_read_and_that_is_noted(tmp_path: Path) -> None:
+    one = f"  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n  resolution: [160, 120]\n"
+    (tmp_path / "c.yaml").write_text(f"cam0:\n{one}cam1:\n{one.replace(str(FX), '525')}")
+    lens, notes = read_lens(tmp_path / "c.yaml", WIDTH, HEIGHT)
+    assert lens.fx == FX and any("the first is read" in note for note in notes)
 
 
 @pytest.mark.parametrize(

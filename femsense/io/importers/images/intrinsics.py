@@ -78,6 +78,8 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.
 WORD = re.compile(r"[A-Za-z_][\w./-]*")
 MODEL = re.compile(r"(?i)\b((?:distortion_|camera[_.])?(?:model|type))[\"']?\s*[:=]\s*[\"']?([A-Za-z][\w ]*)")
 COMMENT = re.compile(r"(?:#|//|%|^\s*;).*$|!!\S+|\bdt:\s*\w+")
+AGAIN = " again"
+"""Behind a name that stood before."""
 SHARE = 4.0
 """A focal length below this is a share of the image's size: of lenses with less than 14° no depth camera is known [1]."""
 CENTRED, SQUARE = 0.2, 0.15
@@ -184,9 +186,18 @@ def _in_json(text: str, path: Path) -> _Found | None:
         raise InputError(
             "not a lens", where=path, found=str(error), expected="JSON with width, height, intrinsic_matrix"
         ) from None
-    flat: dict[str, list[float]] = {}
-    _flatten("", data, flat)
-    return _of_names(flat)
+    depth = (
+        [value for key, value in data.items() if "depth" in key.lower() and isinstance(value, Mapping)]
+        if isinstance(data, dict)
+        else []
+    )
+    for part in [*depth, data]:  # of a colour and a depth camera the depth camera's
+        flat: dict[str, list[float]] = {}
+        _flatten("", part, flat)
+        found = _of_names(flat)
+        if found is not None:
+            return found
+    return None
 
 
 def _flatten(name: str, value: Any, into: dict[str, list[float]]) -> None:
@@ -260,6 +271,8 @@ def _in_text(text: str, width: int, height: int) -> _Found | None:
         lines = [re.sub(r"(?<=\d),(?=\d)", ".", line) for line in lines]
     named = _named_numbers(lines)
     found = _of_names(named) or _of_model(named, width, height) or _of_shape(lines) or _of_order(lines, width, height)
+    if found is not None and any(name.removesuffix(AGAIN) in (*KNOWN, *MATRICES) for name in named if name.endswith(AGAIN)):
+        found = replace(found, notes=(*found.notes, "several lenses stand there, and the first is read"))
     if found is not None or "fx" in named:
         return found
     bare = [" ".join(NUMBER.findall(line)) for line in lines]  # numbers among words that name nothing
@@ -279,18 +292,20 @@ def _of_model(named: Mapping[str, list[float]], width: int, height: int) -> _Fou
 def _named_numbers(lines: Sequence[str]) -> dict[str, list[float]]:
     """Return name → the numbers behind it, to the next name; of a line of names only, those of the line below in its order."""
     flat: dict[str, list[float]] = {}
+    rest = list(lines)
     for line, below in pairwise(lines):
         names, values = WORD.findall(line), NUMBER.findall(below)
         if names and not NUMBER.search(line) and len(names) == len(values) and not WORD.search(NUMBER.sub("", below)):
             flat |= {_last(name): [float(value)] for name, value in zip(names, values)}
+            rest = [other for other in rest if other not in (line, below)]
     name = owner = ""  # of a matrix as OpenCV and ROS write it, which has rows, cols and data below its name
-    for token in re.finditer(rf"{NUMBER.pattern}|{WORD.pattern}", "\n".join(lines)):
+    for token in re.finditer(rf"{NUMBER.pattern}|{WORD.pattern}", "\n".join(rest)):
         if NUMBER.fullmatch(token[0]):
             if name:
                 flat.setdefault(name, []).append(float(token[0]))
             continue
         word = _last(token[0])
-        owner = owner if word in ("rows", "cols", "data") else word
+        owner = owner if word in ("rows", "cols", "data") else word if word not in flat else f"{word}{AGAIN}"
         name = "" if word in ("rows", "cols") else owner
     return flat
 
