@@ -99,9 +99,10 @@ def number_in(cell: str) -> float | None:
     """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
     the seconds since midnight; None for all else."""
     try:
-        return float(FORTRAN.sub(r"\1e\2", cell))
+        return float(cell)
     except ValueError:
-        return moment_in(cell)
+        fortran = FORTRAN.match(cell)
+        return float(f"{fortran[1]}e{fortran[2]}") if fortran and fortran[1].strip(" +-.") else moment_in(cell)
 
 
 def moment_in(cell: str) -> float | None:
