@@ -30,6 +30,7 @@ def calibrate(
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
+    from femsense.app.input_checks import warn_of_pictures
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.calib.files import calibration_document, write_calibration
     from femsense.io.files import check_target
@@ -39,7 +40,9 @@ def calibrate(
     from femsense.report.text import calibration_text
 
     check_target(output, folder=False, kind=CALIBRATION)
-    calibration = calibrate_recording(load_robot(robot), load_recording(recording), correct=correct)
+    body, frames = load_robot(robot), load_recording(recording)
+    warn_of_pictures(body, frames)
+    calibration = calibrate_recording(body, frames, correct=correct)
     if not calibration.settled:
         text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"
         return Answer({"path": None, **calibration_document(calibration)}, text, exit_status=1)

@@ -16,12 +16,12 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
-from femsense.io.importers.input_samples import NEAR_S, Samples, samples_of
-from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
-from femsense.io.importers.pictures import depth_of_metres
-from femsense.io.importers.ros_bag import Bag, Message, open_bag
-from femsense.io.importers.ros_messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
-from femsense.io.importers.ros_plan import (
+from femsense.io.importers.images.intrinsics import lens_line
+from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
+from femsense.io.importers.images.pictures import depth_of_metres
+from femsense.io.importers.ros.bag import Bag, Message, open_bag
+from femsense.io.importers.ros.messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
+from femsense.io.importers.ros.plan import (
     LAG_S,
     Plan,
     chosen_streams,
@@ -32,8 +32,9 @@ from femsense.io.importers.ros_plan import (
     named_values,
     plan_of,
 )
-from femsense.io.importers.ros_topics import Stream, cameras_of, choose, robot_pose, streams_of
+from femsense.io.importers.ros.topics import Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
+from femsense.io.importers.tables.input_samples import NEAR_S, Samples, samples_of
 from femsense.pointcloud.cloud import PointCloud
 
 
@@ -79,7 +80,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
         "marker_topics": [s.topic.name for s in choice.markers] or None,
         "depth_unit_m": plan.unit if choice.lens else None,
-        "lens": None if choice.lens is None else f"{choice.lens.width} × {choice.lens.height}, {choice.lens.model}",
+        "lens": None if choice.lens is None else lens_line(choice.lens),
         "camera_frame": choice.primary.frame or None,
     }
     return Source(
@@ -106,6 +107,11 @@ def list_ros(path: Path) -> dict[str, Any]:
             if s.kind != "other"
         ]
         return {"topics": rows, "other_topics": sum(t.count > 0 for t in bag.topics) - len(rows)}
+
+
+def topics_of(path: Path) -> set[str]:
+    """Return the names of the topics that can be taken."""
+    return {row["topic"] for row in list_ros(path)["topics"]}
 
 
 @dataclass(eq=False, slots=True)
@@ -231,8 +237,8 @@ def _frame(
         picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
     now = {topic: one.at(time)[0] for topic, one in samples.items()}
-    pairs = ((c, v) for topic in plan.columns if topic in now for (c, _, _), v in zip(plan.columns[topic].values(), now[topic]))
-    inputs = {column: float(value) for column, value in pairs if np.isfinite(value)}
+    pairs = ((one, v) for topic in plan.columns if topic in now for one, v in zip(plan.columns[topic].values(), now[topic]))
+    inputs = {one.target.name: float(value) for one, value in pairs if np.isfinite(value)}
     loads = [(point, now[topic]) for topic, point in plan.load_points.items()]
     return Frame(time if device is None else device, picture, markers=named, unlabelled=unnamed, inputs=inputs, loads=loads)
 
@@ -311,4 +317,5 @@ def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:
         return np.array(place(decoded.wrench.force))
     columns = plan.columns[message.topic]
     given = named_values(decoded, message.type)
-    return np.array([factor * given.get((name, fld), np.nan) for name, (_, fld, factor) in columns.items()])
+    scaled = ((one.target, given.get((name, one.field), np.nan)) for name, one in columns.items())
+    return np.array([target.factor * value + target.offset for target, value in scaled])

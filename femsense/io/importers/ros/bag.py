@@ -15,7 +15,7 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import need
-from femsense.io.importers.ros_recovery import NotRos, RecoveredReader
+from femsense.io.importers.ros.recovery import NotRos, RecoveredReader
 
 ENDINGS = (".bag", ".db3", ".mcap")
 BEGINNINGS = ((b"#ROSBAG V2.0", ".bag"), (b"\x89MCAP0", ".mcap"), (b"SQLite format 3\0", ".db3"))

@@ -13,8 +13,9 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.frames import Lens, Options
-from femsense.io.importers.ros_bag import Bag, Topic
-from femsense.io.importers.ros_messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
+from femsense.io.importers.images.intrinsics import check_lens
+from femsense.io.importers.ros.bag import Bag, Topic
+from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -80,8 +81,13 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
     primary = depth or cloud or next(iter(of["markers"]), None) or next(iter(of["inputs"]), None)
     if primary is None:
         found = ", ".join(f"{s.topic.name} ({s.topic.type})" for s in streams[:12]) or "no messages"
+        lost = [s.topic.name for s in streams if s.kind in ("grey", "color") and "depth" in s.topic.name]
         raise InputError(
-            "nothing that can be taken", where=bag.path, found=found, expected="depth images, PointCloud2, markers or inputs"
+            "nothing that can be taken",
+            where=bag.path,
+            found=found,
+            expected="depth images, PointCloud2, markers or inputs",
+            hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
         )
     choice = Choice(primary, None, tuple(of["markers"]), tuple(of["inputs"]), tuple(of["loads"]), None, None, None, 0.001)
     if depth is None:
@@ -258,6 +264,7 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
     if frame and stream.frame and frame != stream.frame and not first.topic.startswith((f"{folder}/", "/device_")):
         return None  # another camera's
     lens = lens_of(info, f"{bag.path}, topic {first.topic}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
+    check_lens(lens, f"{bag.path}, topic {first.topic}")
     model = _sdk_model(bag, stream.topic.name)
     return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
 

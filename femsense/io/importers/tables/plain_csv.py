@@ -6,22 +6,27 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.csv_tables import LENGTHS, header_of, is_time, number_rows, split_unit, time_column, time_scale
+from femsense.core.text import plain_name
+from femsense.core.units import Quantity, Unit
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
-from femsense.io.importers.input_samples import Samples, samples_of
-from femsense.io.importers.mapping import (
+from femsense.io.importers.tables.clock import seconds_of
+from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_time, layout_of, number_rows, time_column
+from femsense.io.importers.tables.input_samples import Samples, samples_of
+from femsense.io.importers.tables.mapping import (
     Column,
     cable_kind,
     check_names,
     kind_of_target,
     mappable,
     mapped_inputs,
+    parse_target,
     resolved,
-    split_factor,
     unit_beside,
 )
 
@@ -72,7 +77,7 @@ def open_plain_csv(path: Path, options: Options) -> Source:
             expected="columns NAME_x, NAME_y, NAME_z, cable_… or chamber_…",
             hint="--map COLUMN=marker.x names a column, --map COLUMN=cable_north an input",
         )
-    clock = _clock(path, names, headed, options)
+    times, notes = _times(path, names, headed, options)
     chosen = [j for _, axes in triples for j in axes]
     declared = _declared_unit(names, chosen, path)
     scale = unit_of(options, declared, path, _extent(path, chosen)) if triples else 1.0
@@ -80,66 +85,98 @@ def open_plain_csv(path: Path, options: Options) -> Source:
 
     def frames() -> Iterator[Frame]:
         between: Samples | None = None
-        for number, row in enumerate(number_rows(path)):
-            time = number / (options.rate or 1.0) if clock is None else row[clock[0]] * clock[1]
+        for time, row in zip(times.tolist(), number_rows(path)):
             places = {name: scale * np.array([row[j] for j in axes]) for name, axes in triples}
             seen = {name: upright(p, options.up)[0] for name, p in places.items() if np.isfinite(p).all() and p.any()}
-            drive = {name: factor * row[j] for name, j, factor in inputs if np.isfinite(row[j])}
+            values = {column.name: float(column.values(row)) for column in inputs}
+            drive = {name: value for name, value in values.items() if np.isfinite(value)}
             if len(drive) < len(inputs):
-                between = between or _input_samples(path, inputs, clock or (None, 1.0 / (options.rate or 1.0)))
+                between = between or _input_samples(path, inputs, times)
                 filled = zip(inputs, between.at(time)[0].tolist())
-                drive = {name: value for (name, _, _), value in filled if np.isfinite(value)}
+                drive = {column.name: value for column, value in filled if np.isfinite(value)}
             yield Frame(time, markers=seen if label else {}, unlabelled=() if label else list(seen.values()), inputs=drive)
 
     found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
-    notes = [] if label else ["the markers have no names: the column marker stays empty, calibration assigns them"]
-    notes += ["--rate has no effect: the table says its times"] if options.rate is not None and clock is not None else []
+    notes += [] if label else ["the markers have no names: the column marker stays empty, calibration assigns them"]
+    notes += notation_notes(path) + unit_notes(inputs, names, options.columns)
     return Source(
         "csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes, names=mappable(names)
     )
 
 
-def _input_samples(path: Path, inputs: Sequence[Column], clock: tuple[int | None, float]) -> Samples:
-    """Return all inputs of a table; without a column of time its rows count."""
-    column, scale = clock
-    taken = [[k if column is None else row[column], *(row[j] for _, j, _ in inputs)] for k, row in enumerate(number_rows(path))]
-    rows = np.array(taken, dtype=np.float64)
-    return samples_of(rows[:, 0] * scale, rows[:, 1:] * [factor for _, _, factor in inputs])
+def list_plain_csv(path: Path) -> dict[str, Any]:
+    """Return the columns of a table. Raises InputError."""
+    names, headed = header_of(path)
+    return {"columns": names if headed else len(names)}
 
 
-def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tuple[int, float] | None:
-    """Return the column of time and its unit; None where a rate stands for it."""
-    mapped = mapped_time(names, options.columns, path)
-    if mapped is not None:
-        return mapped
-    if not headed:
-        return 1, 1.0
-    if options.rate is not None and not any(map(is_time, names)):
-        return None
-    if not any(map(is_time, names)):
+def notation_notes(path: Path) -> list[str]:
+    """Return what was assumed of how a table writes its numbers."""
+    notation = layout_of(path).notation
+    decimal = ["numbers are read with decimal commas"] if notation.commas else []
+    return decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
+
+
+def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
+    """Return what was assumed of the units of inputs: absolute pressures that were made gauge pressures, and units that nobody said."""
+    absolute = [
+        column.name for column in inputs if column.offset and not parse_target(columns.get(names[column.index], "")).scaled
+    ]
+    bare = [
+        column.name
+        for column in inputs
+        if column.factor == 1.0
+        and not column.offset
+        and column_unit(names[column.index])[1] is None
+        and not parse_target(columns.get(names[column.index], "")).scaled
+    ]
+    notes = [f"{', '.join(absolute)}: absolute pressures, 101325 Pa are subtracted"] if absolute else []
+    units = " and ".join(
+        dict.fromkeys("Pa" if name.startswith("chamber_") else "N, or m for --inputs displacement" for name in bare)
+    )
+    return notes + (
+        [f"no unit stands beside {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT says another"] if bare else []
+    )
+
+
+def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> Samples:
+    """Return all inputs of a table at the times [s] of its rows."""
+    taken = [[column.values(row) for column in inputs] for row in number_rows(path)]
+    return samples_of(times, np.array(taken, dtype=np.float64).reshape(len(times), -1))
+
+
+def _times(path: Path, names: list[str], headed: bool, options: Options) -> tuple[FloatArray, list[str]]:
+    """Return the time of each row [s], and what was assumed of it."""
+    clock = mapped_time(names, options.columns)
+    if clock is None and not headed:
+        clock = (1, None)
+    if clock is None and any(map(is_time, names)):
+        clock = time_column(names, path)
+    if clock is None and options.rate is None:
         raise InputError(
             "no column of time",
             where=path,
             found=", ".join(names[:12]),
             expected="a column time_s, --map COLUMN=time, or --rate HZ",
         )
-    return time_column(names, path)
+    if clock is None:
+        return np.arange(sum(1 for _ in number_rows(path))) / (options.rate or 1.0), []
+    times, notes = seconds_of(np.fromiter((row[clock[0]] for row in number_rows(path)), dtype=np.float64), clock[1])
+    return times, notes + (["--rate has no effect: the table says its times"] if options.rate is not None else [])
 
 
-def mapped_time(names: Sequence[str], columns: Mapping[str, str], path: Path) -> tuple[int, float] | None:
-    """Return the column that is mapped to the time and seconds in one unit of it; None where none is. Raises InputError."""
+def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
+    """Return the column that is mapped to the time, and its unit where one is said; None where none is mapped. Raises InputError."""
     for old, new in columns.items():
         if kind_of_target(new) == "time" and old in names:
-            column = list(names).index(old)
-            if "*" in new:
-                return column, split_factor(new)[1]
-            scale, unit = unit_beside(old, "time")
-            return column, scale if unit else time_scale(path, column)
+            target = parse_target(new)
+            said = Unit("", Quantity.TIME, target.factor) if target.scaled else unit_beside(old, "time")
+            return list(names).index(old), said
     return None
 
 
 def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) -> tuple[list[Column], str | None]:
-    """Return (name in the recording, column, factor) of the inputs, mapped or named cable_… and chamber_…, and what cables hold.
+    """Return the inputs, mapped or named cable_… and chamber_…, and what cables hold.
 
     A unit behind a name gives the factor, and says whether cables hold tensions or displacements.
 
@@ -150,11 +187,11 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
     for j, name in enumerate(names):
         if name in mapping or not name.startswith(("cable_", "chamber_")):
             continue
-        factor, unit = unit_beside(name, name, mapped=False)
-        bare = split_unit(name)[0] if unit else name
-        found.append((bare, j, factor))
+        unit = unit_beside(name, name, mapped=False)
+        bare = column_unit(name)[0] if unit else name
+        found.append(Column(bare, j, unit.size if unit else 1.0, unit.zero if unit else 0.0))
         kinds |= cable_kind(bare, unit)
-    taken = [name for name, _, _ in found]
+    taken = [column.name for column in found]
     if len(set(taken)) < len(taken):
         twice = next(name for name in taken if taken.count(name) > 1)
         raise InputError("two columns become the same", where=path, found=twice, expected="a name each")
@@ -162,7 +199,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
         raise InputError(
             "cables that hold tensions beside others that hold displacements",
             where=path,
-            found=", ".join(names[j] for name, j, _ in found if name.startswith("cable_")),
+            found=", ".join(names[column.index] for column in found if column.name.startswith("cable_")),
             expected="one of both in all columns",
         )
     return found, next(iter(kinds), None)
@@ -170,26 +207,45 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
     """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
-    units = {unit for unit in (split_unit(names[j])[1] for j in columns) if unit in LENGTHS}
-    if len(units) > 1:
-        raise InputError("places in several units", where=path, found=", ".join(sorted(units)), expected="one unit")
-    return units.pop() if units else None
+    units = [unit for unit in (_place_unit(names[j]) for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH]
+    said = sorted({unit.name for unit in units})
+    if len(said) > 1 or 0 < len(units) < len(columns):
+        raise InputError(
+            "places in several units",
+            where=path,
+            found=", ".join(said) + (" and none" if len(units) < len(columns) else ""),
+            expected="one unit",
+        )
+    return said[0] if said else None
+
+
+def _place_unit(name: str) -> Unit | None:
+    """Return the unit of a column of places, which stands behind its name or before the axis (tip_mm_x)."""
+    place, unit = _as_place(name), column_unit(name)[1]
+    return unit if unit is not None or place is None else place[2]
+
+
+def _as_place(full: str) -> tuple[str, str, Unit | None] | None:
+    """Return the marker, the axis and the unit of a column whose name has x, y or z at its end or beginning; None for any other."""
+    bare, unit = column_unit(full)
+    match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])", bare) or re.fullmatch(r"([xyzXYZ])[_ ]?(\w+)", bare)
+    if match is None:
+        return None
+    first, second = match[1], match[2]
+    stem, axis = (second, first) if len(first) == 1 and first in "xyzXYZ" and second not in "xyzXYZ" else (first, second)
+    inner, before = column_unit(stem)
+    if unit is None and before is not None and before.quantity is Quantity.LENGTH and before.name != "m":
+        stem, unit = inner, before
+    return stem, axis.lower(), unit
 
 
 def _named_triples(names: Sequence[str]) -> list[tuple[str, tuple[int, int, int]]]:
     """Return markers and their columns where x, y and z differ in one letter of their names."""
     groups: dict[str, dict[str, int]] = {}
     for j, full in enumerate(names):
-        bare, unit = split_unit(full)
-        if unit and unit not in LENGTHS:
-            continue
-        name = bare if unit else full
-        match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])", name) or re.fullmatch(r"([xyzXYZ])[_ ]?(\w+)", name)
-        if match is None:
-            continue
-        first, second = match[1], match[2]
-        stem, axis = (second, first) if len(first) == 1 and first in "xyzXYZ" and second not in "xyzXYZ" else (first, second)
-        groups.setdefault(stem, {}).setdefault(axis.lower(), j)
+        place = _as_place(full)
+        if place is not None and (place[2] is None or place[2].quantity is Quantity.LENGTH):
+            groups.setdefault(place[0], {}).setdefault(place[1], j)
     return [
         (stem, (axes["x"], axes["y"], axes["z"]))
         for stem, axes in groups.items()
@@ -200,7 +256,7 @@ def _named_triples(names: Sequence[str]) -> list[tuple[str, tuple[int, int, int]
 def _mapped_triples(names: Sequence[str], options: Options) -> list[tuple[str, tuple[int, int, int]]]:
     groups: dict[str, dict[str, int]] = {}
     for old, new in options.columns.items():
-        stem, dot, axis = new.rpartition(".")
+        stem, dot, axis = plain_name(new).rpartition(".")
         if dot and axis in ("x", "y", "z"):
             groups.setdefault(stem, {})[axis] = list(names).index(old)
     for stem, axes in groups.items():

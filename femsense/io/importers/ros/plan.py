@@ -10,12 +10,13 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import UNITS, Options
-from femsense.io.importers.mapping import INPUT, LOAD, MARKER, split_factor
-from femsense.io.importers.pictures import FINE_UNIT
-from femsense.io.importers.ros_bag import Bag, Message
-from femsense.io.importers.ros_messages import header_of, markers_of, stamp_of
-from femsense.io.importers.ros_topics import Choice, Stream, transform_between, transforms_of
+from femsense.io.importers.frames import Options, unit_of
+from femsense.io.importers.images.pictures import FINE_UNIT
+from femsense.io.importers.ros.bag import Bag, Message
+from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
+from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
+from femsense.io.importers.several import camera_names
+from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
 
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""
@@ -26,6 +27,16 @@ SCANNED = 5000
 """So many first messages of motors say which of their fields is used."""
 
 
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A value of a message that becomes an input."""
+
+    field: str
+    """"position", "effort", "velocity", or "" where the message has one field only."""
+    target: Target
+    """Its name is the column of frames.csv."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
     """How the messages of a bag become frames."""
@@ -34,8 +45,8 @@ class Plan:
     clock: str
     unit: float
     actuation: str | None
-    columns: dict[str, dict[str, tuple[str, str, float]]]
-    """Topic → name of a value → (column, field, factor)."""
+    columns: dict[str, dict[str, Taken]]
+    """Topic → name of a value → what it becomes."""
     load_points: dict[str, list[float]]
     T_camera_markers: dict[str, FloatArray]
     metadata: dict[str, str]
@@ -54,12 +65,12 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     """Return what is read from a bag, and how: streams, columns, clock."""
     notes = list(choice.notes)
     names = _mappable(bag, choice, options)
-    columns, fields = {}, set[str]()
-    for stream in choice.inputs:
-        columns[stream.topic.name], taken = _input_columns(bag, stream, options)
-        fields |= taken
-    notes += _notes_of_twice(columns)
-    actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields - {""}))
+    pressures = [s.topic.name for s in choice.inputs if _is_pressure(s)]
+    own = dict(zip(pressures, camera_names(pressures))) if len(pressures) > 1 else {}
+    columns = {s.topic.name: _input_columns(bag, s, options, own.get(s.topic.name, "")) for s in choice.inputs}
+    notes += _notes_of_twice(columns) + _notes_of_units(columns)
+    fields = {one.field for values in columns.values() for one in values.values()} - {""}
+    actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields))
     points = {}
     for stream in choice.loads:
         target = options.columns.get(stream.topic.name, "")
@@ -75,7 +86,7 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
     renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
     unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else options.depth_unit or choice.depth_unit_m
-    scale = None if options.unit is None else UNITS[options.unit]
+    scale = None if options.unit is None else unit_of(options, None, bag.path, 0.0)
     return Plan(
         choice,
         clock,
@@ -93,12 +104,12 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     )
 
 
-def _notes_of_twice(columns: dict[str, dict[str, tuple[str, str, float]]]) -> list[str]:
+def _notes_of_twice(columns: dict[str, dict[str, Taken]]) -> list[str]:
     """Return a note for each input that several topics hold."""
     topics: dict[str, list[str]] = {}
     for topic, values in columns.items():
-        for column, _, _ in values.values():
-            topics.setdefault(column, []).append(topic)
+        for one in values.values():
+            topics.setdefault(one.target.name, []).append(topic)
     return [
         f"{column} stands in {' and '.join(held)}: that of {held[-1]} is taken; --map {held[0]}.NAME={column} takes another's"
         for column, held in topics.items()
@@ -106,12 +117,36 @@ def _notes_of_twice(columns: dict[str, dict[str, tuple[str, str, float]]]) -> li
     ]
 
 
+FIELDS = {
+    "effort": "effort, which is N or N m by its message, is taken as newtons",
+    "position": "position, which is m or rad by its message, is taken as metres",
+    "velocity": "velocity is taken as it is",
+    "": "values without a unit are taken as they are, in newtons or metres",
+}
+PRESSURES = "pressures are taken as pascals above the surroundings; FluidPressure is absolute by its definition"
+
+
+def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
+    """Return what is assumed of inputs whose unit nobody said."""
+    notes = []
+    for topic, values in columns.items():
+        for field in FIELDS:
+            names = [one.target.name for one in values.values() if one.field == field and not one.target.scaled]
+            if names and names[0].startswith("chamber_"):
+                notes.append(f"{topic} → {', '.join(names)}: {PRESSURES}: --map NAME={names[0]}*Pa_abs makes them relative")
+            elif names:
+                begin = f"{topic} → {', '.join(names)}: {FIELDS[field]}"
+                notes.append(f"{begin}; motors count ticks, radians or milliampere: --map NAME={names[0]}*FACTOR")
+    return notes
+
+
 def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
     """Return the names that `--map` may take; those of markers are sought in the messages where one is not known otherwise."""
     names = {stream.topic.name: LOAD for stream in choice.loads} | {stream.topic.name: MARKER for stream in choice.markers}
     for stream in choice.inputs if options.columns else ():
         for name, fld in _largest_values(bag, stream):
-            names |= dict.fromkeys((name, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
+            whole = (stream.topic.name,) if _is_pressure(stream) else ()
+            names |= dict.fromkeys((name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
     for stream in choice.markers:
         for message in bag.messages([stream.topic.name]):
             if set(options.columns) <= set(names):
@@ -122,33 +157,43 @@ def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
     return names
 
 
-def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str, tuple[str, str, float]], set[str]]:
-    """Return name in the message → (column, field, factor), and the fields that are used."""
+def _is_pressure(stream: Stream) -> bool:
+    """Whether a topic holds one pressure, which its own name names."""
+    return stream.topic.type.endswith("FluidPressure")
+
+
+def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict[str, Taken]:
+    """Return name in the message → what it becomes; `own` is the name of a pressure where several topics hold one."""
     topic = stream.topic.name
     given = _largest_values(bag, stream)
     names = list(dict.fromkeys(name for name, _ in given))
-    columns: dict[str, tuple[str, str, float]] = {}
+    columns: dict[str, Taken] = {}
     for name in names:
         available = [fld for n, fld in given if n == name]
         usual = next(
             (fld for fld in ("effort", "position", "") if fld in available and (fld != "effort" or given[name, fld] != 0.0)),
             available[0],
         )
-        for key in (f"{name}.{usual}", name, f"{topic}.{name}", *(f"{name}.{fld}" for fld in available)):
+        for key in (
+            *([topic] if _is_pressure(stream) else []),
+            f"{name}.{usual}",
+            name,
+            f"{topic}.{name}",
+            *(f"{name}.{fld}" for fld in available),
+        ):
             if key in options.columns:
-                column, factor = split_factor(options.columns[key])
                 fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
-                columns[name] = (column, fld, factor)
+                columns[name] = Taken(fld, parse_target(options.columns[key]))
     if not columns and not any(key in options.columns for key in names):
-        targets = {split_factor(new)[0] for new in options.columns.values() if not new.startswith("load@")}
-        prefix = "chamber_" if stream.topic.type.endswith("FluidPressure") else "cable_"
+        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) == INPUT}
+        prefix = "chamber_" if _is_pressure(stream) else "cable_"
         for name in names:
             usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
             fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
-            column = name if name.startswith(("cable_", "chamber_")) else prefix + name
+            column = name if name.startswith(("cable_", "chamber_")) else prefix + (own or name)
             if column not in targets:  # --map takes another topic's for it
-                columns[name] = (column, fld, 1.0)
-    return columns, {fld for _, fld, _ in columns.values()}
+                columns[name] = Taken(fld, Target(column))
+    return columns
 
 
 def _largest_values(bag: Bag, stream: Stream) -> dict[tuple[str, str], float]:

@@ -1,31 +1,54 @@
-"""Exports of OptiTrack Motive and Vicon Nexus as CSV: several lines of header, then positions; empty cells are gaps."""
+"""Exports of motion capture as text (OptiTrack Motive, Vicon Nexus, TRC, Qualisys TSV): a header, then positions; empty cells are gaps."""
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.io.importers.csv_tables import is_cut_off, rows_of
+from femsense.core.text import plain_name
 from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
-from femsense.io.importers.mapping import MARKER
+from femsense.io.importers.tables.csv_tables import is_cut_off, rows_of
+from femsense.io.importers.tables.mapping import MARKER
 
-HEAD = 12
+HEAD = 20
 """The headers are in the first lines."""
+
+
+class Program(StrEnum):
+    """Who writes an export; the names of its formats."""
+
+    OPTITRACK = "optitrack"
+    VICON = "vicon"
+    TRC = "trc"
+    QUALISYS = "qualisys"
+
+
+BEGINS = {
+    "Format Version": Program.OPTITRACK,
+    "Trajectories": Program.VICON,
+    "Model Outputs": Program.VICON,
+    "Devices": Program.VICON,
+    "PathFileType": Program.TRC,
+    "NO_OF_FRAMES": Program.QUALISYS,
+}
+"""First cell of an export → its program."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Export:
     """What the header of an export says."""
 
-    program: str
-    """ "optitrack" or "vicon"."""
+    program: Program
     markers: tuple[tuple[str, tuple[int, int, int]], ...]
     """Name ("" where the program could not tell which it is) and the columns of x, y, z."""
     unit: str | None
@@ -35,14 +58,29 @@ class Export:
     """[1/s]."""
     first: int
     """Row at which the data begin, from 0."""
+    frames: int | None = None
+    """Frames that the header announces."""
+    count: int | None = None
+    """Markers that the header announces."""
 
 
-def is_mocap_csv(path: Path) -> bool:
-    """Whether a CSV file begins as an export of Motive or Nexus."""
+def program_of(path: Path) -> Program | None:
+    """Return the program that wrote an export of motion capture, by its first lines; None for any other table."""
     head = list(islice(rows_of(path), HEAD))
     first = head[0][0].strip() if head and head[0] else ""
     sections = len(head) > 3 and [cell.strip() for cell in head[3][:2]] == ["Frame", "Sub Frame"]
-    return sections or first in ("Format Version", "Trajectories", "Model Outputs", "Devices")
+    return Program.VICON if sections else BEGINS.get(first)
+
+
+def list_mocap_csv(path: Path) -> dict[str, Any]:
+    """Return what the header of an export says. Raises InputError."""
+    export = read_export(path)
+    return {
+        "markers": [name or "(unnamed)" for name, _ in export.markers],
+        "unit": export.unit,
+        "rate_hz": export.rate,
+        "frames_announced": export.frames,
+    }
 
 
 def open_mocap_csv(path: Path, options: Options) -> Source:
@@ -65,22 +103,27 @@ def open_mocap_csv(path: Path, options: Options) -> Source:
         raise InputError("no times", where=path, found="frame numbers without a rate", expected="--rate HZ")
     nameless = sum(not name for name, _ in chosen)
     return Source(
-        export.program,
+        export.program.value,
         path,
         partial(_frames, path, export, renamed, scale, rate or 1.0, options.up),
         found={"unit": options.unit or export.unit, "up": options.up or "as in the file"},
-        notes=_notes(nameless, len(chosen) - nameless, export, options),
+        count=export.frames,
+        notes=_notes(nameless, len(chosen) - nameless, export, options, _step(path, export)),
         names={name: MARKER for name, _ in export.markers if name},
     )
 
 
-def _notes(nameless: int, named: int, export: Export, options: Options) -> list[str]:
-    """Return what a person should know: tracks without a name, a rate that was said in vain."""
+def _notes(nameless: int, named: int, export: Export, options: Options, step: float | None) -> list[str]:
+    """Return what a person should know: tracks without a name, where header and rows disagree, a rate that was said in vain."""
     notes = []
     if nameless and named:
         notes.append(f"{nameless} tracks have no name: they are left out of frames that show named markers")
     elif nameless:
         notes.append(f"{nameless} tracks have no name: the column marker stays empty, calibration assigns them")
+    if export.count is not None and export.count != len(export.markers):
+        notes.append(f"the header announces {export.count} markers, {len(export.markers)} stand there")
+    if export.rate and step and abs(step * export.rate - 1.0) > 0.05:
+        notes.append(f"the header says {export.rate:g} frames a second, the times {1.0 / step:.4g}: the times count")
     if options.rate is not None and (export.time is not None or export.rate is not None):
         notes.append("--rate has no effect: the file says its times")
     return notes
@@ -89,9 +132,9 @@ def _notes(nameless: int, named: int, export: Export, options: Options) -> list[
 def read_export(path: Path) -> Export:
     """Return what the header of an export says. Raises InputError."""
     head = list(islice(rows_of(path), HEAD))
-    if head and head[0] and head[0][0].strip() == "Format Version":
-        return _optitrack(head, path)
-    return _vicon(path)
+    readers = {Program.OPTITRACK: _optitrack, Program.TRC: _trc, Program.QUALISYS: _qualisys}
+    reader = readers.get(program_of(path) or Program.VICON)
+    return _vicon(path) if reader is None else reader(head, path)
 
 
 def _frames(
@@ -101,7 +144,7 @@ def _frames(
     last = max(j for _, axes in export.markers for j in axes)
     for row in islice(rows_of(path), export.first, None):
         if not any(cell.strip() for cell in row):
-            if export.program == "vicon" and start is not None:
+            if export.program is Program.VICON and start is not None:
                 return  # the next section begins
             continue
         if len(row) <= last and is_cut_off(path):
@@ -140,7 +183,58 @@ def _optitrack(head: list[list[str]], path: Path) -> Export:
         markers.setdefault(("" if unnamed else _at(names, j), group), {})[axes[j].strip().lower()] = j
     found = tuple((name, (a["x"], a["y"], a["z"])) for (name, _), a in markers.items() if set(a) == set("xyz"))
     rate = pairs.get("Export Frame Rate") or pairs.get("Capture Frame Rate")
-    return Export("optitrack", _distinct(found, kinds), pairs.get("Length Units"), 1, _rate(rate or ""), axes_row + 1)
+    announced = _whole(pairs.get("Total Exported Frames") or pairs.get("Total Frames in Take") or "")
+    unit = pairs.get("Length Units")
+    return Export(Program.OPTITRACK, _distinct(found, kinds), unit, 1, _rate(rate or ""), axes_row + 1, announced)
+
+
+def _trc(head: list[list[str]], path: Path) -> Export:
+    """Read the header of a TRC file (Motion Analysis, OpenSim): keys and values in lines 2 and 3, names in line 4, axes in line 5."""
+    if len(head) < 5:
+        raise InputError(
+            "a TRC file without its header", where=path, found=f"{len(head)} lines", expected="five lines, then frames"
+        )
+    said = dict(zip((cell.strip() for cell in head[1]), (cell.strip() for cell in head[2])))
+    names = [(j, plain_name(cell)) for j, cell in enumerate(head[3]) if j > 1 and cell.strip()]
+    found = tuple((name, (j, j + 1, j + 2)) for j, name in names)
+    rate, frames, count = _rate(said.get("DataRate", "")), _whole(said.get("NumFrames", "")), _whole(said.get("NumMarkers", ""))
+    first = next((i for i, row in enumerate(head) if i > 3 and row and _is_number(row[0])), 5)
+    return Export(Program.TRC, found, said.get("Units"), 1, rate, first, frames, count)
+
+
+def _qualisys(head: list[list[str]], path: Path) -> Export:
+    """Read the header of a TSV file of Qualisys Track Manager: a key and its values a line, then perhaps names of columns; millimetres."""
+    said = {
+        row[0].strip(): [cell.strip() for cell in row[1:]] for row in head if row and re.fullmatch(r"[A-Z_0-9]+", row[0].strip())
+    }
+    kind = " ".join(said.get("DATA_INCLUDED", ["3D"]))
+    if kind != "3D" or "MARKER_NAMES" not in said:
+        raise InputError(
+            "an export of Qualisys without places of markers",
+            where=path,
+            found=f"DATA_INCLUDED {kind}",
+            expected="DATA_INCLUDED 3D with MARKER_NAMES",
+            hint="export the 3D data as TSV, with the header",
+        )
+    names = [plain_name(name) for name in said["MARKER_NAMES"] if name]
+    first = next((i for i, row in enumerate(head) if row and _is_number(row[0])), len(head))
+    titles = [cell.strip().lower() for cell in head[first - 1]]
+    shift = len([title for title in titles if title in ("frame", "time")]) if titles[:1] == ["frame"] else 0
+    time = titles.index("time") if shift and "time" in titles else None
+    found = tuple((name, (shift + 3 * k, shift + 3 * k + 1, shift + 3 * k + 2)) for k, name in enumerate(names))
+    value = {key: _whole(row[0]) if row else None for key, row in said.items()}
+    rate = _rate(said.get("FREQUENCY", [""])[0])
+    return Export(Program.QUALISYS, found, "mm", time, rate, first, value.get("NO_OF_FRAMES"), value.get("NO_OF_MARKERS"))
+
+
+def _is_number(cell: str) -> bool:
+    return bool(np.isfinite(_cell([cell], 0)))
+
+
+def _whole(cell: str) -> int | None:
+    """Return a count that a header says; None where it says none."""
+    value = _cell([cell], 0)
+    return int(value) if np.isfinite(value) and value >= 0 else None
 
 
 def _vicon(path: Path) -> Export:
@@ -163,7 +257,7 @@ def _vicon(path: Path) -> Export:
         nameless = name.startswith("*") or not name
         found.append(("" if nameless else label if bare.count(name) > 1 else name, columns))
     unit = next((cell.strip() for cell in units if cell.strip()), None)
-    return Export("vicon", tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
+    return Export(Program.VICON, tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
 
 
 def _distinct(
@@ -183,6 +277,15 @@ def _extent(path: Path, export: Export) -> float:
     values = np.array([_cell(row, j) for row in rows for _, axes in export.markers for j in axes])
     finite = values[np.isfinite(values)]
     return float(np.ptp(finite)) if finite.size else 0.0
+
+
+def _step(path: Path, export: Export) -> float | None:
+    """Return the median step of the times of the first rows [s]; None where there are no times."""
+    if export.time is None:
+        return None
+    times = np.array([_cell(row, export.time) for row in islice(rows_of(path), export.first, export.first + 50)])
+    steps = np.diff(times[np.isfinite(times)])
+    return float(np.median(steps)) if len(steps) else None
 
 
 def _rate(cell: str) -> float | None:

@@ -20,8 +20,9 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Lens, Options, Source, need
-from femsense.io.importers.lens import pixel_rays, registered_color
-from femsense.io.importers.pictures import decoded_image
+from femsense.io.importers.images.intrinsics import lens_line
+from femsense.io.importers.images.lens import pixel_rays, registered_color
+from femsense.io.importers.images.pictures import decoded_image
 
 DEPTH_MODES = {
     (320, 288): ((512, 512), (96, 90)),
@@ -61,7 +62,7 @@ def open_kinect(path: Path, options: Options) -> Source:
     tracks = _tracks(path)
     lens = tracks.lens
     found = {
-        "lens": f"{lens.width} × {lens.height}, {lens.model}",
+        "lens": lens_line(lens),
         "depth_unit_m": 0.001,
         "colour": None if tracks.color_lens is None else f"{tracks.color_lens.width} × {tracks.color_lens.height}",
         "serial_number": tracks.serial,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud
+from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud, viewpoint_doubt
 from femsense.io.clouds.images import png_header, read_png
-from femsense.io.importers.array_clouds import read_array_cloud
-from femsense.io.importers.frames import FARTHEST, Frame, Images, Lens, Options, Source, unit_of
-from femsense.io.importers.pictures import decoded_image
+from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Options, Source, unit_of
+from femsense.io.importers.images.array_clouds import read_array_cloud
+from femsense.io.importers.images.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
+from femsense.io.importers.images.pictures import decoded_image
+from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
 
 CLOUDS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
@@ -25,10 +28,8 @@ TUM_UNIT = 1 / 5000
 REDWOOD_UNIT = 1 / 1000
 WIDEST = 20.0
 """Scenes of cameras are not wider [m]."""
-TUM_LENS = (525.0, 525.0, 319.5, 239.5)
-"""The lens that the TUM benchmark gives for all its sequences, 640 × 480."""
-LENSES = ("camera_intrinsic.json", "intrinsic.json", "camera.json")
-"""Files of a lens as Open3D writes them."""
+DEFAULT_LENS = Lens(640, 480, 525.0, 525.0, 319.5, 239.5)
+"""The lens that the TUM benchmark gives for all its sequences, and Redwood for its own."""
 PAIRS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Lists of pairs as `associate.py` of TUM RGB-D prints them: time file time file, depth first or second."""
 NEAR_S = 0.02
@@ -53,13 +54,13 @@ def open_tum(folder: Path, options: Options) -> Source:
     header = png_header(folder / depth[0][1]) if (folder / depth[0][1]).is_file() else None
     if header is None:
         raise InputError("the first depth image is missing or none", where=folder / depth[0][1], expected="a PNG of 16 bits")
-    lens, said = _folder_lens(folder, header[0], header[1])
-    unit = options.depth_unit or _depth_unit(folder) or TUM_UNIT
-    notes = [f"the lens is {said}"] if said else []
+    lens, notes = _folder_lens(folder, header[0], header[1])
+    unit, said = _unit_of_depth(folder, options, TUM_UNIT)
+    _warn_of_distance(folder / depth[0][1], unit, said, "TUM")
     pairs = _associated(depth, color)
     lost = sum(c is None for _, _, c in pairs) if color else 0
-    found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": said}
-    frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs])
+    found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": lens_line(lens)}
+    frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs], lens)
     return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=unit, count=len(pairs), notes=notes)
 
 
@@ -71,8 +72,9 @@ def open_redwood(folder: Path, options: Options) -> Source:
     header = png_header(depth[0])
     if header is None or header[2:] != (16, 0):
         raise InputError("not a depth image", where=depth[0], found=header and f"{header[2]} bits", expected="a PNG of 16 bits")
-    lens, said = _folder_lens(folder, header[0], header[1])
-    unit = options.depth_unit or _depth_unit(folder) or REDWOOD_UNIT
+    lens, notes = _folder_lens(folder, header[0], header[1])
+    unit, said = _unit_of_depth(folder, options, REDWOOD_UNIT)
+    _warn_of_distance(depth[0], unit, said, "Redwood")
     times = _file_times(depth)
     if times is None and options.rate is None:
         raise InputError(
@@ -83,14 +85,13 @@ def open_redwood(folder: Path, options: Options) -> Source:
     items = [(clock[i], file, color_of.get(file)) for i, file in enumerate(depth)]
     found = {
         "depth_unit_m": unit,
-        "lens": said,
+        "lens": lens_line(lens),
         "times": "in the names of the files" if times is not None else f"{options.rate:g} a second",
     }
-    notes = [f"the lens is {said}"] if said else []
     return Source(
         "redwood",
         folder,
-        partial(_image_frames, items),
+        partial(_image_frames, items, lens),
         found=_given(found),
         lens=lens,
         depth_unit_m=unit,
@@ -105,6 +106,9 @@ def open_clouds(folder: Path, options: Options) -> Source:
     if not files:
         raise InputError("no clouds", where=folder, expected=", ".join(CLOUDS))
     times = _cloud_times(folder, files, options)
+    doubt = viewpoint_doubt(files[0])
+    if doubt is not None:
+        warnings.warn(doubt, stacklevel=3)
     scale = unit_of(options, _declared_unit(files[0]), files[0], _extent(files[0]))
     frames = [Frame(t, picture=partial(_scaled_cloud, file, scale)) for t, file in zip(times, files)]
     endings = sorted({file.suffix.lower() for file in files})
@@ -122,18 +126,19 @@ def read_points(file: Path) -> PointCloud:
 # Images
 
 
-def _image_frames(items: Sequence[tuple[float, Path, Path | None]]) -> Iterator[Frame]:
+def _image_frames(items: Sequence[tuple[float, Path, Path | None]], lens: Lens) -> Iterator[Frame]:
     for time, depth, color in items:
-        yield Frame(time, picture=partial(_images, depth, color))
+        yield Frame(time, picture=partial(_images, depth, color, lens))
 
 
-def _images(depth: Path, color: Path | None) -> Images:
-    if not depth.is_file():
-        raise InputError("a depth image is missing", where=depth, found="no such file")
-    image = read_png(depth)
-    if image.ndim != 2 or image.dtype != np.uint16:
+def _images(depth: Path, color: Path | None, lens: Lens) -> Images:
+    image = _depth_image(depth)
+    if image.shape != (lens.height, lens.width):
         raise InputError(
-            "not a depth image", where=depth, found=f"{image.dtype}, shape {image.shape}", expected="one channel of 16 bits"
+            "a depth image of another size than the first",
+            where=depth,
+            found=f"{image.shape[1]} × {image.shape[0]}",
+            expected=f"{lens.width} × {lens.height}, which the lens is for",
         )
     if color is None or not color.is_file():
         return Images(image)
@@ -147,6 +152,21 @@ def _images(depth: Path, color: Path | None) -> Images:
             hint="register it to the depth image",
         )
     return Images(image, pixels)
+
+
+def _depth_image(file: Path) -> DepthImage:
+    if not file.is_file():
+        raise InputError("a depth image is missing", where=file, found="no such file")
+    image = read_png(file)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(
+            "not a depth image",
+            where=file,
+            found=f"{image.dtype}, shape {image.shape}",
+            expected="one channel of 16 bits",
+            hint="depth that was packed as 8 bits is lost" if image.dtype == np.uint8 else None,
+        )
+    return np.asarray(image)
 
 
 def _lists(folder: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
@@ -187,21 +207,14 @@ def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) 
     return result
 
 
-def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, str]:
-    """Return the lens of a folder and where it is from."""
-    files = [folder / n for n in LENSES if (folder / n).is_file()]
-    if files:
-        return _json_lens(files[0], width, height), files[0].name
-    texts = [folder / n for n in ("calibration.txt", "camera.txt", "intrinsics.txt") if (folder / n).is_file()]
-    if texts:
-        values = [float(v) for v in re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", texts[0].read_text())]
-        if len(values) >= 9 and values[1] == 0.0:
-            values = [values[0], values[4], values[2], values[5]]
-        if len(values) >= 4:
-            fx, fy, cx, cy = values[:4]
-            return Lens(width, height, fx, fy, cx, cy, np.array((values[4:9] + [0.0] * 5)[:5])), texts[0].name
-    if (width, height) == (640, 480):
-        return Lens(640, 480, *TUM_LENS), "the default of TUM and Redwood for 640 × 480 (525, 525, 319.5, 239.5)"
+def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, list[str]]:
+    """Return the lens of a folder's images, and where it is from. Raises InputError."""
+    file = next((folder / name for name in FILES if (folder / name).is_file()), None)
+    if file is not None:
+        lens, notes = read_lens(file, width, height)
+        return lens, [f"the lens is from {file.name}: {lens_text(lens)}", *(f"{file.name}: {note}" for note in notes)]
+    if (width, height) == (DEFAULT_LENS.width, DEFAULT_LENS.height):
+        return DEFAULT_LENS, [f"the lens is the default of TUM and Redwood for 640 × 480: {lens_text(DEFAULT_LENS)}"]
     raise InputError(
         "no lens",
         where=folder,
@@ -210,31 +223,42 @@ def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, str]:
     )
 
 
-def _depth_unit(folder: Path) -> float | None:
-    """Return metres in one unit of the depth images, where the lens's file has Open3D's `depth_scale` (units in a metre)."""
-    for name in LENSES:
-        if (folder / name).is_file():
-            try:
-                scale = json.loads((folder / name).read_text(encoding="utf-8-sig")).get("depth_scale")
-                return None if not scale else 1.0 / float(scale)
-            except (ValueError, TypeError, AttributeError) as error:
-                raise InputError("not a lens", where=folder / name, found=str(error), expected="depth_scale: a number") from None
-    return None
+def _unit_of_depth(folder: Path, options: Options, usual: float) -> tuple[float, bool]:
+    """Return metres in one unit of the depth images, and whether a person or a file says it.
 
-
-def _json_lens(path: Path, width: int, height: int) -> Lens:
+    `depth_scale` counts units in a metre as Open3D writes it, or millimetres in one unit (BOP), which is at most 1.
+    """
+    if options.depth_unit is not None:
+        return options.depth_unit, True
+    file = next((folder / name for name in JSON_NAMES if (folder / name).is_file()), None)
+    if file is None:
+        return usual, False
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8-sig"))
-        given = np.asarray(data["intrinsic_matrix"], dtype=float).reshape(3, 3)
-        K = given.T if given[0, 2] == 0.0 else given  # Open3D writes it by columns
-        size = int(data.get("width", width)), int(data.get("height", height))
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "not a lens", where=path, found=str(error), expected="width, height, intrinsic_matrix as Open3D writes them"
-        ) from None
-    if size != (width, height):
-        raise InputError("the lens is of another size than the images", where=path, found=size, expected=(width, height))
-    return Lens(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        scale = json.loads(file.read_text(encoding="utf-8-sig")).get("depth_scale")
+        value = float(scale) if scale else 0.0
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InputError("not a lens", where=file, found=str(error), expected="depth_scale: a number") from None
+    if not value:
+        return usual, False
+    return (1.0 / value if value > 1.0 else 1e-3 * value), True
+
+
+def _warn_of_distance(file: Path, unit: float, said: bool, layout: str) -> None:
+    """Warn where the first depth image shows a scene that is too near or too far for its unit."""
+    image = _depth_image(file)
+    if not image.any():
+        return
+    away, low = unit * float(np.median(image[image > 0])), RANGES.scene_m[0] if said else RANGES.assumed_scene_m
+    if low <= away <= FARTHEST:
+        return
+    others = {"millimetres": 1e-3, "0.2 mm": TUM_UNIT, "0.1 mm": 1e-4, "1/256 m": 1 / 256}
+    fits = [
+        f"in {n} it is {s * away / unit:.3g} m (--depth-unit {s:.6g})" for n, s in others.items() if 0.2 < s * away / unit < 5.0
+    ]
+    begin = f"the scene is {away:.3g} m away where one unit of depth is {1e3 * unit:.3g} mm"
+    from_layout = "" if said else f", as {layout} has it"
+    text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M says another'}"
+    warnings.warn(text, stacklevel=3)
 
 
 def _color_of(depth: list[Path], images: list[Path]) -> dict[Path, Path]:

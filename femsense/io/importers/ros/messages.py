@@ -13,7 +13,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Lens
-from femsense.io.importers.pictures import decoded_image
+from femsense.io.importers.images.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
 
 Pixels = npt.NDArray[Any]
@@ -100,6 +100,14 @@ def compressed_image(message: Any, where: str | Path | None) -> tuple[Pixels, st
     if "compressedDepth" in message.format:
         return _compressed_depth(data, message.format, where)
     image = decoded_image(data, where)
+    if message.format.partition(";")[0].strip() in DEPTH and image.dtype != np.uint16:
+        raise InputError(
+            "depth that was packed as 8 bits: it is lost",
+            where=where,
+            found=f"{message.format.strip()}, which unpacks to {image.dtype}",
+            expected="one channel of 16 bits",
+            hint="record the uncompressed topic, or compressedDepth",
+        )
     if image.dtype == np.uint16:
         return image, "16UC1"
     return image, "mono8" if image.ndim == 2 else "rgb8"

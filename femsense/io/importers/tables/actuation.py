@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,13 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.csv_tables import read_numbers, split_unit, time_column
 from femsense.io.importers.frames import Options
-from femsense.io.importers.input_samples import samples_of
 from femsense.io.importers.journal import Journal
-from femsense.io.importers.mapping import check_targets, resolved
-from femsense.io.importers.plain_csv import input_columns, mapped_time
+from femsense.io.importers.tables.clock import seconds_of
+from femsense.io.importers.tables.csv_tables import column_unit, read_numbers, time_column
+from femsense.io.importers.tables.input_samples import samples_of
+from femsense.io.importers.tables.mapping import check_targets, resolved
+from femsense.io.importers.tables.plain_csv import input_columns, mapped_time, notation_notes, unit_notes
 
 SURE = 0.6
 """A correlation below this does not tell the offset."""
@@ -28,6 +29,8 @@ SMOOTH_S = 0.1
 noise of a tenth of the motion leaves 0.84 of correlation, not 0.41."""
 FLAT = 1e-9
 """A signal whose variance over the overlap is below this share of its energy is constant (rounding of the transform)."""
+QUARTER_S, FARTHEST_ZONE_S, ZONE_SLACK_S = 900.0, 14 * 3600.0, 120.0
+"""Zones of time differ by whole quarters of an hour, up to fourteen hours; programs are started within two minutes of each other [s]."""
 GRID = 4000
 """Samples of the common clock on which motion and inputs are compared, at most."""
 
@@ -44,6 +47,8 @@ class ActuationLog:
     values: FloatArray
     """[N], [m] or [Pa], NaN where a cell is empty, shape (n, columns)."""
     actuation: str | None = None
+    notes: tuple[str, ...] = ()
+    """What was assumed."""
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
         """Return each column at these times of the log's clock [s], NaN where it is not known; see `Samples.at`."""
@@ -64,24 +69,35 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
     names, table = read_numbers(file)
     check_targets(options.columns)
     columns = resolved(options.columns, names)
-    clock, scale = mapped_time(names, columns, file) or time_column(names, file)
-    time_s = table[:, clock] * scale
+    clock, unit = mapped_time(names, columns) or time_column(names, file)
+    time_s, notes = seconds_of(table[:, clock], unit)
     direct, actuation = input_columns(names, columns, file)
-    mapped = [column for column in direct if names[column[1]] in columns]
+    mapped = [column for column in direct if names[column.index] in columns]
     chosen = mapped or direct
     if not chosen:
-        others = {n: f"cable_{split_unit(n)[0]}" for j, n in enumerate(names) if j != clock and n.lower() not in ("frame", "id")}
+        others = {n: f"cable_{column_unit(n)[0]}" for j, n in enumerate(names) if j != clock and n.lower() not in ("frame", "id")}
         chosen, actuation = input_columns(names, others, file)
     if not chosen:
         raise InputError(
             "no inputs", where=file, found=", ".join(names), expected="columns cable_… or chamber_…, or --map NAME=cable_x"
         )
-    kept = np.isfinite(time_s) & np.isfinite(table[:, [j for _, j, _ in chosen]]).any(axis=1)
+    kept = np.isfinite(time_s) & np.isfinite(table[:, [column.index for column in chosen]]).any(axis=1)
     time_s = time_s[kept]
-    if len(time_s) < 2 or (np.diff(time_s) <= 0).any():
-        raise InputError("time does not increase", where=file, found=f"{len(time_s)} rows", expected="rows in order of time")
-    values = np.stack([factor * table[kept, j] for _, j, factor in chosen], axis=1)
-    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values, actuation)
+    back = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(time_s) < 2 or len(back):
+        row = int(np.flatnonzero(kept)[back[0] + 1]) + 1 if len(back) else 0
+        raise InputError(
+            "time does not increase",
+            where=file,
+            found=f"{time_s[back[0] + 1]:.6g} s after {time_s[back[0]]:.6g} s in row {row}"
+            if len(back)
+            else f"{len(time_s)} rows",
+            expected="rows in order of time",
+            hint="stamps that stand still were rounded: log more digits" if len(back) > 1 else None,
+        )
+    values = np.stack([column.values(table[kept]) for column in chosen], axis=1)
+    notes += notation_notes(file) + unit_notes(chosen, names, columns)
+    return ActuationLog(file, time_s, tuple(column.name for column in chosen), values, actuation, tuple(notes))
 
 
 def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[ActuationLog, dict[str, Any]]:
@@ -105,7 +121,7 @@ def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[Ac
             "actuation_correlation": best,
             "actuation_next_correlation": next_best,
         }
-    moved = ActuationLog(log.path, log.time_s + offset, log.columns, log.values, log.actuation)
+    moved = replace(log, time_s=log.time_s + offset)
     inside = (times >= moved.time_s[0]) & (times <= moved.time_s[-1])
     if not inside.any():
         raise InputError(
@@ -113,9 +129,17 @@ def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[Ac
             where=log.path,
             found=f"log {log.time_s[0]:.3f} … {log.time_s[-1]:.3f} s, frames {times[0]:.3f} … {times[-1]:.3f} s, offset {offset:g} s",
             expected="the same clock, or --offset SECONDS (frames' time minus the log's)",
-            hint=f"if both began together: --offset {times[0] - log.time_s[0]:.3f}",
+            hint=_offset_hint(float(times[0] - log.time_s[0])),
         )
     return moved, {**said, "actuation_offset_s": float(offset), "frames_beyond_log": int((~inside).sum())}
+
+
+def _offset_hint(apart: float) -> str:
+    """Return what to try where clocks are `apart` [s]: whole quarters of an hour are time zones."""
+    zone = QUARTER_S * round(apart / QUARTER_S)
+    if zone and abs(zone) <= FARTHEST_ZONE_S and abs(apart - zone) < ZONE_SLACK_S:
+        return f"one is in local time and the other in UTC, {abs(zone) / 3600:g} hours apart: --offset {zone:g}"
+    return f"if both began together: --offset {apart:.3f}"
 
 
 def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) -> tuple[float, float, float]:
