@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
 """How often it is asked whether a source has stopped."""
+MEASURED_HZ = 100.0
+"""How often markers are measured by sensors at most: twice as often as commands go out."""
 PATIENCE_S = 3.0
 """How long a connection may take before it is said that there is none."""
 
@@ -88,7 +90,8 @@ class LiveStream:
         clients = None if self.broker is None else self.broker.clients
         brokers = {where: sink.was_connected for where, sink in self.brokers.items()}
         passed = sum(readings.passed for readings in self.sources)
-        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed)
+        dropped = sum(readings.dropped for readings in self.sources)
+        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed, dropped)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
@@ -226,6 +229,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
             message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers, why))
             live.hub.publish([message])
             live.hub.received(message, "sensors")
+            live.stop.wait(1.0 / MEASURED_HZ)
 
     thread = Thread(target=run, daemon=True, name="femsense-measured")
     live.closers.append(lambda: thread.join(2.0))
@@ -328,8 +332,9 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     def run() -> None:
         try:
             if readings:
-                for frame in frames:
+                while (frame := next(frames, None)) is not None:
                     publisher.publish(frame)
+                    live.stop.wait(publisher.wait_s())  # and only then is the newest reading taken
             else:
                 play(publisher, frames, live.stop)
         finally:

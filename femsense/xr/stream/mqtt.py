@@ -148,10 +148,11 @@ class MqttSource:
         *,
         topics: Sequence[str] = (f"{PREFIX}/#",),
         lost: Callable[[], None] = lambda: None,
+        kept: bool = True,
     ) -> None:
         """Call receive(message) in a thread of its own, for the topics that filters name, and lost() when the broker goes away.
 
-        Raises MissingDependency.
+        `kept`: also with what the broker has kept from earlier. Raises MissingDependency.
         """
         self._client = make_client(address)
         self._refusal = Refusal(self._client, address)
@@ -160,9 +161,14 @@ class MqttSource:
         self._client.on_connect = self._greet
         self._client.on_disconnect = self._leave
         self._lost = lost
-        self._client.on_message = lambda _c, _d, got: receive(Message(got.topic, bytes(got.payload)))
+        self._receive, self._kept = receive, kept
+        self._client.on_message = self._take
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
+
+    def _take(self, _client: Client, _data: Any, got: Any) -> None:
+        if self._kept or not got.retain:
+            self._receive(Message(got.topic, bytes(got.payload)))
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
         if self._refusal.refused(reason):

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,6 +63,12 @@ def take(source: str, count: int, send: object) -> list[Reading]:
             stop.set()
             break
     return found
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 @pytest.mark.parametrize(
@@ -150,12 +157,78 @@ def test_a_time_that_is_not_said_counts_from_the_beginning(tmp_path: Path) -> No
 
 
 def test_datagrams_are_readings() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_udp_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         found = take(f"udp://127.0.0.1:{port}", 2, lambda: out.sendto(b'{"bend": 1, "sway": 2}', ("127.0.0.1", port)))
     assert [row.tolist() for _, row in found] == [[1, 2], [1, 2]] and found[1][0] > found[0][0]
+
+
+def test_of_a_flood_the_newest_reading_is_taken_and_the_others_are_counted() -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for k in range(200):
+            out.sendto(f"{k / 500},{k},0".encode(), ("127.0.0.1", port))
+            time.sleep(0.0005)
+    assert within(3.0, lambda: readings.dropped == 199)
+    assert next(readings)[1].tolist() == [199, 0]
+    found: list[Reading] = []
+    Thread(target=lambda: found.extend(readings), daemon=True).start()
+    time.sleep(0.3)
+    assert found == [] and readings.trouble == ""  # nothing waits behind the last one
+    stop.set()
+
+
+@pytest.mark.parametrize("date", [True, False])
+def test_a_reading_is_as_old_as_its_sender_says(date: bool) -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+
+        def age_of(age_s: float) -> float:
+            made = (time.time() if date else time.monotonic()) - age_s
+            out.sendto(f"{made!r},1,2".encode(), ("127.0.0.1", port))
+            next(readings)
+            return time.monotonic() - readings.came
+
+        assert age_of(4.0) >= (4.0 if date else 0.0)  # of a clock that counts from anywhere, delays are known but for their least
+        assert age_of(0.0) < 2.0
+        time.sleep(1.0)
+        assert 0.8 <= age_of(0.9) < 2.0
+        assert age_of(-50.0) < 1.0 and age_of(0.0) < 1.0  # its clock was set
+    stop.set()
+
+
+def test_a_reading_that_was_overtaken_on_its_way_is_dropped() -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for line in (b"5.0,1,1", b"5.2,2,2", b"5.1,3,3"):
+            out.sendto(line, ("127.0.0.1", port))
+    assert within(3.0, lambda: readings.overtaken == 1) and readings.dropped == 2
+    assert next(readings)[0] == 5.2
+    stop.set()
+
+
+def test_frames_of_a_websocket_are_readings_and_it_is_found_again() -> None:
+    server = pytest.importorskip("websockets.sync.server")
+    port = free_udp_port()
+    stop = Event()
+    readings = readings_of(f"ws://127.0.0.1:{port}/sensors", CHANNELS, stop)
+    assert within(3.0, lambda: "Connection refused" in readings.trouble)
+    for value in (1, 2):
+
+        def answer(connection: Any, value: int = value) -> None:
+            connection.send(json.dumps({"bend": value, "sway": 0}))
+            connection.send(f"{value},5".encode())
+            time.sleep(0.3)
+
+        with server.serve(answer, "127.0.0.1", port) as serving:
+            Thread(target=serving.serve_forever, daemon=True).start()
+            while next(readings)[1].tolist() != [value, 5]:
+                pass
+            serving.shutdown()
+    stop.set()
 
 
 def test_messages_of_a_broker_are_readings() -> None:
@@ -299,9 +372,12 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
         stream.write("1,0.4,-0.2\n")
         stream.flush()
         bent = next(frames)
-        stream.write("2,9,0\n3,,0\n")
+        stream.write("2,9,0\n")
         stream.flush()
-        odd, blind = next(frames), next(frames)
+        odd = next(frames)
+        stream.write("3,,0\n")
+        stream.flush()
+        blind = next(frames)
     np.testing.assert_allclose(still.bones[:, :3], twin.T_robot_bone[:, :3, 3], atol=1e-7)
     np.testing.assert_allclose(still.bones[:, 3:], np.tile([0, 0, 0, 1.0], (6, 1)), atol=1e-6)
     T = np.tile(np.eye(4), (6, 1, 1))
@@ -342,9 +418,7 @@ def test_a_source_without_readings_says_why() -> None:
 
 
 def test_a_line_that_is_no_reading_is_shown_until_one_is() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_udp_port()
     readings, found = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, Event()), []
     assert readings.trouble == "nothing has come yet"
     Thread(target=lambda: found.append(next(readings)), daemon=True).start()
