@@ -52,7 +52,12 @@ class Bridge:
         elif scheme in ("http", "https", "ws", "wss"):
             viewer = _Viewer(self, url, password, authority)
             web = WebSource(viewer.socket, headers=viewer.headers, lost=viewer.lost, **viewer.options)
-            Thread(target=web.run, args=(viewer.take, self._stop), daemon=True, name="femsense-bridge").start()
+
+            def take(frame: bytes) -> None:
+                viewer.take(frame)
+                web.send(b"")  # confirmed: the next may come
+
+            Thread(target=web.run, args=(take, self._stop), daemon=True, name="femsense-bridge").start()
             self._send, self._close = lambda message: web.send(pack([message])), lambda: None
             self._trouble = lambda: web.away
         else:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
@@ -100,6 +100,8 @@ class MqttSink:
         self._refusal = Refusal(self._client, address)
         self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
         self._client.on_connect = self._greet
+        self._waiting: dict[str, Message] = {}
+        self._lock = Lock()
         self.connected = Event()
         self.was_connected = False
         self._client.on_disconnect = self._leave
@@ -114,10 +116,18 @@ class MqttSink:
         return "" if self.connected.is_set() else self._refusal.text
 
     def send(self, messages: tuple[Message, ...]) -> None:
-        """Hand messages to the broker if there is one; returns at once."""
+        """Hand messages to the broker if there is one; returns at once.
+
+        While the connection has not taken the ones before, the newest of each topic wait; what is retained never does.
+        """
         if not self.connected.is_set():
             return
-        for message in messages:
+        with self._lock:
+            self._waiting.update((message.topic, message) for message in messages)
+            if self._client.want_write() and not any(message.retained for message in messages):
+                return
+            taken, self._waiting = list(self._waiting.values()), {}
+        for message in taken:
             self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
 
     def close(self) -> None:
