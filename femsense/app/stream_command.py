@@ -16,7 +16,7 @@ from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
+from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, broker_address, lets_anybody_in
 from femsense.xr.stream.payloads import MEASURED, Twin, TwinFrame, measured_bytes, topic
 from femsense.xr.stream.publisher import FIRST_POSE, Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
@@ -52,6 +52,12 @@ class StreamOptions:
     authority: Path | None = None
     """Certificate that a broker's own is checked against."""
     rate_hz: float = 60.0
+    names: tuple[str, ...] = ()
+    """Further names of this machine."""
+    commands: bool = False
+    """Whether commands may go out once `let_drag` allows them."""
+    insecure: bool = False
+    """Commands also over a broker that lets anybody in."""
     page: Path = PAGE
 
 
@@ -62,6 +68,8 @@ class LiveStream:
     hub: Hub
     server: WebSocketServer
     broker: EmbeddedBroker | None = None
+    commands: bool = False
+    """Whether commands may go out."""
     publishers: list[Publisher] = field(default_factory=list)
     threads: list[Thread] = field(default_factory=list)
     stop: Event = field(default_factory=Event)
@@ -174,7 +182,12 @@ def stream_sensors(
 
 
 def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
-    """Let viewers drag the robot of a run that streams; the first that `live` plays."""
+    """Let viewers drag the robot of a run that streams; the first that `live` plays.
+
+    Raises InputError where commands are allowed but `StreamOptions.commands` was not: brokers were not asked whom they let in.
+    """
+    if options.gate.allowed and not live.commands:
+        raise InputError("this stream sends no commands", where="options.gate", expected="StreamOptions(commands=True)")
     from femsense.sensing.run_files import read_run
     from femsense.xr.glb_reader import read_glb
     from femsense.xr.stream.drag_server import DragServer, handles_of
@@ -295,22 +308,44 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
     """Start the server, and a broker or a client of one where it is asked for; `stop` ends the sources."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
-    access = Access(options.host, password, options.certificate, options.key)
+    access = Access(options.host, password, options.certificate, options.key, options.names)
+    address = None if options.mqtt is None else broker_address(options.mqtt, password=password, authority=options.authority)
+    if options.commands and not options.insecure:
+        _need_known_clients(address, embedded=options.broker_port is not None, password=password)
     hub = Hub()
     with contextlib.ExitStack() as undo:
         files = live_page_files(options.page)
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
         broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
-        live = LiveStream(hub, server, broker, stop=stop or Event())
-        if options.mqtt is not None:
-            address = broker_address(options.mqtt, password=password, authority=options.authority)
+        live = LiveStream(hub, server, broker, options.commands, stop=stop or Event())
+        if address is not None:
             sink = MqttSink(hub, address, first)
             where = f"{address.host}:{address.port}"
             live.brokers[where] = sink
             live.watched.append(connection(where, lambda: sink.trouble))
         undo.pop_all()
     return live
+
+
+def _need_known_clients(address: BrokerAddress | None, *, embedded: bool, password: str | None) -> None:
+    """Raise InputError where a broker lets anybody in: whoever reaches it could move the robot."""
+    where = "--commands"
+    hint = "--insecure sends commands nevertheless: whoever reaches the broker can then move the robot"
+    if embedded and not password:
+        raise InputError(
+            "the broker of --broker lets anybody in", where=where, expected="a password: --password-file FILE", hint=hint
+        )
+    known = False if address is None else lets_anybody_in(address)
+    if known is not False and address is not None:
+        found = "it does not answer, so that it cannot be known whom it lets in" if known is None else "it lets anybody in"
+        raise InputError(
+            "commands need a broker that asks for a password",
+            where=where,
+            found=f"{address.host}:{address.port}: {found}",
+            expected="allow_anonymous false there, and mqtts://USER@HOST with --password-file FILE",
+            hint=hint,
+        )
 
 
 def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:

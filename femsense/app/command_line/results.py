@@ -147,7 +147,13 @@ def stream(
     ] = None,
     drag: Annotated[bool, typer.Option("--drag", help="Let viewers drag the robot of the first run.")] = False,
     commands: Annotated[bool, typer.Option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="With --commands: also over a broker that lets anybody in.")
+    ] = False,
     host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
+    names: Annotated[
+        list[str] | None, typer.Option("--name", metavar="NAME", help="By which others know this machine.", show_default=False)
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page and its WebSocket; 0: a free one.")] = 8010,
     mqtt: Annotated[
         str | None,
@@ -182,6 +188,7 @@ def stream(
     need_stream(runs or [], sensors, drag=drag)
     need_model(sensors, model)
     need_with("--commands", commands, "--drag", drag)
+    need_with("--insecure", insecure, "--commands", commands)
     need_with("--drag", drag, "RUN", bool(runs))
     need_with("--once", once, "RUN", bool(runs))
     need_with("--broker-port", broker_port is not None, "--broker", broker)
@@ -201,6 +208,9 @@ def stream(
         key=key,
         authority=authority,
         rate_hz=rate,
+        names=tuple(names or ()),
+        commands=commands,
+        insecure=insecure,
     )
     if sensors is not None and model is not None and not runs:
         return _live(stream_sensors(sensors, model, options, say=say), browser)

@@ -1,6 +1,6 @@
 """Answers a dragged point: inputs by a `Follower`, the shape that the robot can take, and commands while armed and held.
 
-Each wish is answered with where the way to it stands; while a wish stays, answers go on until nothing comes nearer.
+One client steers at a time (`lease`), and anybody can stop everything. Each wish is answered with where the way to it stands; while a wish stays, answers go on until nothing comes nearer.
 """
 
 from __future__ import annotations
@@ -24,13 +24,16 @@ from femsense.model.robot import Robot
 from femsense.xr.skinning import Skin, prepare_poses
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
 from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.lease import Claim, Lease, Ruling
 from femsense.xr.stream.payloads import (
     COMMAND,
     DRAG,
     GHOST,
     INPUTS,
+    LEASE,
     MEASURED,
     REACH,
+    STOP,
     Handle,
     Input,
     bone_rows,
@@ -68,11 +71,9 @@ class DragOptions:
 class Wish:
     """Where someone wants a point."""
 
-    who: str
+    claim: Claim
     handle: str
     target_m: tuple[float, float, float] | None
-    held: bool
-    armed: bool
 
 
 def drive_inputs(robot: Robot) -> tuple[Input, ...]:
@@ -127,7 +128,7 @@ class DragServer:
         self._grabbed = False  # a point, since the last answer
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
-        self._driver, self._driver_at = "", float("-inf")
+        self.lease = Lease(self.options.gate.hold_s)
         self._told: dict[str, float] = {}  # the robot's own word of its inputs
         self._told_at = float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
@@ -137,7 +138,7 @@ class DragServer:
         self._unmeasured, self._unmeasured_at = "", float("-inf")  # why it is not
         self._answer: tuple[FloatArray, dict[str, Any]] | None = None
         self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
-        self._seq = self._commands = 0
+        self._seq = self._commands = self._leases = 0
         hub.listen(self._hear)
         self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
         for thread in self._threads:
@@ -160,6 +161,8 @@ class DragServer:
             self._measure(message.payload)
         elif known[1] == DRAG:
             self._take(message, who)
+        elif known[1] == STOP:
+            self.stop()
 
     def _measure(self, payload: bytes) -> None:
         """Take note of where the dragged marker was measured, and of what the robot says of its inputs."""
@@ -176,34 +179,63 @@ class DragServer:
             if inputs:
                 self._told, self._told_at = inputs, now
 
-    def _take(self, message: Message, who: str) -> None:
-        wish = self._read(message.payload, who)
-        now = time.monotonic()
+    def stop(self) -> None:
+        """End all motion at once, whoever steers; who wants to go on has to disarm first."""
         with self._lock:
-            if wish is None or (who != self._driver and now - self._driver_at < 4.0 * self.options.gate.hold_s):
-                return  # one hand at a time
-            if not wish.held or wish.handle != self._handle or now - self._driver_at > self.options.gate.hold_s:
-                self.gate.release()  # what was wanted before is not wanted now
-                self.feedback.forget()
-                self._grabbed = wish.held
-            self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
-            self.gate.hold(now, armed=wish.armed and wish.held)
-            self._handle = wish.handle if wish.held else ""
-            self._wish = wish if wish.held else None
+            self.lease.stop()
+            self._let_go()
+        if self.options.gate.allowed:
+            self._stopped()
+        self._say_who_steers()
+
+    def _let_go(self) -> None:
+        """Forget what was wanted: it is not wanted now."""
+        self.gate.release()
+        self.feedback.forget()
+        self._wish, self._handle, self._grabbed = None, "", False
+
+    def _take(self, message: Message, who: str) -> None:
+        wish, now = self._read(message.payload, who), time.monotonic()
+        if wish is None:
+            return
+        with self._lock:
+            ruling = self.lease.rule(wish.claim, now)
+            if ruling is Ruling.RELEASED:
+                self._let_go()
+            elif ruling in (Ruling.GRANTED, Ruling.RENEWED):
+                if ruling is Ruling.GRANTED or wish.handle != self._handle:
+                    self._let_go()
+                    self._grabbed = True
+                self.gate.hold(now, armed=wish.claim.armed and ruling is Ruling.RENEWED)
+                self._wish, self._handle = wish, wish.handle
+        if ruling is not Ruling.RENEWED:
+            self._say_who_steers()
         self._fresh.set()
+
+    def _say_who_steers(self) -> None:
+        self._leases += 1
+        document = {
+            "header": header(self._leases, time.time(), "robot"),
+            "client": self.lease.client,
+            "number": self.lease.number,
+            "expires_s": self.lease.hold_s,
+            "stopped": self.lease.stopped,
+        }
+        self.hub.publish([Message(topic(self.name, LEASE), json.dumps(document).encode())])
 
     def _read(self, payload: bytes, who: str) -> Wish | None:
         """Return a wish, or None where it is none or wants something that cannot be meant."""
         told = read_document(payload, most=4096)
         if told is None:
             return None
+        client, seq, number = told.get("client"), told.get("seq"), told.get("lease", 0)
+        if not isinstance(client, str) or not 0 < len(client) <= 64 or type(seq) is not int or type(number) is not int:
+            return None
         handle, held = told.get("handle"), told.get("held") is True
         target = _place(told.get("target_m"))
-        if handle not in self.robot.glued_names or (held and target is None):
+        if held and (handle not in self.robot.glued_names or target is None or not self._is_near(target)):
             return None
-        if target is not None and not self._is_near(target):
-            return None
-        return Wish(who, str(handle), target, held, told.get("armed") is True)
+        return Wish(Claim(who, client, seq, number, held, told.get("armed") is True), str(handle), target)
 
     def _is_near(self, place_m: tuple[float, float, float]) -> bool:
         middle = self.robot.body.mesh.nodes.mean(axis=0)
@@ -231,7 +263,7 @@ class DragServer:
         begun = time.perf_counter()
         with self._lock:
             turn, grabbed, self._grabbed = self.gate.turn, self._grabbed, False
-            moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
+            moves = self.options.gate.allowed and self._wish is not None and self._wish.claim.armed
             current = {**self.gate.last, **self._current(time.monotonic())} if moves else self._shown()
             last = self._motion
             reached = None if last is None else last.reached_m.get(handle)
@@ -312,6 +344,9 @@ class DragServer:
             with self._lock:
                 inputs = self.gate.step(time.monotonic(), self._current(time.monotonic()))
                 moving = self.gate.moving
+                expired = self.lease.expire(time.monotonic())
+            if expired:
+                self._say_who_steers()
             if inputs is not None:
                 self._command(inputs, armed=True)
             elif was_moving and not moving:

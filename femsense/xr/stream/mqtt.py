@@ -9,7 +9,7 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, STOP, split_topic, status_bytes, topic
 from femsense.xr.stream.quiet import keep_quiet
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class MqttSink:
         self.connected = Event()
         self.was_connected = False
         self._client.on_disconnect = self._leave
-        self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
+        self._client.on_message = self._hear
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
         hub.attach(self)
@@ -129,6 +129,11 @@ class MqttSink:
             taken, self._waiting = list(self._waiting.values()), {}
         for message in taken:
             self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
+
+    def _hear(self, _client: Client, _data: Any, got: Any) -> None:
+        """Pass on what others send. What the broker kept from earlier is nobody's wish of now; a stop counts whenever it comes."""
+        if not got.retain or got.topic.endswith(f"/{STOP}"):
+            self.hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
 
     def close(self) -> None:
         """Take leave, so that the will is not executed."""
@@ -204,6 +209,26 @@ class MqttSource:
         """Leave the broker."""
         self._client.disconnect()
         self._client.loop_stop()
+
+
+def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | None:
+    """Return whether a broker accepts a client without a name and password; None where it does not answer in time [s]."""
+    if address.user is None:
+        return True
+    answered, accepted = Event(), []
+    client = make_client(replace(address, user=None, password=None))
+
+    def answer(_client: Any, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        accepted.append(not reason.is_failure)
+        answered.set()
+
+    client.on_connect = answer
+    client.connect_async(address.host, address.port)
+    client.loop_start()
+    answered.wait(timeout_s)
+    client.disconnect()
+    client.loop_stop()
+    return accepted[0] if accepted else None
 
 
 def make_client(address: BrokerAddress) -> Client:

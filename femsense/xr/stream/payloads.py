@@ -38,8 +38,9 @@ MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, FIELD, STATUS = (
     "status",
 )
 DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
-RECEIVED = (DRAG, MEASURED)
-"""What others may send: wishes, and where markers of the robot are."""
+LEASE, STOP = "lease", "stop"
+RECEIVED = (DRAG, MEASURED, STOP)
+"""What others may send: wishes, where markers of the robot are, and that all motion ends."""
 RETAINED = (MODEL, GLB, STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"

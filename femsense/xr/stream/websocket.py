@@ -296,7 +296,8 @@ class WebSocketServer:
         """Answer a request for a file; None lets a viewer in."""
         headers, path = request.headers, request.path.partition("?")[0]
         host = headers.get("Host")
-        if not self.access.knows_host(host) or not same_origin(headers.get("Origin"), host):
+        reached_at = str(connection.transport.get_extra_info("sockname")[0])
+        if not self.access.knows_host(host, reached_at) or not same_origin(headers.get("Origin"), host):
             return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
         if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
             await asyncio.sleep(0.3)  # who guesses waits

@@ -100,6 +100,25 @@ def test_pages_of_other_hosts_reach_nothing(headers: dict[str, str], status: int
         assert get(server, "/", **filled)[0] == status
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1", 200),
+        ("localhost:{port}", 200),
+        (f"{socket.gethostname().upper()}.", 200),
+        ("tunnel.example:443", 200),
+        ("evil.example", 403),
+        ("10.9.8.7", 403),
+        ("", 403),
+    ],
+)
+def test_with_a_password_too_a_foreign_host_is_refused_before_it_is_asked_for(host: str, status: int) -> None:
+    with served(Access("0.0.0.0", "secret", names=("tunnel.example",))) as (_, _publisher, server):
+        asked = {"Host": host.format(port=server.port)}
+        assert get(server, "/", **asked, Authorization=basic("secret"))[0] == status
+        assert get(server, "/", **asked)[0] == (401 if status == 200 else 403)
+
+
 def test_other_machines_only_with_a_password() -> None:
     with pytest.raises(InputError, match="only with a password"):
         Access("0.0.0.0")
