@@ -16,7 +16,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.control.follow import Follower
-from femsense.control.motion import CONVERGING, REACHED, STOPPED, Motion
+from femsense.control.motion import CONVERGING, NEAREST, REACHED, STOPPED, Motion
 from femsense.control.search import ReachOptions
 from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import embed_points
@@ -74,6 +74,20 @@ class Wish:
     claim: Claim
     handle: str
     target_m: tuple[float, float, float] | None
+
+
+def in_plain_words(motion: Motion) -> str:
+    """Return what became of a wish, for somebody who drags and knows nothing of solvers."""
+    away = f"{1e3 * motion.error_m:.3g} mm"
+    held_back = f": {'; '.join(motion.limits)}" if motion.limits else ""
+    if motion.status == REACHED:
+        return f"The robot can bring the point there, to {away}"
+    if motion.status == CONVERGING:
+        return f"Looking for a way: {away} to go{held_back}"
+    if motion.status == NEAREST:
+        return f"The robot cannot bring it closer than {away}{held_back or ': nothing that drives it moves the point that way'}"
+    why = held_back if motion.equilibrium.converged else f": {motion.equilibrium.advice}"
+    return f"No way was found, {away} are left{why}"
 
 
 def drive_inputs(robot: Robot) -> tuple[Input, ...]:
@@ -322,12 +336,12 @@ class DragServer:
         units = {one.name: one.unit for one in self.gate.inputs}
         missed = self.feedback.missed_m
         unknown = self._why_not_measured(handle, time.monotonic())
-        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
+        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm away from there"
         known = {} if np.isnan(missed) else {"measured_error_m": missed}
         begins = "" if self._is_known(time.monotonic()) else BEGINS
         return {
             "status": motion.status,
-            "text": motion.text + measured + begins,
+            "text": in_plain_words(motion) + measured + begins,
             "error_m": motion.error_m,
             **known,
             "correction_m": float(np.linalg.norm(self.feedback.correction_m)),

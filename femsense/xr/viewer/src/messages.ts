@@ -45,6 +45,13 @@ export interface Reach {
   inputs: { name: string; value: number; unit: string }[];
 }
 
+/** Who steers the robot. */
+export interface Lease {
+  client: string; // "": nobody
+  number: number;
+  stopped: boolean; // by somebody who pressed stop; who was armed is not any more
+}
+
 const text = new TextDecoder();
 const bytes = new TextEncoder();
 
@@ -152,6 +159,11 @@ export function readReach(payload: Uint8Array): Reach | null {
     armed: told.armed === true,
     inputs: list(told.inputs).map((i) => ({ name: String(i.name), value: number(i.value) ?? NaN, unit: String(i.unit ?? "") })),
   };
+}
+
+export function readLease(payload: Uint8Array): Lease | null {
+  const told = document(payload);
+  return told ? { client: String(told.client ?? ""), number: number(told.number) ?? 0, stopped: told.stopped === true } : null;
 }
 
 function quantity(told: Record<string, unknown>): { name: string; unit: string } {
