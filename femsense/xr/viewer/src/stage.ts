@@ -83,7 +83,8 @@ export class Stage {
     this.controls.dampingFactor = 0.12;
     this.controls.addEventListener("change", () => this.touch());
     this.controls.addEventListener("start", () => (this.moved = true));
-    new ResizeObserver(() => this.resize()).observe(canvas);
+    const observer = new ResizeObserver(() => this.resize());
+    for (const one of [canvas, document.getElementById("dock")!]) observer.observe(one);
     this.resize();
   }
 
