@@ -179,7 +179,9 @@ def flood(seconds: float, rate_hz: float = 500.0) -> None:
     print(f"\n{count} readings at {rate_hz:.0f} Hz, {poses} poses, {dropped} readings replaced by newer ones:\n")
     print("| from a reading to a viewer | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
     print(table_row("flood", ages), flush=True)
-    print(f"\nThe oldest pose was {1e3 * max(ages):.1f} ms old; the last arrived {1e3 * (last - ended):.1f} ms after the last reading.")
+    print(
+        f"\nThe oldest pose was {1e3 * max(ages):.1f} ms old; the last arrived {1e3 * (last - ended):.1f} ms after the last reading."
+    )
 
 
 def watch_slowly(port: int, seconds: float, confirms: bool, out: Any) -> None:

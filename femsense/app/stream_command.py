@@ -25,6 +25,7 @@ from femsense.xr.view import PAGE, live_page_files
 if TYPE_CHECKING:
     from femsense.xr.stream.drag_server import DragOptions, DragServer
     from femsense.xr.stream.readings import Readings
+    from femsense.xr.user_skin import UserSkin
 
 PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
@@ -157,9 +158,17 @@ def stream_runs(
 
 
 def stream_sensors(
-    source: str, model_file: Path, options: StreamOptions, *, name: str | None = None, say: Callable[[str], None] = quiet
+    source: str,
+    model_file: Path,
+    options: StreamOptions,
+    *,
+    name: str | None = None,
+    skin: UserSkin | None = None,
+    say: Callable[[str], None] = quiet,
 ) -> LiveStream:
     """Send what a learnt model makes of sensors while they are read; return at once. `say` is told that a file is waited for.
+
+    `skin`: the robot's own surface, in the frame of reference of the model; a tube without it.
 
     Raises:
         InputError: no model, no such source, or an address that cannot be used.
@@ -170,7 +179,7 @@ def stream_sensors(
     from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
 
     model = load_model(model_file)
-    twin = sensor_twin(model, name or model_file.stem)
+    twin = sensor_twin(model, name or model_file.stem, skin)
     stop = Event()
     readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
     live = _serve(options, twin.name, stop)

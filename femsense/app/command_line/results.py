@@ -145,6 +145,13 @@ def stream(
     model: Annotated[
         Path | None, typer.Option("--model", metavar="MODEL", help="Of femsense learn, for --sensors.", show_default=False)
     ] = None,
+    skin: Annotated[
+        Path | None,
+        typer.Option("--skin", metavar="FILE", help="With --sensors: the robot's surface, GLB, STL, OBJ, PLY.", show_default=False),
+    ] = None,
+    skin_unit: Annotated[
+        str | None, typer.Option("--skin-unit", metavar="UNIT", help="Of its coordinates: m, cm or mm.", show_default=False)
+    ] = None,
     drag: Annotated[bool, typer.Option("--drag", help="Let viewers drag the robot of the first run.")] = False,
     commands: Annotated[bool, typer.Option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
     insecure: Annotated[
@@ -187,6 +194,8 @@ def stream(
 
     need_stream(runs or [], sensors, drag=drag)
     need_model(sensors, model)
+    need_with("--skin", skin is not None, "--sensors alone", sensors is not None and not runs)
+    need_with("--skin-unit", skin_unit is not None, "--skin", skin is not None)
     need_with("--commands", commands, "--drag", drag)
     need_with("--insecure", insecure, "--commands", commands)
     need_with("--drag", drag, "RUN", bool(runs))
@@ -213,7 +222,10 @@ def stream(
         insecure=insecure,
     )
     if sensors is not None and model is not None and not runs:
-        return _live(stream_sensors(sensors, model, options, say=say), browser)
+        from femsense.xr.user_skin import read_skin
+
+        worn = None if skin is None else read_skin(skin, unit=skin_unit)
+        return _live(stream_sensors(sensors, model, options, skin=worn, say=say), browser)
     live = stream_runs(runs or [], options, loop=not once, say=say)
     if drag:
         from femsense.xr.stream.command_gate import GateOptions

@@ -24,8 +24,10 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import linear_network
 from femsense.xr.skinning import skin_vertices
+from femsense.xr.stream.payloads import model_bytes
 from femsense.xr.stream.readings import Reading, read_line, readings_of
 from femsense.xr.stream.sensor_source import frames_of_sensors, markers_of_sensors, sensor_twin
+from femsense.xr.user_skin import UserSkin
 
 CHANNELS = ("bend", "sway")
 REST = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
@@ -387,6 +389,29 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     assert bent.contacts is None and bent.status == "ok" and "bend = 9" in odd.status and "no number" in blind.status
     np.testing.assert_array_equal(blind.bones, odd.bones)
     assert still.read_at < bent.read_at < odd.read_at == blind.read_at  # what is blind shows what was read before
+
+
+def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refused(model: ProprioceptiveModel, tmp_path: Path) -> None:
+    height = np.linspace(0.0, 0.1, 21)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.01
+    rest = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in height])
+    red = np.tile([1.0, 0.0, 0.0], (len(rest), 1))
+    worn = UserSkin(rest, np.array([[i, i + 1, i + 4] for i in range(len(rest) - 4)]), red)
+    twin = sensor_twin(replace(model, report={"error_mm": 2.5}), "arm", worn)
+    mesh = read_glb(twin.glb)
+    np.testing.assert_allclose(mesh.skin.rest, rest, atol=1e-7)
+    told = json.loads(model_bytes(twin, "robots/arm.glb"))
+    assert told["error_m"] == 2.5e-3 and [marker["name"] for marker in told["markers"]] == list("abcde")
+    file = tmp_path / "sensors.csv"
+    file.write_text("time_s,bend,sway\n0,0.2,0.1\n", encoding="utf-8")
+    bones = next(frames_of_sensors(readings_of(str(file), CHANNELS, Event()), model)).bones
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(bones[:, 3:]).as_matrix(), bones[:, :3]
+    middle = skin_vertices(mesh.skin, T[None])[0].reshape(21, 4, 3).mean(axis=1)
+    np.testing.assert_allclose(middle[:, :2], np.outer(middle[:, 2], [0.2, 0.1]), atol=1e-4)  # on the line that the markers are on
+    for wrong in (replace(worn, rest=1000.0 * rest), replace(worn, rest=rest + [0.0, 0.2, 0.0])):
+        with pytest.raises(InputError, match="not where the model's bones are"):
+            sensor_twin(model, "arm", wrong)
 
 
 def test_bones_of_a_lying_body_have_the_axes_of_the_robot_at_rest(tmp_path: Path) -> None:

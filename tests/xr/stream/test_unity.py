@@ -77,7 +77,9 @@ def test_unity_s_part_reads_the_transcript(tmp_path: Path) -> None:
 def test_the_package_compiles_against_what_it_uses_of_unity(tmp_path: Path) -> None:
     sources = sorted(file for file in UNITY.rglob("*.cs") if "Tests~" not in file.parts)
     library = ["-target:library", "-define:UNITY_5_3_OR_NEWER", "-nowarn:0649", f"-out:{tmp_path / 'package.dll'}"]
-    done = subprocess.run(["mcs", *library, str(STAND_INS), *map(str, sources)], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        ["mcs", *library, str(STAND_INS), *map(str, sources)], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0 and len(sources) == 8, done.stdout + done.stderr
 
 

@@ -175,8 +175,9 @@ class Streams {
     const answers = state !== "ended" && !!robot?.model.handles.length;
     if (!answers && this.dragging.on) element("drag").click();
     element("drag").hidden = !answers;
-    const said = this.paused ? `paused · ${words}` : words;
-    badge.dataset.state = this.paused && state === "live" ? "paused" : state;
+    const doubt = state === "live" && robot?.shown && isDoubtful(robot.shown) ? (robot.shown.forceless ? "outside of what was learnt" : "doubtful") : "";
+    const said = [this.paused ? "paused" : "", words, doubt].filter(Boolean).join(" · ");
+    badge.dataset.state = doubt ? "doubtful" : this.paused && state === "live" ? "paused" : state;
     if (badge.textContent !== said) badge.textContent = said;
     element("live").setAttribute("aria-pressed", String(!this.paused && state === "live"));
     element("panel").hidden = !robot?.shown;
@@ -385,7 +386,8 @@ class Robot {
   about(): string {
     const vertices = this.body?.skins.reduce((sum, s) => sum + (s.geometry.getAttribute("position")?.count ?? 0), 0) ?? 0;
     const frame = this.model.inRobotFrame ? "" : " · markers' frame";
-    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}`;
+    const error = this.model.error === null ? "" : ` · ± ${(1000 * this.model.error).toPrecision(2)} mm where it was tested`;
+    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}${error}`;
   }
 
   private moved(pose: ReturnType<typeof readPose>): void {

@@ -20,6 +20,7 @@ export interface Model {
   markers: NamedPoint[];
   cameras: NamedPoint[];
   commands: boolean;
+  error: number | null; // of a learnt model, root mean square distance of its markers from measured ones [m]
   duration: number | null; // of a run that is played over and over [s]
   field: { name: string; unit: string } | null; // what colours the body
 }
@@ -120,6 +121,7 @@ export function readModel(payload: Uint8Array): Model | null {
     cameras: list(told.cameras).map(named),
     commands: told.commands === true,
     duration: number(told.duration_s),
+    error: number(told.error_m),
     field: told.field ? quantity(told.field as Record<string, unknown>) : null,
   };
 }
