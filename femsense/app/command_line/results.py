@@ -147,7 +147,9 @@ def stream(
     ] = None,
     skin: Annotated[
         Path | None,
-        typer.Option("--skin", metavar="FILE", help="With --sensors: the robot's surface, GLB, STL, OBJ, PLY.", show_default=False),
+        typer.Option(
+            "--skin", metavar="FILE", help="With --sensors: the robot's surface, GLB, STL, OBJ, PLY.", show_default=False
+        ),
     ] = None,
     skin_unit: Annotated[
         str | None, typer.Option("--skin-unit", metavar="UNIT", help="Of its coordinates: m, cm or mm.", show_default=False)

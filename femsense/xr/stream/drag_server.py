@@ -1,6 +1,7 @@
 """Answers a dragged point: inputs by a `Follower`, the shape that the robot can take, and commands while armed and held.
 
-One client steers at a time (`lease`), and anybody can stop everything. Each wish is answered with where the way to it stands; while a wish stays, answers go on until nothing comes nearer.
+One client steers at a time (`lease`), and anybody can stop everything. Each wish is answered with where the way to it stands;
+while a wish stays, answers go on until nothing comes nearer.
 """
 
 from __future__ import annotations
@@ -10,21 +11,22 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from threading import Event, Lock, Thread
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.control.follow import Follower
-from femsense.control.motion import CONVERGING, NEAREST, REACHED, STOPPED, Motion
+from femsense.control.motion import CONVERGING, REACHED, STOPPED, Motion
 from femsense.control.search import ReachOptions
 from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import embed_points
 from femsense.model.robot import Robot
 from femsense.xr.skinning import Skin, prepare_poses
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
+from femsense.xr.stream.drag_messages import Wish, in_plain_words, is_number, place_of, read_wish, rows_of
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.lease import Claim, Lease, Ruling
+from femsense.xr.stream.lease import Lease, Ruling
 from femsense.xr.stream.payloads import (
     COMMAND,
     DRAG,
@@ -65,29 +67,6 @@ class DragOptions:
     """A hand that has not moved for so long rests: its target is sought from rest too where it is not reached [s]."""
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
     """How what is measured corrects the inputs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Wish:
-    """Where someone wants a point."""
-
-    claim: Claim
-    handle: str
-    target_m: tuple[float, float, float] | None
-
-
-def in_plain_words(motion: Motion) -> str:
-    """Return what became of a wish, for somebody who drags and knows nothing of solvers."""
-    away = f"{1e3 * motion.error_m:.3g} mm"
-    held_back = f": {'; '.join(motion.limits)}" if motion.limits else ""
-    if motion.status == REACHED:
-        return f"The robot can bring the point there, to {away}"
-    if motion.status == CONVERGING:
-        return f"Looking for a way: {away} to go{held_back}"
-    if motion.status == NEAREST:
-        return f"The robot cannot bring it closer than {away}{held_back or ': nothing that drives it moves the point that way'}"
-    why = held_back if motion.equilibrium.converged else f": {motion.equilibrium.advice}"
-    return f"No way was found, {away} are left{why}"
 
 
 def drive_inputs(robot: Robot) -> tuple[Input, ...]:
@@ -181,7 +160,7 @@ class DragServer:
     def _measure(self, payload: bytes) -> None:
         """Take note of where the dragged marker was measured, and of what the robot says of its inputs."""
         told, now = read_document(payload) or {}, time.monotonic()
-        places = {str(row.get("name")): _place(row.get("position_m")) for row in _rows(told, "markers")}
+        places = {str(row.get("name")): place_of(row.get("position_m")) for row in rows_of(told, "markers")}
         inputs = self._values(told)
         with self._lock:
             place = places.get(self._handle)
@@ -209,8 +188,8 @@ class DragServer:
         self._wish, self._handle, self._grabbed = None, "", False
 
     def _take(self, message: Message, who: str) -> None:
-        wish, now = self._read(message.payload, who), time.monotonic()
-        if wish is None:
+        wish, now = read_wish(message.payload, who), time.monotonic()
+        if wish is None or not self._can_be_meant(wish):
             return
         with self._lock:
             ruling = self.lease.rule(wish.claim, now)
@@ -237,19 +216,11 @@ class DragServer:
         }
         self.hub.publish([Message(topic(self.name, LEASE), json.dumps(document).encode())])
 
-    def _read(self, payload: bytes, who: str) -> Wish | None:
-        """Return a wish, or None where it is none or wants something that cannot be meant."""
-        told = read_document(payload, most=4096)
-        if told is None:
-            return None
-        client, seq, number = told.get("client"), told.get("seq"), told.get("lease", 0)
-        if not isinstance(client, str) or not 0 < len(client) <= 64 or type(seq) is not int or type(number) is not int:
-            return None
-        handle, held = told.get("handle"), told.get("held") is True
-        target = _place(told.get("target_m"))
-        if held and (handle not in self.robot.glued_names or target is None or not self._is_near(target)):
-            return None
-        return Wish(Claim(who, client, seq, number, held, told.get("armed") is True), str(handle), target)
+    def _can_be_meant(self, wish: Wish) -> bool:
+        """Return whether a wish is for a marker of the robot, and not far away from it."""
+        if not wish.claim.held:
+            return True
+        return wish.handle in self.robot.glued_names and wish.target_m is not None and self._is_near(wish.target_m)
 
     def _is_near(self, place_m: tuple[float, float, float]) -> bool:
         middle = self.robot.body.mesh.nodes.mean(axis=0)
@@ -409,26 +380,8 @@ class DragServer:
     def _values(self, told: Mapping[str, Any]) -> dict[str, float]:
         """Return the inputs in a document, as far as they are in the units of commands."""
         units = {one.name: one.unit for one in self.gate.inputs}
-        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in _rows(told, "inputs")]
-        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and _is_number(v)}
-
-
-def _rows(told: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """Return the objects in a list of a document."""
-    rows = told.get(name)
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
-def _is_number(told: object) -> TypeGuard[float]:
-    return isinstance(told, int | float) and bool(np.isfinite(told))
-
-
-def _place(told: object) -> tuple[float, float, float] | None:
-    """Return x, y, z of an object, or None."""
-    if not isinstance(told, dict):
-        return None
-    values = [float(v) for v in (told.get(axis) for axis in "xyz") if _is_number(v)]
-    return (values[0], values[1], values[2]) if len(values) == 3 else None
+        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in rows_of(told, "inputs")]
+        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and is_number(v)}
 
 
 def _top(limit: float | None, unit: str) -> float:

@@ -42,8 +42,8 @@ def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = N
     else:
         skin, triangles = bound_to_chain(worn.rest, rest.positions), worn.triangles
     still = np.tile(skin.skeleton.T_robot_bone, (1, 1, 1, 1))
-    paint = {} if worn is None else {"color_rgb": worn.colors, "texture": worn.texture}
-    glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], name=name, **paint)
+    color, texture = (None, None) if worn is None else (worn.colors, worn.texture)
+    glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], color_rgb=color, texture=texture, name=name)
     inputs = tuple(
         Input(channel, "", float(low), float(high), "learnt")
         for channel, low, high in zip(model.channels, model.domain.low, model.domain.high)
@@ -54,7 +54,14 @@ def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = N
     error = 1e-3 * known if isinstance(known, float) else float("nan")
     landmarks = Landmarks(marks, ())
     return Twin(
-        name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs, frame=model.frame, landmarks=landmarks, error_m=error
+        name,
+        glb,
+        skin.skeleton.names,
+        skin.skeleton.T_robot_bone,
+        inputs=inputs,
+        frame=model.frame,
+        landmarks=landmarks,
+        error_m=error,
     )
 
 

@@ -110,8 +110,9 @@ class _Viewer:
         self.wake.set()
         return True
 
-    def answer(self, _ping: object) -> None:
-        self._answered += 1
+    def answer(self, pong: asyncio.Future[float]) -> None:
+        """Take note of the answer to a ping; one that never came, since the viewer left, is no error."""
+        self._answered += not pong.cancelled() and pong.exception() is None
         self.wake.set()
 
     def leave(self) -> None:
@@ -268,7 +269,7 @@ class WebSocketServer:
                     viewer.sent += 1
                     await connection.send(pack(waiting))
                     if not viewer.confirmed:
-                        (await connection.ping()).add_done_callback(viewer.answer)
+                        asyncio.ensure_future(await connection.ping()).add_done_callback(viewer.answer)
         except ConnectionClosed:
             pass
         finally:

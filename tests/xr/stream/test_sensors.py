@@ -391,7 +391,9 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     assert still.read_at < bent.read_at < odd.read_at == blind.read_at  # what is blind shows what was read before
 
 
-def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refused(model: ProprioceptiveModel, tmp_path: Path) -> None:
+def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refused(
+    model: ProprioceptiveModel, tmp_path: Path
+) -> None:
     height = np.linspace(0.0, 0.1, 21)
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.01
     rest = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in height])
@@ -408,8 +410,10 @@ def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refuse
     T = np.tile(np.eye(4), (6, 1, 1))
     T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(bones[:, 3:]).as_matrix(), bones[:, :3]
     middle = skin_vertices(mesh.skin, T[None])[0].reshape(21, 4, 3).mean(axis=1)
-    np.testing.assert_allclose(middle[:, :2], np.outer(middle[:, 2], [0.2, 0.1]), atol=1e-4)  # on the line that the markers are on
-    for wrong in (replace(worn, rest=1000.0 * rest), replace(worn, rest=rest + [0.0, 0.2, 0.0])):
+    np.testing.assert_allclose(
+        middle[:, :2], np.outer(middle[:, 2], [0.2, 0.1]), atol=1e-4
+    )  # on the line that the markers are on
+    for wrong in (replace(worn, rest=1000.0 * rest), replace(worn, rest=np.add(rest, [0.0, 0.2, 0.0]))):
         with pytest.raises(InputError, match="not where the model's bones are"):
             sensor_twin(model, "arm", wrong)
 
