@@ -199,7 +199,8 @@ class DragServer:
                 if ruling is Ruling.GRANTED or wish.handle != self._handle:
                     self._let_go()
                     self._grabbed = True
-                self.gate.hold(now, armed=wish.claim.armed and ruling is Ruling.RENEWED)
+                if ruling is Ruling.RENEWED:
+                    self.gate.hold(now, armed=wish.claim.armed)
                 self._wish, self._handle = wish, wish.handle
         if ruling is not Ruling.RENEWED:
             self._say_who_steers()

@@ -440,8 +440,7 @@ def test_without_arming_the_ghost_moves_and_the_robot_does_not(served: tuple[Hub
     drag(hub, wanted, armed=False)
     assert within(5.0, lambda: reach_of(hub).get("status") == "reached")
     drag(hub, np.add(wanted, [0.0, 0.0, 0.05]), armed=False)
-    assert within(5.0, lambda: reach_of(hub).get("status") != "reached")
-    assert "cannot bring it closer than " in reach_of(hub)["text"] and not there.heard
+    assert within(10.0, lambda: "cannot bring it closer than " in reach_of(hub)["text"]) and not there.heard
 
 
 def test_a_drag_begins_where_the_robot_is(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
