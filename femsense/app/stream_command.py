@@ -345,16 +345,18 @@ def _need_known_clients(address: BrokerAddress | None, *, embedded: bool, passwo
         raise InputError(
             "the broker of --broker lets anybody in", where=where, expected="a password: --password-file FILE", hint=hint
         )
-    known = False if address is None else lets_anybody_in(address)
-    if known is not False and address is not None:
-        found = "it does not answer, so that it cannot be known whom it lets in" if known is None else "it lets anybody in"
-        raise InputError(
-            "commands need a broker that asks for a password",
-            where=where,
-            found=f"{address.host}:{address.port}: {found}",
-            expected="allow_anonymous false there, and mqtts://USER@HOST with --password-file FILE",
-            hint=hint,
-        )
+    if address is None or (known := lets_anybody_in(address)) is False:
+        return
+    found = "it lets anybody in" if known else "it does not answer, so that it cannot be known whom it lets in"
+    if address.user is None:
+        found = "without a name and password it lets anybody in"
+    raise InputError(
+        "commands need a broker that asks for a password",
+        where=where,
+        found=f"{address.host}:{address.port}: {found}",
+        expected="allow_anonymous false there, and mqtts://USER@HOST with --password-file FILE",
+        hint=hint,
+    )
 
 
 def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:
