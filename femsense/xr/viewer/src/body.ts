@@ -27,7 +27,7 @@ import { tie } from "./ties";
 
 const SAMPLED = 600; // vertices that tell about where a body is
 const GREY = 0x6b7177; // of what is old
-const AMBER = 0xd08a1c; // of what may be wrong
+const AMBER = 0xf08c00; // of what may be wrong
 const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
 
 export async function loadMesh(url: string): Promise<GLTF> {
@@ -150,7 +150,7 @@ export class Body {
 
   private fade(): void {
     this.arrows.tell(this.stale ? "stale" : this.doubtful ? "doubtful" : "");
-    this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.75 : 0, this.stale ? GREY : AMBER);
+    this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.93 : 0, this.stale ? GREY : AMBER);
   }
 
   get isStale(): boolean {
