@@ -86,8 +86,53 @@ class Refusal:
         self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
 
 
-class MqttSink:
-    """Sends a hub's messages to a broker; comes back by itself where the broker goes away.
+class MqttLink:
+    """A client of a broker that comes back by itself where the broker goes away."""
+
+    def __init__(self, address: BrokerAddress, topics: Sequence[str]) -> None:
+        """Prepare a client that listens to the topics that filters name. Raises MissingDependency."""
+        self._address, self._topics = address, topics
+        self._client = make_client(address)
+        self._refusal = Refusal(self._client, address)
+        self.connected = Event()
+        self.was_connected = False
+        self._client.on_connect = self._greet
+        self._client.on_disconnect = self._leave
+        self._client.on_message = lambda _c, _d, got: self._hear(Message(got.topic, bytes(got.payload)), kept=bool(got.retain))
+
+    def _begin(self) -> None:
+        """Connect in the background."""
+        self._client.connect_async(self._address.host, self._address.port, keepalive=5)
+        self._client.loop_start()
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; empty where there is one."""
+        return "" if self.connected.is_set() else self._refusal.text
+
+    def close(self) -> None:
+        """Take leave, so that the last will is not executed."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _hear(self, message: Message, *, kept: bool) -> None:
+        """Take a message; `kept`: the broker had it from earlier."""
+        raise NotImplementedError
+
+    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        if self._refusal.refused(reason):
+            return
+        client.subscribe([(one, 0) for one in self._topics])
+        self.connected.set()
+        self.was_connected = True
+
+    def _leave(self, *_: object) -> None:
+        self._refusal.closed(was_connected=self.connected.is_set())
+        self.connected.clear()
+
+
+class MqttSink(MqttLink):
+    """Sends a hub's messages to a broker.
 
     While there is no broker nothing is kept: what is retained is sent again when it is back, all else is old by then. Where the
     program ends without a word, the broker says for the first robot that it is lost (the last will).
@@ -95,25 +140,13 @@ class MqttSink:
 
     def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
+        super().__init__(address, WANTED)
         self.hub = hub
-        self._status, self._client = topic(robot, STATUS), make_client(address)
-        self._refusal = Refusal(self._client, address)
-        self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
-        self._client.on_connect = self._greet
+        self._client.will_set(topic(robot, STATUS), status_bytes("lost"), qos=0, retain=True)
         self._waiting: dict[str, Message] = {}
         self._lock = Lock()
-        self.connected = Event()
-        self.was_connected = False
-        self._client.on_disconnect = self._leave
-        self._client.on_message = self._hear
-        self._client.connect_async(address.host, address.port, keepalive=5)
-        self._client.loop_start()
+        self._begin()
         hub.attach(self)
-
-    @property
-    def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal.text
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to the broker if there is one; returns at once.
@@ -130,30 +163,17 @@ class MqttSink:
         for message in taken:
             self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
 
-    def _hear(self, _client: Client, _data: Any, got: Any) -> None:
+    def _hear(self, message: Message, *, kept: bool) -> None:
         """Pass on what others send. What the broker kept from earlier is nobody's wish of now; a stop counts whenever it comes."""
-        if not got.retain or got.topic.endswith(f"/{STOP}"):
-            self.hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
+        if not kept or message.topic.endswith(f"/{STOP}"):
+            self.hub.received(message, "MQTT")
 
-    def close(self) -> None:
-        """Take leave, so that the will is not executed."""
-        self._client.disconnect()
-        self._client.loop_stop()
-
-    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if self._refusal.refused(reason):
-            return
-        client.subscribe([(one, 0) for one in WANTED])
-        self.connected.set()
-        self.was_connected = True
+    def _greet(self, *told: Any) -> None:
+        super()._greet(*told)
         self.send(tuple(message for message in self.hub.newest().values() if message.retained))
 
-    def _leave(self, *_: object) -> None:
-        self._refusal.closed(was_connected=self.connected.is_set())
-        self.connected.clear()
 
-
-class MqttSource:
+class MqttSource(MqttLink):
     """Receives from a broker what streams there."""
 
     def __init__(
@@ -169,46 +189,21 @@ class MqttSource:
 
         `kept`: also with what the broker has kept from earlier. Raises MissingDependency.
         """
-        self._client = make_client(address)
-        self._refusal = Refusal(self._client, address)
-        self.connected = Event()
-        self._topics = tuple(topics)
-        self._client.on_connect = self._greet
-        self._client.on_disconnect = self._leave
-        self._lost = lost
-        self._receive, self._kept = receive, kept
-        self._client.on_message = self._take
-        self._client.connect_async(address.host, address.port, keepalive=5)
-        self._client.loop_start()
-
-    def _take(self, _client: Client, _data: Any, got: Any) -> None:
-        if self._kept or not got.retain:
-            self._receive(Message(got.topic, bytes(got.payload)))
-
-    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if self._refusal.refused(reason):
-            return
-        client.subscribe([(one, 0) for one in self._topics])
-        self.connected.set()
-
-    def _leave(self, *_: object) -> None:
-        self._refusal.closed(was_connected=self.connected.is_set())
-        self.connected.clear()
-        self._lost()
-
-    @property
-    def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal.text
+        super().__init__(address, topics)
+        self._receive, self._lost, self._kept = receive, lost, kept
+        self._begin()
 
     def send(self, message: Message) -> None:
         """Publish a message."""
         self._client.publish(message.topic, message.payload, qos=0)
 
-    def close(self) -> None:
-        """Leave the broker."""
-        self._client.disconnect()
-        self._client.loop_stop()
+    def _hear(self, message: Message, *, kept: bool) -> None:
+        if self._kept or not kept:
+            self._receive(message)
+
+    def _leave(self, *_: object) -> None:
+        super()._leave()
+        self._lost()
 
 
 def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | None:
