@@ -156,12 +156,17 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
         source.last = replace(source.last, contacts=None, status="light = 9 is outside 0 … 1")
         go_on(browser)
         odd = said(browser)
-        assert 0 < odd["faded"] < 1 and odd["badge"] == "doubtful" and odd["parts"] == [
-            False,
-            False,
-            False,
-            True,
-        ]  # no forces are known; why it is faded is said
+        assert (
+            0 < odd["faded"] < 1
+            and odd["badge"] == "doubtful"
+            and odd["parts"]
+            == [
+                False,
+                False,
+                False,
+                True,
+            ]
+        )  # no forces are known; why it is faded is said
         assert said(browser)["watching"]
         source.flowing.clear()
         stale = said(browser)
