@@ -23,6 +23,7 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / "support")]
 from analytic import bar_body
+from hand import Hand
 from helpers import block_mesh
 from obedient import ObedientRobot
 
@@ -66,10 +67,10 @@ def dragged(post: tuple[np.ndarray, float] | None, *, measured: bool) -> tuple[f
     real.inputs = dict(zip(model.body.cable_names, WANTED_N))
     wanted = real.place(0)
     real.inputs = dict.fromkeys(model.body.cable_names, 0.0)
-    wish = {"handle": "tip", "target_m": dict(zip("xyz", map(float, wanted))), "held": True, "armed": True}
+    hand = Hand(hub)
     end = time.monotonic() + SECONDS
     while time.monotonic() < end:
-        hub.received(Message("femsense/bar/drag", json.dumps(wish).encode()), "me")
+        hand.drag(wanted)
         time.sleep(0.03)
         if measured:
             real.report(("tip", "side"))
@@ -101,12 +102,13 @@ def answered(name: str, marker: str) -> str:
     rest = np.array(robot.marker_points[robot.marker_names.index(marker)])
     swing = SWING * np.linalg.norm(np.ptp(mesh.nodes, axis=0))
 
+    hand = Hand(hub, robot=name)
+
     def drag(seconds: float, path: float) -> None:
         begun = time.monotonic()
         while (now := time.monotonic() - begun) < seconds:
             place = rest + swing * np.sin(path * now + 1.0)
-            wish = {"handle": marker, "target_m": dict(zip("xyz", map(float, place))), "held": True, "armed": False}
-            hub.received(Message(f"femsense/{name}/drag", json.dumps(wish).encode()), "me")
+            hand.drag(place, armed=False, handle=marker)
             time.sleep(1.0 / 30.0)
 
     hub.attach(answers)

@@ -1,6 +1,9 @@
 """Latency of live streams, and what slow, hostile and many viewers do to them.
 
-    python benchmarks/xr_stream.py [--seconds S] [--soak S] [--robots N] [--viewers N]
+    python benchmarks/xr_stream.py [--seconds S] [--soak S] [--robots N] [--viewers N] [--only latency|flood|slow|soak]
+
+The flood: readings at 500 Hz by UDP, JSON and CSV, through a learnt model and out at 60 Hz; the age of a pose counts from when its
+reading was made, and what still goes out after the last reading is counted. The slow viewers handle 25 frames a second.
 
 Clients run in processes of their own and compare clocks of the same machine (CLOCK_MONOTONIC). A pose has 12 bones, 356 bytes,
 60 Hz. The soak: robots at 60 Hz to viewers; one viewer more reads nothing, one sends garbage, floods, asks for files,
@@ -41,14 +44,17 @@ def twin(name: str) -> Twin:
 
 
 def latencies(kind: str, port: int, seconds: float, out: Any) -> None:
-    """Put (robot, seq, age [s]) statistics of the poses that a client receives."""
+    """Put the ages [s] of the poses that a client receives, the number of robots, and when the last pose came."""
     ages: list[float] = []
     newest: dict[str, int] = {}
+    last = float("nan")
 
     def take(topic: str, payload: bytes) -> None:
+        nonlocal last
         if topic.endswith("/pose"):
             _, seq, sent = struct.unpack_from("<4sId", payload)
-            ages.append(time.monotonic() - sent)
+            last = time.monotonic()
+            ages.append(last - sent)
             newest[topic] = seq
 
     end = time.monotonic() + seconds
@@ -64,7 +70,7 @@ def latencies(kind: str, port: int, seconds: float, out: Any) -> None:
                 with suppress(TimeoutError):
                     for message in unpack(viewer.recv(0.2)):
                         take(message.topic, message.payload)
-    out.put((ages[10:], len(newest)))
+    out.put((ages[10:], len(newest), last))
 
 
 def send(publishers: list[Publisher], seconds: float) -> None:
@@ -88,7 +94,7 @@ def measure(kind: str, port: int, publishers: list[Publisher], seconds: float) -
     client.start()
     time.sleep(2.5)
     send(publishers, seconds)
-    ages, _ = out.get(timeout=seconds + 20)
+    ages, *_ = out.get(timeout=seconds + 20)
     client.join()
     return list(ages)
 
@@ -112,6 +118,104 @@ def latency(seconds: float) -> None:
     for k in range(10_000):
         pose_bytes(k, 0.0, np.zeros((BONES, 7), dtype=np.float32))
     print(f"\nA pose is packed in {1e2 * (time.perf_counter() - begun):.1f} µs.")
+
+
+# A flood of readings, and viewers that are slower than the poses
+
+
+def send_readings(port: int, seconds: float, rate_hz: float, out: Any) -> None:
+    """Send readings of two channels by UDP; their time is the moment of sending."""
+    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    begun, k = time.monotonic(), 0
+    while (now := time.monotonic()) < begun + seconds:
+        reading = {"time_s": now, "bend": 0.3 * np.sin(now), "sway": 0.0}
+        line = json.dumps(reading) if k % 2 else f"{now},{reading['bend']},0.0"
+        link.sendto(line.encode(), ("127.0.0.1", port))
+        k += 1
+        time.sleep(max(0.0, begun + k / rate_hz - time.monotonic()))
+    out.put((k, time.monotonic()))
+
+
+def line_model() -> Any:
+    """A model of five markers on a line, moved by two channels, with twelve bones."""
+    from femsense.xr.armature import ArmatureOptions, make_armature
+    from femsense.xr.proprioception.domain import learn_domain
+    from femsense.xr.proprioception.model import ProprioceptiveModel
+    from femsense.xr.proprioception.network import linear_network
+
+    rest = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
+    slopes = np.zeros((5, 3, 2))
+    slopes[:, 0, 0], slopes[:, 1, 1] = rest[:, 2], rest[:, 2]
+    domain = learn_domain(np.random.default_rng(0).uniform(-0.5, 0.5, (300, 2)))
+    network = linear_network(np.zeros(2), np.ones(2), slopes.reshape(15, 2), rest.ravel())
+    chain = make_armature(rest, ArmatureOptions(bones=BONES))
+    return ProprioceptiveModel(("bend", "sway"), tuple("abcde"), network, (), domain, chain)
+
+
+def flood(seconds: float, rate_hz: float = 500.0) -> None:
+    from femsense.app.stream_command import StreamOptions, stream_sensors
+    from femsense.xr.proprioception.model_file import save_model
+    from femsense.xr.view import PAGE
+
+    spawn = mp.get_context("spawn")
+    out: Any = spawn.Queue()
+    sent: Any = spawn.Queue()
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        model = save_model(line_model(), Path(folder) / "line.onnx")
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+        probe.close()
+        with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=PAGE)) as live:
+            client = spawn.Process(target=latencies, args=("ws", live.server.port, seconds + 5.0, out))
+            client.start()
+            time.sleep(2.0)
+            source = spawn.Process(target=send_readings, args=(port, seconds, rate_hz, sent))
+            source.start()
+            count, ended = sent.get(timeout=seconds + 20.0)
+            ages, _, last = out.get(timeout=seconds + 20.0)
+            source.join()
+            client.join()
+            poses, dropped = live.publishers[0].sent, live.sources[0].dropped
+    print(f"\n{count} readings at {rate_hz:.0f} Hz, {poses} poses, {dropped} readings replaced by newer ones:\n")
+    print("| from a reading to a viewer | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
+    print(table_row("flood", ages), flush=True)
+    print(
+        f"\nThe oldest pose was {1e3 * max(ages):.1f} ms old; the last arrived {1e3 * (last - ended):.1f} ms after the last reading."
+    )
+
+
+def watch_slowly(port: int, seconds: float, confirms: bool, out: Any) -> None:
+    """Put the ages of poses at a viewer that takes 40 ms for each frame."""
+    from websockets.sync.client import connect
+
+    ages: list[float] = []
+    end = time.monotonic() + seconds
+    with connect(f"ws://127.0.0.1:{port}/ws", proxy=None, compression=None, max_size=None) as viewer:
+        while time.monotonic() < end:
+            with suppress(TimeoutError):
+                for message in unpack(viewer.recv(0.2)):
+                    if message.topic.endswith("/pose"):
+                        ages.append(time.monotonic() - struct.unpack_from("<4sId", message.payload)[2])
+                time.sleep(0.04)
+                if confirms:
+                    viewer.send(b"")
+    out.put(ages)
+
+
+def slow(seconds: float) -> None:
+    print("\n| viewer that handles 25 frames a second | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
+    for confirms in (True, False):
+        hub = Hub()
+        publisher = Publisher(hub, twin("arm"))
+        server = WebSocketServer(hub, {})
+        out: Any = mp.get_context("spawn").Queue()
+        client = mp.get_context("spawn").Process(target=watch_slowly, args=(server.port, seconds + 3.0, confirms, out))
+        client.start()
+        time.sleep(2.0)
+        send([publisher], seconds)
+        print(table_row("confirms its frames" if confirms else "does not", out.get(timeout=seconds + 20.0)), flush=True)
+        client.join()
+        hub.close()
 
 
 def with_mosquitto(program: str, seconds: float) -> list[float]:
@@ -194,11 +298,11 @@ def soak(seconds: float, robots: int, viewers: int) -> None:
         f"one that is hostile:\n"
     )
     print("| viewer | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
-    print(table_row("all together", [age for ages, _ in found for age in ages]))
-    print(table_row("the worst one", max((ages for ages, _ in found), key=lambda a: float(np.percentile(a, 95)) if a else 0.0)))
+    print(table_row("all together", [age for ages, *_ in found for age in ages]))
+    print(table_row("the worst one", max((ages for ages, *_ in found), key=lambda a: float(np.percentile(a, 95)) if a else 0.0)))
     sent = sum(publisher.sent for publisher in publishers)
-    share = np.mean([len(ages) for ages, _ in found]) / sent
-    print(f"\nEach viewer got {100 * share:.0f} % of {sent} poses, of {min(n for _, n in found)} robots or more.")
+    share = np.mean([len(ages) for ages, *_ in found]) / sent
+    print(f"\nEach viewer got {100 * share:.0f} % of {sent} poses, of {min(n for _, n, _ in found)} robots or more.")
     print(f"Memory of the server {before:.0f} → {after:.0f} MB, processor {100 * cpu / (seconds - 4.0):.0f} % of one core.")
     hub.close()
 
@@ -209,10 +313,18 @@ def main() -> None:
     parser.add_argument("--soak", type=float, default=60.0)
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--viewers", type=int, default=10)
+    parser.add_argument("--only", choices=["latency", "flood", "slow", "soak"])
     asked = parser.parse_args()
     print(json.dumps({"cores": os.cpu_count(), "load": os.getloadavg()[0]}))
-    latency(asked.seconds)
-    soak(asked.soak, asked.robots, asked.viewers)
+    parts = {
+        "latency": lambda: latency(asked.seconds),
+        "flood": lambda: flood(asked.seconds),
+        "slow": lambda: slow(asked.seconds),
+        "soak": lambda: soak(asked.soak, asked.robots, asked.viewers),
+    }
+    for name, part in parts.items():
+        if asked.only in (None, name):
+            part()
 
 
 if __name__ == "__main__":

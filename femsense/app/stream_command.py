@@ -16,7 +16,7 @@ from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
+from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, broker_address, lets_anybody_in
 from femsense.xr.stream.payloads import MEASURED, Twin, TwinFrame, measured_bytes, topic
 from femsense.xr.stream.publisher import FIRST_POSE, Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
@@ -25,10 +25,13 @@ from femsense.xr.view import PAGE, live_page_files
 if TYPE_CHECKING:
     from femsense.xr.stream.drag_server import DragOptions, DragServer
     from femsense.xr.stream.readings import Readings
+    from femsense.xr.user_skin import UserSkin
 
 PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
 """How often it is asked whether a source has stopped."""
+MEASURED_HZ = 100.0
+"""How often markers are measured by sensors at most: twice as often as commands go out."""
 PATIENCE_S = 3.0
 """How long a connection may take before it is said that there is none."""
 
@@ -50,6 +53,12 @@ class StreamOptions:
     authority: Path | None = None
     """Certificate that a broker's own is checked against."""
     rate_hz: float = 60.0
+    names: tuple[str, ...] = ()
+    """Further names of this machine."""
+    commands: bool = False
+    """Whether commands may go out once `let_drag` allows them."""
+    insecure: bool = False
+    """Commands also over a broker that lets anybody in."""
     page: Path = PAGE
 
 
@@ -60,6 +69,8 @@ class LiveStream:
     hub: Hub
     server: WebSocketServer
     broker: EmbeddedBroker | None = None
+    commands: bool = False
+    """Whether commands may go out."""
     publishers: list[Publisher] = field(default_factory=list)
     threads: list[Thread] = field(default_factory=list)
     stop: Event = field(default_factory=Event)
@@ -88,7 +99,8 @@ class LiveStream:
         clients = None if self.broker is None else self.broker.clients
         brokers = {where: sink.was_connected for where, sink in self.brokers.items()}
         passed = sum(readings.passed for readings in self.sources)
-        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed)
+        dropped = sum(readings.dropped for readings in self.sources)
+        return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed, dropped)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
         """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
@@ -146,9 +158,17 @@ def stream_runs(
 
 
 def stream_sensors(
-    source: str, model_file: Path, options: StreamOptions, *, name: str | None = None, say: Callable[[str], None] = quiet
+    source: str,
+    model_file: Path,
+    options: StreamOptions,
+    *,
+    name: str | None = None,
+    skin: UserSkin | None = None,
+    say: Callable[[str], None] = quiet,
 ) -> LiveStream:
     """Send what a learnt model makes of sensors while they are read; return at once. `say` is told that a file is waited for.
+
+    `skin`: the robot's own surface, in the frame of reference of the model; a tube without it.
 
     Raises:
         InputError: no model, no such source, or an address that cannot be used.
@@ -159,7 +179,7 @@ def stream_sensors(
     from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
 
     model = load_model(model_file)
-    twin = sensor_twin(model, name or model_file.stem)
+    twin = sensor_twin(model, name or model_file.stem, skin)
     stop = Event()
     readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
     live = _serve(options, twin.name, stop)
@@ -171,7 +191,12 @@ def stream_sensors(
 
 
 def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
-    """Let viewers drag the robot of a run that streams; the first that `live` plays."""
+    """Let viewers drag the robot of a run that streams; the first that `live` plays.
+
+    Raises InputError where commands are allowed but `StreamOptions.commands` was not: brokers were not asked whom they let in.
+    """
+    if options.gate.allowed and not live.commands:
+        raise InputError("this stream sends no commands", where="options.gate", expected="StreamOptions(commands=True)")
     from femsense.sensing.run_files import read_run
     from femsense.xr.glb_reader import read_glb
     from femsense.xr.stream.drag_server import DragServer, handles_of
@@ -226,6 +251,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
             message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers, why))
             live.hub.publish([message])
             live.hub.received(message, "sensors")
+            live.stop.wait(1.0 / MEASURED_HZ)
 
     thread = Thread(target=run, daemon=True, name="femsense-measured")
     live.closers.append(lambda: thread.join(2.0))
@@ -291,22 +317,46 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
     """Start the server, and a broker or a client of one where it is asked for; `stop` ends the sources."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
-    access = Access(options.host, password, options.certificate, options.key)
+    access = Access(options.host, password, options.certificate, options.key, options.names)
+    address = None if options.mqtt is None else broker_address(options.mqtt, password=password, authority=options.authority)
+    if options.commands and not options.insecure:
+        _need_known_clients(address, embedded=options.broker_port is not None, password=password)
     hub = Hub()
     with contextlib.ExitStack() as undo:
         files = live_page_files(options.page)
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
         broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
-        live = LiveStream(hub, server, broker, stop=stop or Event())
-        if options.mqtt is not None:
-            address = broker_address(options.mqtt, password=password, authority=options.authority)
+        live = LiveStream(hub, server, broker, options.commands, stop=stop or Event())
+        if address is not None:
             sink = MqttSink(hub, address, first)
             where = f"{address.host}:{address.port}"
             live.brokers[where] = sink
             live.watched.append(connection(where, lambda: sink.trouble))
         undo.pop_all()
     return live
+
+
+def _need_known_clients(address: BrokerAddress | None, *, embedded: bool, password: str | None) -> None:
+    """Raise InputError where a broker lets anybody in: whoever reaches it could move the robot."""
+    where = "--commands"
+    hint = "--insecure sends commands nevertheless: whoever reaches the broker can then move the robot"
+    if embedded and not password:
+        raise InputError(
+            "the broker of --broker lets anybody in", where=where, expected="a password: --password-file FILE", hint=hint
+        )
+    if address is None or (known := lets_anybody_in(address)) is False:
+        return
+    found = "it lets anybody in" if known else "it does not answer, so that it cannot be known whom it lets in"
+    if address.user is None:
+        found = "without a name and password it lets anybody in"
+    raise InputError(
+        "commands need a broker that asks for a password",
+        where=where,
+        found=f"{address.host}:{address.port}: {found}",
+        expected="allow_anonymous false there, and mqtts://USER@HOST with --password-file FILE",
+        hint=hint,
+    )
 
 
 def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:
@@ -328,8 +378,9 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     def run() -> None:
         try:
             if readings:
-                for frame in frames:
+                while (frame := next(frames, None)) is not None:
                     publisher.publish(frame)
+                    live.stop.wait(publisher.wait_s())  # and only then is the newest reading taken
             else:
                 play(publisher, frames, live.stop)
         finally:

@@ -77,6 +77,8 @@ class Streamed:
     """Elsewhere, and whether it was ever connected."""
     passed: int = 0
     """Messages or lines that were no readings."""
+    dropped: int = 0
+    """Readings that a newer one replaced before a pose was made of them."""
 
     @property
     def text(self) -> str:
@@ -87,7 +89,8 @@ class Streamed:
         places += [f"the broker {where}" for where, reached in self.brokers.items() if reached]
         silent = "".join(f"; the broker {where} was never reached" for where, reached in self.brokers.items() if not reached)
         passed = f"; {_count(self.passed, 'line')} passed over: no readings" if self.passed else ""
-        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}{silent}{passed}"
+        dropped = f"; {_count(self.dropped, 'reading')} replaced by newer ones" if self.dropped else ""
+        return f"streamed {_listed(robots)} in {self.seconds:.1f} s, to {_listed(places)}{silent}{passed}{dropped}"
 
 
 def _count(number: int, one: str, many: str = "") -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from threading import Event, Lock, Thread
 from typing import Protocol
 
@@ -19,11 +18,10 @@ from femsense.core.text import did_you_mean
 from femsense.live.clock import ClockMap
 from femsense.live.watch import Notice
 from femsense.model.robot import Robot
-from femsense.xr.stream.readings import Readings, read_line, readings_of
+from femsense.xr.stream.readings import Readings, readings_of
 
 KEPT = 4096
 """Values that are kept for frames that are still to come."""
-RECONNECT_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +73,7 @@ def make_actuation(text: str, robot: Robot, limits: ActuationLimits | None = Non
     if text.startswith("fixed"):
         return FixedActuation(columns, _fixed(text.partition(":")[2], columns))
     stop = Event()
-    if text.startswith(("ws://", "wss://")):
-        lines = _WebSocketLines(text)
-        readings = Readings(lines.items(stop), partial(read_line, channels=columns), away=lambda: lines.away)
-    else:
-        readings = readings_of(text, columns, stop)
-    return ReadActuation(columns, readings, stop, text, limits)
+    return ReadActuation(columns, readings_of(text, columns, stop), stop, text, limits)
 
 
 class FixedActuation:
@@ -222,33 +215,6 @@ class FrameActuation:
 
     def close(self) -> None:
         """Nothing is held."""
-
-
-class _WebSocketLines:
-    """Text messages of a WebSocket, which is connected again when it is lost."""
-
-    def __init__(self, url: str) -> None:
-        self._url = url
-        self.away = "not connected yet"
-
-    def items(self, stop: Event) -> Iterator[bytes]:
-        """Yield messages until `stop` is set."""
-        from websockets.exceptions import WebSocketException
-        from websockets.sync.client import connect
-
-        while not stop.is_set():
-            try:
-                with connect(self._url, open_timeout=2.0) as socket:
-                    self.away = ""
-                    while not stop.is_set():
-                        try:
-                            message = socket.recv(timeout=0.2)
-                        except TimeoutError:
-                            continue
-                        yield message.encode() if isinstance(message, str) else message
-            except (OSError, WebSocketException) as error:
-                self.away = f"no connection: {error}"
-                stop.wait(RECONNECT_S)
 
 
 def _fixed(text: str, columns: tuple[str, ...]) -> FloatArray:

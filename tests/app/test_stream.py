@@ -18,6 +18,7 @@ from threading import Timer
 import numpy as np
 import pytest
 from glb import ROOT
+from hand import Hand
 from helpers import write_block_robot, write_small_recording
 from small_run import make_run, write_run_with_a_cloud
 from streams import within
@@ -47,9 +48,11 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.model_file import save_model
 from femsense.xr.proprioception.network import linear_network
+from femsense.xr.stream.command_gate import GateOptions
 from femsense.xr.stream.connecting import REFUSED
 from femsense.xr.stream.drag_server import DragOptions
-from femsense.xr.stream.hub import Message
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.mqtt import EmbeddedBroker
 from femsense.xr.stream.websocket import pack, unpack
 from femsense.xr.view import PAGE
 
@@ -217,7 +220,7 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
         while answered.status == "converging":
             answered = server.answer(marker, (place["x"], place["y"], place["z"]))
     assert answered.status in ("reached", "nearest")
-    wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": True}).encode()
+    wish = {"client": "me", "handle": marker, "target_m": place, "held": True, "armed": True}
     for commands in ((), ("--commands",)):
         with (
             command_line("stream", str(run), "--drag", *commands, "--port", "0") as url,
@@ -225,12 +228,15 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
         ):
             heard: dict[str, dict[str, object]] = {}
             with connect(f"{again.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
-                end, sent = time.monotonic() + 30.0, 0.0
+                end, sent, seq = time.monotonic() + 30.0, 0.0, 0
                 while time.monotonic() < end and not (is_found(heard) and heard.get("command", {}).get("armed")):
                     if is_found(heard) and not commands:
                         end = min(end, time.monotonic() + 0.5)
                     if time.monotonic() - sent > 0.03:  # as the page does
-                        viewer.send(pack([Message(f"femsense/{made.robot.name}/drag", wish)]))
+                        lease, seq = heard.get("lease", {}), seq + 1
+                        number = lease["number"] if lease.get("client") == "me" else 0
+                        said = json.dumps({**wish, "seq": seq, "lease": number}).encode()
+                        viewer.send(pack([Message(f"femsense/{made.robot.name}/drag", said)]))
                         sent = time.monotonic()
                     for message in unpack(viewer.recv(5)):
                         if not message.topic.endswith(("/pose", "/ghost", "/cloud", "/field")):
@@ -245,6 +251,23 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
 def is_found(heard: dict[str, dict[str, object]]) -> bool:
     """Whether inputs for the wish are found: answers before that say that they converge."""
     return heard.get("reach", {}).get("status") in ("reached", "nearest")
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_commands_over_a_broker_that_lets_anybody_in_are_refused_unless_that_is_wanted(
+    tmp_path: Path, page: Path, embedded: bool
+) -> None:
+    run, hub = write_run_with_mesh(tmp_path / "bar"), Hub()
+    elsewhere = EmbeddedBroker(hub, port=0)
+    way = {"broker_port": 0} if embedded else {"mqtt": f"127.0.0.1:{elsewhere.port}"}
+    options = StreamOptions(page=page, commands=True, **way)
+    with pytest.raises(InputError, match=r"lets anybody in[\s\S]*--insecure"):
+        stream_runs([run], options)
+    with stream_runs([run], replace(options, insecure=True)) as live:
+        assert live.commands
+    with stream_runs([run], replace(options, commands=False)) as live, pytest.raises(InputError, match="sends no commands"):
+        let_drag(live, run, DragOptions(gate=GateOptions(allowed=True)))
+    hub.close()
 
 
 def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> None:
@@ -264,10 +287,9 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
     )
     readings = tmp_path / "sensors.csv"
     readings.write_text("time_s,bend\n0,1\n", encoding="utf-8")
-    place = dict(zip("xyz", map(float, rest + 2e-3 * np.eye(3)[2])))
-    wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": False}).encode()
     with stream_runs([run], StreamOptions(page=page)) as live:
         let_drag(live, run, DragOptions())
+        hand = Hand(live.hub, robot=made.robot.name)
         with pytest.raises(InputError, match="markers that the robot does not have"):
             measure_by_sensors(live, str(readings), strange)
         with pytest.raises(InputError, match="not in the robot's frame"):
@@ -279,7 +301,7 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
             while time.monotonic() < end and "measured_error_m" not in told:
                 file.write(f"{time.monotonic()},1\n")
                 file.flush()
-                live.hub.received(Message(f"femsense/{made.robot.name}/drag", wish), "me")
+                hand.drag(rest + 2e-3 * np.eye(3)[2], armed=False, handle=marker)
                 time.sleep(0.05)
                 newest = live.hub.newest().get(f"femsense/{made.robot.name}/reach")
                 told = {} if newest is None else json.loads(newest.payload)

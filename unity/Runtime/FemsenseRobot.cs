@@ -34,6 +34,12 @@ namespace Femsense
         [Serializable] private class Bone { public string name = ""; }
         [Serializable] private class Model { public Bone[] bones = null; }
 
+        /// <summary>Ends all motion of the robot, whoever steers it.</summary>
+        public void Stop()
+        {
+            stream.Stop(robot);
+        }
+
         private void Update()
         {
             var model = stream.Take("femsense/" + robot + "/model");

@@ -117,6 +117,18 @@ namespace Femsense
     /// <summary>Frames of the WebSocket: topic length uint16, payload length uint32, topic, payload, again and again.</summary>
     public static class Frames
     {
+        /// <summary>Returns a frame of one message.</summary>
+        public static byte[] Write(string topic, byte[] payload)
+        {
+            var name = Encoding.UTF8.GetBytes(topic);
+            var frame = new byte[6 + name.Length + payload.Length];
+            BitConverter.GetBytes((ushort)name.Length).CopyTo(frame, 0);
+            BitConverter.GetBytes((uint)payload.Length).CopyTo(frame, 2);
+            name.CopyTo(frame, 6);
+            payload.CopyTo(frame, 6 + name.Length);
+            return frame;
+        }
+
         public static List<Message> Read(byte[] frame, int length)
         {
             var found = new List<Message>();

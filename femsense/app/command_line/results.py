@@ -118,9 +118,13 @@ def stream(
         str | None, option("--sensors", "SOURCE", "CSV file, udp://, mqtt://, serial: – alone, or with --drag.")
     ] = None,
     model: Annotated[Path | None, option("--model", "MODEL", "Of femsense learn, for --sensors.")] = None,
+    skin: Annotated[Path | None, option("--skin", "FILE", "With --sensors: the robot's surface, GLB, STL, OBJ, PLY.")] = None,
+    skin_unit: Annotated[str | None, option("--skin-unit", "UNIT", "Of its coordinates: m, cm or mm.")] = None,
     drag: Annotated[bool, option("--drag", help="Let viewers drag the robot of the first run.")] = False,
     commands: Annotated[bool, option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
+    insecure: Annotated[bool, option("--insecure", help="With --commands: also over a broker that lets anybody in.")] = False,
     host: Annotated[str, option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
+    names: Annotated[list[str] | None, option("--name", "NAME", "By which others know this machine.")] = None,
     port: Annotated[int, option("--port", help="Of the page and its WebSocket; 0: a free one.", min=0, max=65535)] = 8010,
     mqtt: Annotated[str | None, option("--mqtt", "HOST[:PORT]", "Send to this broker; mqtts:// encrypts.")] = None,
     broker: Annotated[bool, option("--broker", help="Serve a broker for this machine.")] = False,
@@ -143,7 +147,10 @@ def stream(
     runs = [run_of(run) for run in runs or []]
     need_stream(runs, sensors, drag=drag)
     need_model(sensors, model)
+    need_with("--skin", skin is not None, "--sensors alone", sensors is not None and not runs)
+    need_with("--skin-unit", skin_unit is not None, "--skin", skin is not None)
     need_with("--commands", commands, "--drag", drag)
+    need_with("--insecure", insecure, "--commands", commands)
     need_with("--drag", drag, "RUN", bool(runs))
     need_with("--once", once, "RUN", bool(runs))
     need_with("--broker-port", broker_port is not None, "--broker", broker)
@@ -153,9 +160,12 @@ def stream(
     from femsense.app.stream_command import StreamOptions, let_drag, measure_by_sensors, stream_runs, stream_sensors
 
     served = (1883 if broker_port is None else broker_port) if broker else None
-    options = filled(StreamOptions, locals(), broker_port=served)
+    options = filled(StreamOptions, locals(), broker_port=served, names=tuple(names or ()))
     if sensors is not None and model is not None and not runs:
-        return _live(stream_sensors(sensors, model, options, say=say), browser)
+        from femsense.xr.user_skin import read_skin
+
+        worn = None if skin is None else read_skin(skin, unit=skin_unit)
+        return _live(stream_sensors(sensors, model, options, skin=worn, say=say), browser)
     live = stream_runs(runs or [], options, loop=not once, say=say)
     if drag:
         from femsense.xr.stream.command_gate import GateOptions

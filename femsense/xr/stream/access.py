@@ -6,6 +6,7 @@ import base64
 import hmac
 import ipaddress
 import secrets
+import socket
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,8 @@ class Access:
     certificate: Path | None = None
     """PEM file; with it all traffic is encrypted."""
     key: Path | None = None
+    names: tuple[str, ...] = ()
+    """Further names under which other machines know this one: of a proxy, a tunnel, a router."""
     ticket: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
     """What the page's cookie holds once the password was given; made anew for each server."""
 
@@ -74,10 +77,18 @@ class Access:
                 return True
         return _same(_password_of(authorization), self.password)
 
-    def knows_host(self, header: str | None) -> bool:
-        """Return whether a Host header may be ours; without a password only names of this machine, so that no foreign page
-        reaches us under its own name."""
-        return self.password is not None or _name_of(header or "") in LOOPBACK_NAMES
+    def knows_host(self, header: str | None, reached_at: str) -> bool:
+        """Return whether a Host header is ours, so that no foreign page reaches us under its own name (DNS rebinding).
+
+        Names of this machine's own loopback always are; with a password also the machine's name, the address that was reached, and
+        those that were declared.
+        """
+        name = _name_of(header or "").lower().rstrip(".")
+        if name in LOOPBACK_NAMES or self.password is None:
+            return name in LOOPBACK_NAMES
+        here = socket.gethostname().lower()
+        own = {here, here.partition(".")[0], f"{here.partition('.')[0]}.local", reached_at.lower(), self.host.lower()}
+        return name in own | {one.lower() for one in self.names}
 
 
 def is_loopback(host: str) -> bool:

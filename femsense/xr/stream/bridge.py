@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import ssl
 import urllib.request
 from collections.abc import Callable, Collection
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 from femsense.core.errors import InputError
-from femsense.xr.stream.connecting import NO_ANSWER, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import MqttSource, broker_address
 from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
-from femsense.xr.stream.quiet import stream_log
-from femsense.xr.stream.websocket import pack, require_websockets, unpack
-
-if TYPE_CHECKING:
-    from websockets.sync.connection import Connection
+from femsense.xr.stream.web_source import WebSource
+from femsense.xr.stream.websocket import pack, unpack
 
 LARGEST_MESH = 64 << 20
 """Bytes of a mesh that is taken from elsewhere."""
-AGAIN_S = (0.2, 0.5, 1.0, 2.0)
-"""How long to wait before the next attempt to connect [s]; the last for all further ones."""
 
 
 class Bridge:
@@ -58,8 +51,15 @@ class Bridge:
             self._trouble: Callable[[], str] = lambda: source.trouble
         elif scheme in ("http", "https", "ws", "wss"):
             viewer = _Viewer(self, url, password, authority)
-            self._send, self._close = viewer.send, viewer.close
-            self._trouble = lambda: viewer.trouble
+            web = WebSource(viewer.socket, headers=viewer.headers, lost=viewer.lost, **viewer.options)
+
+            def take(frame: bytes) -> None:
+                viewer.take(frame)
+                web.send(b"")  # confirmed: the next may come
+
+            Thread(target=web.run, args=(take, self._stop), daemon=True, name="femsense-bridge").start()
+            self._send, self._close = lambda message: web.send(pack([message])), lambda: None
+            self._trouble = lambda: web.away
         else:
             raise InputError("not a stream", where="--stream", found=url, expected="http://…, ws://…, mqtt://…, or with s")
         hub.listen(self._back)
@@ -94,66 +94,25 @@ class Bridge:
 
 
 class _Viewer:
-    """A viewer of another femsense: reads its WebSocket, fetches its meshes, comes back when it was gone."""
+    """A viewer of another femsense: takes its messages and fetches its meshes."""
 
     def __init__(self, bridge: Bridge, url: str, password: str | None, authority: Path | None) -> None:
-        require_websockets()
         parts = urlsplit(url)
         secure = parts.scheme in ("https", "wss")
         self._bridge, self._at = bridge, parts.netloc
-        self._secure = secure
+        self.socket = f"{'wss' if secure else 'ws'}://{self._at}/ws"
+        self._pages = f"{'https' if secure else 'http'}://{self._at}"
         self._tls = ssl.create_default_context(cafile=authority) if secure else None
-        self._headers = {}
-        if password:
-            word = base64.b64encode(f"femsense:{password}".encode()).decode()
-            self._headers["Authorization"] = f"Basic {word}"
-        self._connection: Connection | None = None
-        self.trouble = NO_ANSWER
-        self._stop = Event()
+        self.options: dict[str, Any] = {"max_size": LARGEST_MESH, **({"ssl": self._tls} if secure else {})}
+        word = base64.b64encode(f"femsense:{password}".encode()).decode()
+        self.headers = {"Authorization": f"Basic {word}"} if password else {}
         self._known: dict[str, str] = {}
-        Thread(target=self._run, daemon=True, name="femsense-bridge").start()
 
-    def send(self, message: Message) -> None:
-        connection = self._connection
-        if connection is not None:
-            with contextlib.suppress(Exception):  # gone meanwhile: what is old is not sent again
-                connection.send(pack([message]))
+    def lost(self) -> None:
+        self._bridge.lost(list(self._known), self._at)
 
-    def close(self) -> None:
-        self._stop.set()
-        connection = self._connection
-        if connection is not None:
-            Thread(target=connection.close, daemon=True).start()
-
-    def _run(self) -> None:
-        from websockets.exceptions import WebSocketException
-
-        attempt = 0
-        while not self._stop.is_set():
-            try:
-                self._read()
-                attempt, self.trouble = 0, NO_ANSWER
-            except (OSError, WebSocketException, EOFError, InputError) as error:
-                self.trouble = why_not(error, tls=self._secure, password="Authorization" in self._headers)
-            self._connection = None
-            self._bridge.lost(list(self._known), self._at)
-            self._stop.wait(AGAIN_S[min(attempt, len(AGAIN_S) - 1)])
-            attempt += 1
-
-    def _read(self) -> None:
-        from websockets.sync.client import connect
-
-        address = f"{'wss' if self._secure else 'ws'}://{self._at}/ws"
-        more: dict[str, Any] = {"ssl": self._tls} if self._secure else {}
-        more |= {"compression": None, "max_size": LARGEST_MESH, "open_timeout": 5, "proxy": None, "logger": stream_log()}
-        with connect(address, additional_headers=self._headers, **more) as connection:
-            self._connection, self.trouble = connection, ""
-            for frame in connection:
-                if isinstance(frame, bytes):
-                    self._take(list(unpack(frame)))
-
-    def _take(self, messages: list[Message]) -> None:
-        meshes = []
+    def take(self, frame: bytes) -> None:
+        messages, meshes = list(unpack(frame)), []
         for message in messages:
             known = split_topic(message.topic)
             if known is not None and known[1] == MODEL:
@@ -165,8 +124,7 @@ class _Viewer:
         digest = str((read_document(model.payload) or {}).get("glb_sha256", ""))
         if self._known.get(robot) == digest and digest:
             return []
-        address = f"{'https' if self._secure else 'http'}://{self._at}/robots/{robot}.glb"
-        request = urllib.request.Request(address, headers=self._headers)
+        request = urllib.request.Request(f"{self._pages}/robots/{robot}.glb", headers=self.headers)
         with urllib.request.urlopen(request, timeout=10, context=self._tls) as answer:
             glb = answer.read(LARGEST_MESH)
         self._known[robot] = digest

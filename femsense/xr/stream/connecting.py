@@ -41,7 +41,7 @@ def _refused_by_server(status: int, *, password: bool) -> str:
     if status == 401:
         return not_let_in(password=password)
     if status == 403:
-        return "the server answers only to its own names: 127.0.0.1, or a stream with a password"
+        return "the server answers only to its own names: 127.0.0.1, or with a password those of its machine and of --name"
     if status == 503:
         return "too many viewers"
     return f"what answers there is no stream of femsense (HTTP {status}): is it the right port?"

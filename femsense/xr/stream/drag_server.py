@@ -1,6 +1,7 @@
 """Answers a dragged point: inputs by a `Follower`, the shape that the robot can take, and commands while armed and held.
 
-Each wish is answered with where the way to it stands; while a wish stays, answers go on until nothing comes nearer.
+One client steers at a time (`lease`), and anybody can stop everything. Each wish is answered with where the way to it stands;
+while a wish stays, answers go on until nothing comes nearer.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from threading import Event, Lock, Thread
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +24,18 @@ from femsense.fem.mesh import embed_points
 from femsense.model.robot import Robot
 from femsense.xr.skinning import Skin, prepare_poses
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
+from femsense.xr.stream.drag_messages import Wish, in_plain_words, is_number, place_of, read_wish, rows_of
 from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.lease import Lease, Ruling
 from femsense.xr.stream.payloads import (
     COMMAND,
     DRAG,
     GHOST,
     INPUTS,
+    LEASE,
     MEASURED,
     REACH,
+    STOP,
     Handle,
     Input,
     bone_rows,
@@ -62,17 +67,6 @@ class DragOptions:
     """A hand that has not moved for so long rests: its target is sought from rest too where it is not reached [s]."""
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
     """How what is measured corrects the inputs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Wish:
-    """Where someone wants a point."""
-
-    who: str
-    handle: str
-    target_m: tuple[float, float, float] | None
-    held: bool
-    armed: bool
 
 
 def drive_inputs(robot: Robot) -> tuple[Input, ...]:
@@ -127,7 +121,7 @@ class DragServer:
         self._grabbed = False  # a point, since the last answer
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
-        self._driver, self._driver_at = "", float("-inf")
+        self.lease = Lease(self.options.gate.hold_s)
         self._told: dict[str, float] = {}  # the robot's own word of its inputs
         self._told_at = float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
@@ -137,7 +131,7 @@ class DragServer:
         self._unmeasured, self._unmeasured_at = "", float("-inf")  # why it is not
         self._answer: tuple[FloatArray, dict[str, Any]] | None = None
         self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
-        self._seq = self._commands = 0
+        self._seq = self._commands = self._leases = 0
         hub.listen(self._hear)
         self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
         for thread in self._threads:
@@ -160,11 +154,13 @@ class DragServer:
             self._measure(message.payload)
         elif known[1] == DRAG:
             self._take(message, who)
+        elif known[1] == STOP:
+            self.stop()
 
     def _measure(self, payload: bytes) -> None:
         """Take note of where the dragged marker was measured, and of what the robot says of its inputs."""
         told, now = read_document(payload) or {}, time.monotonic()
-        places = {str(row.get("name")): _place(row.get("position_m")) for row in _rows(told, "markers")}
+        places = {str(row.get("name")): place_of(row.get("position_m")) for row in rows_of(told, "markers")}
         inputs = self._values(told)
         with self._lock:
             place = places.get(self._handle)
@@ -176,34 +172,56 @@ class DragServer:
             if inputs:
                 self._told, self._told_at = inputs, now
 
-    def _take(self, message: Message, who: str) -> None:
-        wish = self._read(message.payload, who)
-        now = time.monotonic()
+    def stop(self) -> None:
+        """End all motion at once, whoever steers; who wants to go on has to disarm first."""
         with self._lock:
-            if wish is None or (who != self._driver and now - self._driver_at < 4.0 * self.options.gate.hold_s):
-                return  # one hand at a time
-            if not wish.held or wish.handle != self._handle or now - self._driver_at > self.options.gate.hold_s:
-                self.gate.release()  # what was wanted before is not wanted now
-                self.feedback.forget()
-                self._grabbed = wish.held
-            self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
-            self.gate.hold(now, armed=wish.armed and wish.held)
-            self._handle = wish.handle if wish.held else ""
-            self._wish = wish if wish.held else None
+            self.lease.stop()
+            self._let_go()
+        if self.options.gate.allowed:
+            self._stopped()
+        self._say_who_steers()
+
+    def _let_go(self) -> None:
+        """Forget what was wanted: it is not wanted now."""
+        self.gate.release()
+        self.feedback.forget()
+        self._wish, self._handle, self._grabbed = None, "", False
+
+    def _take(self, message: Message, who: str) -> None:
+        wish, now = read_wish(message.payload, who), time.monotonic()
+        if wish is None or not self._can_be_meant(wish):
+            return
+        with self._lock:
+            ruling = self.lease.rule(wish.claim, now)
+            if ruling is Ruling.RELEASED:
+                self._let_go()
+            elif ruling in (Ruling.GRANTED, Ruling.RENEWED):
+                if ruling is Ruling.GRANTED or wish.handle != self._handle:
+                    self._let_go()
+                    self._grabbed = True
+                if ruling is Ruling.RENEWED:
+                    self.gate.hold(now, armed=wish.claim.armed)
+                self._wish, self._handle = wish, wish.handle
+        if ruling is not Ruling.RENEWED:
+            self._say_who_steers()
         self._fresh.set()
 
-    def _read(self, payload: bytes, who: str) -> Wish | None:
-        """Return a wish, or None where it is none or wants something that cannot be meant."""
-        told = read_document(payload, most=4096)
-        if told is None:
-            return None
-        handle, held = told.get("handle"), told.get("held") is True
-        target = _place(told.get("target_m"))
-        if handle not in self.robot.glued_names or (held and target is None):
-            return None
-        if target is not None and not self._is_near(target):
-            return None
-        return Wish(who, str(handle), target, held, told.get("armed") is True)
+    def _say_who_steers(self) -> None:
+        self._leases += 1
+        document = {
+            "header": header(self._leases, time.time(), "robot"),
+            "client": self.lease.client,
+            "number": self.lease.number,
+            "expires_s": self.lease.hold_s,
+            "stopped": self.lease.stopped,
+        }
+        self.hub.publish([Message(topic(self.name, LEASE), json.dumps(document).encode())])
+
+    def _can_be_meant(self, wish: Wish) -> bool:
+        """Return whether a wish is for a marker of the robot, and not far away from it."""
+        if not wish.claim.held:
+            return True
+        return wish.handle in self.robot.glued_names and wish.target_m is not None and self._is_near(wish.target_m)
 
     def _is_near(self, place_m: tuple[float, float, float]) -> bool:
         middle = self.robot.body.mesh.nodes.mean(axis=0)
@@ -231,7 +249,7 @@ class DragServer:
         begun = time.perf_counter()
         with self._lock:
             turn, grabbed, self._grabbed = self.gate.turn, self._grabbed, False
-            moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
+            moves = self.options.gate.allowed and self._wish is not None and self._wish.claim.armed
             current = {**self.gate.last, **self._current(time.monotonic())} if moves else self._shown()
             last = self._motion
             reached = None if last is None else last.reached_m.get(handle)
@@ -290,12 +308,12 @@ class DragServer:
         units = {one.name: one.unit for one in self.gate.inputs}
         missed = self.feedback.missed_m
         unknown = self._why_not_measured(handle, time.monotonic())
-        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
+        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm away from there"
         known = {} if np.isnan(missed) else {"measured_error_m": missed}
         begins = "" if self._is_known(time.monotonic()) else BEGINS
         return {
             "status": motion.status,
-            "text": motion.text + measured + begins,
+            "text": in_plain_words(motion) + measured + begins,
             "error_m": motion.error_m,
             **known,
             "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
@@ -312,6 +330,9 @@ class DragServer:
             with self._lock:
                 inputs = self.gate.step(time.monotonic(), self._current(time.monotonic()))
                 moving = self.gate.moving
+                expired = self.lease.expire(time.monotonic())
+            if expired:
+                self._say_who_steers()
             if inputs is not None:
                 self._command(inputs, armed=True)
             elif was_moving and not moving:
@@ -360,26 +381,8 @@ class DragServer:
     def _values(self, told: Mapping[str, Any]) -> dict[str, float]:
         """Return the inputs in a document, as far as they are in the units of commands."""
         units = {one.name: one.unit for one in self.gate.inputs}
-        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in _rows(told, "inputs")]
-        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and _is_number(v)}
-
-
-def _rows(told: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """Return the objects in a list of a document."""
-    rows = told.get(name)
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-
-
-def _is_number(told: object) -> TypeGuard[float]:
-    return isinstance(told, int | float) and bool(np.isfinite(told))
-
-
-def _place(told: object) -> tuple[float, float, float] | None:
-    """Return x, y, z of an object, or None."""
-    if not isinstance(told, dict):
-        return None
-    values = [float(v) for v in (told.get(axis) for axis in "xyz") if _is_number(v)]
-    return (values[0], values[1], values[2]) if len(values) == 3 else None
+        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in rows_of(told, "inputs")]
+        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and is_number(v)}
 
 
 def _top(limit: float | None, unit: str) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
@@ -29,13 +29,13 @@ class GrowingFile:
         self.away = ""
         """Why there are no rows, as far as the file itself is the reason."""
         self.age_s = 0.0
-        """How long ago the row that was yielded last was written at least [s]: of what stood there already the file's own time says it."""
+        """How long ago the row that is heard now was written at least [s]: of what stood there already the file's own time says it."""
         if file.is_dir() or not file.absolute().parent.is_dir():
             raise InputError(
                 "no such source",
                 where="--sensors",
                 found=file,
-                expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC or serial:PORT?baud=115200",
+                expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC, ws://HOST:PORT/PATH or serial:PORT?baud=115200",
             )
         self._open()
         if self._missing:
@@ -43,8 +43,8 @@ class GrowingFile:
                 "channels are missing", where=file, found=", ".join(self._columns), expected=", ".join(self._missing)
             )
 
-    def rows(self, stop: Event) -> Iterator[dict[str, str]]:
-        """Yield the last row, then those that are written, column → text, until `stop` is set."""
+    def run(self, hear: Callable[[dict[str, str]], None], stop: Event) -> None:
+        """Call hear(row) with the last row, then those that are written, column → text, until `stop` is set."""
         rest, is_old = "", True
         while not stop.is_set():
             if self._stream is None and not self._open():
@@ -55,7 +55,7 @@ class GrowingFile:
                 rest, is_old = self._end(), False
             *lines, rest = (rest + self._stream.read(CHUNK)).split("\n")
             for line in lines:
-                yield dict(zip(self._columns, next(csv.reader([line]), [])))
+                hear(dict(zip(self._columns, next(csv.reader([line]), []))))
             if not lines:
                 self.age_s = 0.0  # what comes from now on is written while we watch
                 stop.wait(POLL_S)

@@ -9,9 +9,9 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
@@ -20,7 +20,7 @@ from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.packet_limit import PacketLimit
-from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, STOP, split_topic, status_bytes, topic
 from femsense.xr.stream.quiet import keep_quiet
 
 if TYPE_CHECKING:
@@ -87,8 +87,53 @@ class Refusal:
         self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
 
 
-class MqttSink:
-    """Sends a hub's messages to a broker; comes back by itself where the broker goes away.
+class MqttLink:
+    """A client of a broker that comes back by itself where the broker goes away."""
+
+    def __init__(self, address: BrokerAddress, topics: Sequence[str]) -> None:
+        """Prepare a client that listens to the topics that filters name. Raises MissingDependency."""
+        self._address, self._topics = address, topics
+        self._client = make_client(address)
+        self._refusal = Refusal(self._client, address)
+        self.connected = Event()
+        self.was_connected = False
+        self._client.on_connect = self._greet
+        self._client.on_disconnect = self._leave
+        self._client.on_message = lambda _c, _d, got: self._hear(Message(got.topic, bytes(got.payload)), kept=bool(got.retain))
+
+    def _begin(self) -> None:
+        """Connect in the background."""
+        self._client.connect_async(self._address.host, self._address.port, keepalive=5)
+        self._client.loop_start()
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; empty where there is one."""
+        return "" if self.connected.is_set() else self._refusal.text
+
+    def close(self) -> None:
+        """Take leave, so that the last will is not executed."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _hear(self, message: Message, *, kept: bool) -> None:
+        """Take a message; `kept`: the broker had it from earlier."""
+        raise NotImplementedError
+
+    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        if self._refusal.refused(reason):
+            return
+        client.subscribe([(one, 0) for one in self._topics])
+        self.connected.set()
+        self.was_connected = True
+
+    def _leave(self, *_: object) -> None:
+        self._refusal.closed(was_connected=self.connected.is_set())
+        self.connected.clear()
+
+
+class MqttSink(MqttLink):
+    """Sends a hub's messages to a broker.
 
     While there is no broker nothing is kept: what is retained is sent again when it is back, all else is old by then. Where the
     program ends without a word, the broker says for the first robot that it is lost (the last will).
@@ -96,52 +141,46 @@ class MqttSink:
 
     def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
+        super().__init__(address, WANTED)
         self.hub = hub
-        self._status, self._client = topic(robot, STATUS), make_client(address)
-        self._refusal = Refusal(self._client, address)
-        self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
-        self._client.on_connect = self._greet
-        self.connected = Event()
-        self.was_connected = False
+        self._client.will_set(topic(robot, STATUS), status_bytes("lost"), qos=0, retain=True)
+        self._waiting: dict[str, Message] = {}
+        self._lock = Lock()
         self._packets = PacketLimit(f"{address.host}:{address.port}")
-        self._client.on_disconnect = self._leave
-        self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
-        self._client.connect_async(address.host, address.port, keepalive=5)
-        self._client.loop_start()
+        self._begin()
         hub.attach(self)
 
-    @property
-    def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal.text
-
     def send(self, messages: tuple[Message, ...]) -> None:
-        """Hand messages to the broker if there is one; returns at once."""
+        """Hand messages to the broker if there is one; returns at once.
+
+        While the connection has not taken the ones before, the newest of each topic wait; what is retained never does.
+        """
         if not self.connected.is_set():
             return
-        for message in messages:
+        with self._lock:
+            self._waiting.update((message.topic, message) for message in messages)
+            if self._client.want_write() and not any(message.retained for message in messages):
+                return
+            taken, self._waiting = list(self._waiting.values()), {}
+        for message in taken:
             self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
 
-    def close(self) -> None:
-        """Take leave, so that the will is not executed."""
-        self._client.disconnect()
-        self._client.loop_stop()
+    def _hear(self, message: Message, *, kept: bool) -> None:
+        """Pass on what others send. What the broker kept from earlier is nobody's wish of now; a stop counts whenever it comes."""
+        if not kept or message.topic.endswith(f"/{STOP}"):
+            self.hub.received(message, "MQTT")
 
-    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if self._refusal.refused(reason):
-            return
-        client.subscribe([(one, 0) for one in WANTED])
-        self.connected.set()
-        self.was_connected = True
-        self.send(self._packets.fitting(tuple(message for message in self.hub.newest().values() if message.retained)))
+    def _greet(self, *told: Any) -> None:
+        super()._greet(*told)
+        if self.connected.is_set():
+            self.send(self._packets.fitting(tuple(message for message in self.hub.newest().values() if message.retained)))
 
-    def _leave(self, *_: object) -> None:
+    def _leave(self, *told: object) -> None:
         self._packets.ended()
-        self._refusal.closed(was_connected=self.connected.is_set())
-        self.connected.clear()
+        super()._leave(*told)
 
 
-class MqttSource:
+class MqttSource(MqttLink):
     """Receives from a broker what streams there."""
 
     def __init__(
@@ -151,46 +190,47 @@ class MqttSource:
         *,
         topics: Sequence[str] = (f"{PREFIX}/#",),
         lost: Callable[[], None] = lambda: None,
+        kept: bool = True,
     ) -> None:
         """Call receive(message) in a thread of its own, for the topics that filters name, and lost() when the broker goes away.
 
-        Raises MissingDependency.
+        `kept`: also with what the broker has kept from earlier. Raises MissingDependency.
         """
-        self._client = make_client(address)
-        self._refusal = Refusal(self._client, address)
-        self.connected = Event()
-        self._topics = tuple(topics)
-        self._client.on_connect = self._greet
-        self._client.on_disconnect = self._leave
-        self._lost = lost
-        self._client.on_message = lambda _c, _d, got: receive(Message(got.topic, bytes(got.payload)))
-        self._client.connect_async(address.host, address.port, keepalive=5)
-        self._client.loop_start()
-
-    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if self._refusal.refused(reason):
-            return
-        client.subscribe([(one, 0) for one in self._topics])
-        self.connected.set()
-
-    def _leave(self, *_: object) -> None:
-        self._refusal.closed(was_connected=self.connected.is_set())
-        self.connected.clear()
-        self._lost()
-
-    @property
-    def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
-        return "" if self.connected.is_set() else self._refusal.text
+        super().__init__(address, topics)
+        self._receive, self._lost, self._kept = receive, lost, kept
+        self._begin()
 
     def send(self, message: Message) -> None:
         """Publish a message."""
         self._client.publish(message.topic, message.payload, qos=0)
 
-    def close(self) -> None:
-        """Leave the broker."""
-        self._client.disconnect()
-        self._client.loop_stop()
+    def _hear(self, message: Message, *, kept: bool) -> None:
+        if self._kept or not kept:
+            self._receive(message)
+
+    def _leave(self, *_: object) -> None:
+        super()._leave()
+        self._lost()
+
+
+def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | None:
+    """Return whether a broker accepts a client without a name and password; None where it does not answer in time [s]."""
+    if address.user is None:
+        return True
+    answered, accepted = Event(), []
+    client = make_client(replace(address, user=None, password=None))
+
+    def answer(_client: Any, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        accepted.append(not reason.is_failure)
+        answered.set()
+
+    client.on_connect = answer
+    client.connect_async(address.host, address.port)
+    client.loop_start()
+    answered.wait(timeout_s)
+    client.disconnect()
+    client.loop_stop()
+    return accepted[0] if accepted else None
 
 
 def make_client(address: BrokerAddress) -> Client:

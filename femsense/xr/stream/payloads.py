@@ -38,8 +38,9 @@ MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, FIELD, STATUS = (
     "status",
 )
 DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
-RECEIVED = (DRAG, MEASURED)
-"""What others may send: wishes, and where markers of the robot are."""
+LEASE, STOP = "lease", "stop"
+RECEIVED = (DRAG, MEASURED, STOP)
+"""What others may send: wishes, where markers of the robot are, and that all motion ends."""
 RETAINED = (MODEL, GLB, STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"
@@ -114,6 +115,8 @@ class Twin:
     """Of a run that is played over and over; nan: none is."""
     field: FieldKind | None = None
     """What `TwinFrame.field` holds."""
+    error_m: float = float("nan")
+    """Root mean square distance of its markers from the measured ones, where a learnt model was tested [m]; nan: not known."""
     frame: str = "robot"
     """Of reference of all that is sent, one of `FRAMES`; "markers": where these were never brought into the robot's frame."""
 
@@ -253,6 +256,7 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
                 "markers": [{"name": m.name, "position_m": _vector(m.position_m)} for m in known.markers],
                 "cameras": [{"name": c.name, "position_m": _vector(c.position_m)} for c in known.cameras],
                 "duration_s": twin.duration_s,
+                "error_m": twin.error_m,
                 **({"field": {"name": twin.field.name, "unit": twin.field.unit}} if twin.field else {}),
             }
         )

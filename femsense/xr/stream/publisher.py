@@ -62,9 +62,13 @@ class RateLimit:
         self._interval = 1.0 / rate_hz
         self._next = float("-inf")
 
+    def wait_s(self, now: float) -> float:
+        """Return how long after this time [s] the next message may go out [s]."""
+        return max(0.0, self._next - EARLY * self._interval - now)
+
     def allows(self, now: float) -> bool:
         """Return whether a message at this time [s] may go out."""
-        if now < self._next - EARLY * self._interval:
+        if self.wait_s(now) > 0.0:
             return False
         self._next = max(self._next, now - EARLY * self._interval) + self._interval
         return True
@@ -118,6 +122,10 @@ class Publisher:
             self.hub.publish([*self._judged(moment), *self._messages(frame, moment, is_new=is_new)])
             self._seq += 1
         return True
+
+    def wait_s(self) -> float:
+        """Return how long it takes until the next frame may go out [s]: who takes the newest then sends nothing that is old."""
+        return self._pose_limit.wait_s(time.monotonic())
 
     def watch(self, *, now: float | None = None) -> None:
         """Say that it is stale where nothing was read for `STALE_S`; the next pose says that it is live."""

@@ -1,17 +1,17 @@
-"""Readings of sensors as they come: from a CSV file that grows, UDP, MQTT, or a serial line."""
+"""The newest readings of sensors: from a CSV file that grows, UDP, MQTT, a WebSocket, or a serial line."""
 
 from __future__ import annotations
 
 import json
-import queue
 import re
 import socket
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,10 +19,13 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.latest import Latest
 from femsense.io.text_numbers import Notation
 from femsense.xr.stream.growing_file import GrowingFile
 from femsense.xr.stream.mqtt import MqttSource, broker_address
+from femsense.xr.stream.sender_clock import SenderClock
 from femsense.xr.stream.serial_line import LONGEST_LINE, WAIT_S, SerialLine
+from femsense.xr.stream.web_source import WebSource
 
 SHOWN = 60
 """Characters of a line that is no reading."""
@@ -37,41 +40,77 @@ Reading = tuple[float, FloatArray]
 """Time [s], and one value for each channel; nan where there is none."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Made:
+    """A reading, and when it was made [s, monotonic clock]."""
+
+    reading: Reading
+    made_at: float
+
+
 class Readings(Iterator[Reading]):
-    """Readings as they come, and what is the matter where none do."""
+    """The newest reading of a source, again and again: what was replaced before it was asked for is only counted."""
 
     def __init__(
         self,
-        items: Iterator[Any],
         read: Callable[[Any], Reading | None],
+        stop: Event,
         *,
         away: Callable[[], str] = lambda: "",
         age_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """Read items; `away` says why the source is not there, or nothing, and `age_s` how old the item before was when it came [s]."""
-        self._items, self._read, self._away, self._age_s = items, read, away, age_s
+        """Wait for items until `stop` is set.
+
+        Arguments:
+            read: returns the reading in an item, or None.
+            stop: ends it.
+            away: says why the source is not there, or nothing.
+            age_s: least age of the item that is heard now, by the source [s].
+        """
+        self._read, self._stop, self._away, self._age_s = read, stop, away, age_s
         self._begun = time.monotonic()
+        self._clock, self._slot = SenderClock(), Latest[_Made]()
         self._first: Any = None
+        self._newest_at = self._late_s = float("nan")
         self.came = float("nan")
-        """When the newest reading was made, as far as its source says, else when it came [s, monotonic clock]; nan: none came."""
+        """When the reading that was returned last was made, by its sender's time, else when it arrived [s, monotonic clock]."""
         self.passed = 0
         """How many items were no readings."""
+        self.overtaken = 0
+        """How many readings arrived after one that their sender had made later."""
+
+    def hear(self, item: Any) -> None:
+        """Take what arrives; to be called in the order of arrival."""
+        found = self._read(item)
+        if found is None:
+            self._pass_over(item)
+            return
+        arrived = time.monotonic()
+        late = self._clock.age_s(found[0], arrived)
+        if late is None:
+            self.overtaken += 1
+            return
+        age = max(late, self._age_s())
+        self._newest_at, self._late_s = arrived - age, late
+        when = found[0] if np.isfinite(found[0]) else arrived - self._begun
+        self._slot.put(_Made((when, found[1]), arrived - age))
 
     def __next__(self) -> Reading:
-        for item in self._items:
-            found = self._read(item)
-            if found is not None:
-                now = time.monotonic()
-                self.came = now - self._age_s()
-                when, values = found
-                return (when if np.isfinite(when) else now - self._begun), values
-            self._pass_over(item)
+        while not self._stop.is_set():
+            if (made := self._slot.take(WAIT_S)) is not None:
+                self.came = made.made_at
+                return made.reading
         raise StopIteration
 
     def _pass_over(self, item: Any) -> None:
         if not _is_blank(item):
             self.passed += 1
             self._first = item if self._first is None else self._first
+
+    @property
+    def dropped(self) -> int:
+        """How many readings were replaced by newer ones before they were asked for, or were overtaken on their way."""
+        return self._slot.dropped + self.overtaken
 
     @property
     def away(self) -> str:
@@ -83,9 +122,12 @@ class Readings(Iterator[Reading]):
         """Why no readings come; empty while they do and the source is there."""
         if why := self.away:
             return why
-        if np.isfinite(self.came):
-            return "they stopped" if time.monotonic() - self.came > QUIET_S else ""
-        return self.refused or "nothing has come yet"
+        if not np.isfinite(self._newest_at):
+            return self.refused or "nothing has come yet"
+        if time.monotonic() - self._newest_at <= QUIET_S:
+            return ""
+        late = self._late_s
+        return f"they come {late:.1f} s late by the time that their sender gives them" if late > QUIET_S else "they stopped"
 
     @property
     def refused(self) -> str:
@@ -94,18 +136,13 @@ class Readings(Iterator[Reading]):
         comma = ": a decimal comma? Write a point, or semicolons between numbers" if WHOLE_PAIR.fullmatch(text) else ""
         return f"what comes is no reading of its channels, first {_shown(self._first)}{comma}" if self.passed else ""
 
-    def close(self) -> None:
-        """Let go of the source."""
-        if isinstance(self._items, Generator):
-            self._items.close()
-
 
 def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
-    """Open a source and return what yields its readings until `stop` is set; lines that are none are passed over.
+    """Open a source and return what yields its newest reading until `stop` is set; lines that are none are passed over.
 
     Arguments:
-        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, or `serial:PORT?baud=115200`. What comes by UDP,
-            MQTT or a serial line is a JSON object channel → number,
+        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, `ws://HOST:PORT/PATH`, or `serial:PORT?baud=115200`. What comes
+            by UDP, MQTT, WebSocket or a serial line is a JSON object channel → number,
             or numbers with commas between in the order of the channels; `time_s` is optional.
         channels: names, in the order of the values that are yielded.
         stop: ends it.
@@ -121,16 +158,22 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
     parts = urlsplit(source)
     read = partial(read_line, channels=channels)
     if parts.scheme == "udp":
-        return Readings(_datagrams(source, stop), read)
+        endpoint = _bound(source)
+        readings = Readings(read, stop)
+        return _listening(readings, lambda: _receive(endpoint, readings.hear, stop))
     if parts.scheme in ("mqtt", "mqtts"):
-        waiting: queue.Queue[bytes] = queue.Queue(1)
-        broker = _topic(source, waiting)
-        return Readings(_newest(broker, waiting, stop), read, away=lambda: broker.trouble and f"no connection, {broker.trouble}")
+        return _subscribed(source, read, stop)
+    if parts.scheme in ("ws", "wss"):
+        web = WebSource(source)
+        readings = Readings(read, stop, away=lambda: web.away and f"no connection, {web.away}")
+        return _listening(readings, lambda: web.run(readings.hear, stop))
     if parts.scheme == "serial":
         line = SerialLine(source)
-        return Readings(line.lines(stop), read, away=lambda: line.away)
+        readings = Readings(read, stop, away=lambda: line.away)
+        return _listening(readings, lambda: line.run(readings.hear, stop))
     file = GrowingFile(Path(source), channels)
-    return Readings(file.rows(stop), lambda row: _of_object(row, channels), away=lambda: file.away, age_s=lambda: file.age_s)
+    readings = Readings(lambda row: _of_object(row, channels), stop, away=lambda: file.away, age_s=lambda: file.age_s)
+    return _listening(readings, lambda: file.run(readings.hear, stop))
 
 
 def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
@@ -194,10 +237,15 @@ def _is_blank(item: Any) -> bool:
     return not (item.strip() if isinstance(item, bytes) else any(cell.strip() for cell in item.values()))
 
 
-# Sources
+# Sources: each hands on what arrives, in a thread of its own
 
 
-def _datagrams(source: str, stop: Event) -> Iterator[bytes]:
+def _listening(readings: Readings, run: Callable[[], None]) -> Readings:
+    Thread(target=run, daemon=True, name="femsense-readings").start()
+    return readings
+
+
+def _bound(source: str) -> socket.socket:
     parts = urlsplit(source)
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -209,36 +257,30 @@ def _datagrams(source: str, stop: Event) -> Iterator[bytes]:
         raise InputError(
             "the address cannot be used", where=source, found=error, expected="udp://HOST:PORT of this machine"
         ) from None
-    return _received(endpoint, stop)
+    return endpoint
 
 
-def _received(endpoint: socket.socket, stop: Event) -> Iterator[bytes]:
+def _receive(endpoint: socket.socket, hear: Callable[[bytes], None], stop: Event) -> None:
     with closing(endpoint):
         endpoint.settimeout(WAIT_S)
         while not stop.is_set():
             with suppress(TimeoutError):
-                yield endpoint.recv(LONGEST_LINE)
+                hear(endpoint.recv(LONGEST_LINE))
 
 
-def _topic(source: str, waiting: queue.Queue[bytes]) -> MqttSource:
-    """Put messages of a topic into a queue of one place: only the newest waits."""
+def _subscribed(source: str, read: Callable[[Any], Reading | None], stop: Event) -> Readings:
+    """Listen to a topic of a broker; what the broker kept from earlier is no reading of now."""
     parts = urlsplit(source)
     name = parts.path.lstrip("/")
     if not name:
         raise InputError("a topic is missing", where=source, expected="mqtt://HOST/TOPIC")
-
-    def take(payload: bytes) -> None:
-        with suppress(queue.Empty):
-            waiting.get_nowait()
-        with suppress(queue.Full):
-            waiting.put_nowait(payload)
-
+    connection: list[MqttSource] = []
+    readings = Readings(read, stop, away=lambda: connection[0].trouble and f"no connection, {connection[0].trouble}")
     address = broker_address(f"{parts.scheme}://{parts.netloc}")
-    return MqttSource(address, lambda message: take(message.payload), topics=(name,))
+    connection.append(MqttSource(address, lambda message: readings.hear(message.payload), topics=(name,), kept=False))
 
+    def leave() -> None:
+        stop.wait()
+        connection[0].close()
 
-def _newest(source: MqttSource, waiting: queue.Queue[bytes], stop: Event) -> Iterator[bytes]:
-    with closing(source):
-        while not stop.is_set():
-            with suppress(queue.Empty):
-                yield waiting.get(timeout=WAIT_S)
+    return _listening(readings, leave)

@@ -1,4 +1,4 @@
-"""Sensors as a stream: readings, the learnt model, bones, and a tube around them where there is no other mesh."""
+"""Sensors as a stream: readings, the learnt model, bones, and the robot's own skin on them, or a tube where there is none."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
 from femsense.xr.gltf import glb_bytes
+from femsense.xr.landmarks import Landmark, Landmarks
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.skeleton import skeleton_at
 from femsense.xr.skinning import INFLUENCES, Skin
 from femsense.xr.stream.payloads import Input, Twin, TwinFrame, bone_rows
 from femsense.xr.stream.publisher import STALE_S
 from femsense.xr.stream.readings import Readings
+from femsense.xr.user_skin import UserSkin
 
 AROUND, BETWEEN = 20, 6
 """Vertices around the tube, and rings between neighbouring bones."""
@@ -22,17 +25,79 @@ THICKNESS = 1 / 16
 """Radius of the tube, as a share of its length."""
 
 
-def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
-    """Return what streams of a learnt model: a tube around its chain of bones. Raises InputError where it has no chain."""
+def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = None) -> Twin:
+    """Return what streams of a learnt model: a surface on its chain of bones.
+
+    Arguments:
+        model: with a chain of bones.
+        name: of the robot in topics.
+        worn: its own surface, in the frame of reference of the model's markers; a tube without it.
+
+    Raises:
+        InputError: the model has no chain, or the surface is not where its bones are.
+    """
     rest = model.rest_bones
-    skin, triangles = tube_around(rest.positions, rest.T_robot_bone[:, :3, :2])
+    if worn is None:
+        skin, triangles = tube_around(rest.positions, rest.T_robot_bone[:, :3, :2])
+    else:
+        skin, triangles = bound_to_chain(worn.rest, rest.positions), worn.triangles
     still = np.tile(skin.skeleton.T_robot_bone, (1, 1, 1, 1))
-    glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], name=name)
+    color, texture = (None, None) if worn is None else (worn.colors, worn.texture)
+    glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], color_rgb=color, texture=texture, name=name)
     inputs = tuple(
         Input(channel, "", float(low), float(high), "learnt")
         for channel, low, high in zip(model.channels, model.domain.low, model.domain.high)
     )
-    return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs, frame=model.frame)
+    places = () if model.chain is None else model.chain.rest_points
+    marks = tuple(Landmark(label, place) for label, place in zip(model.marker_names, places))
+    known = model.report.get("error_mm")
+    error = 1e-3 * known if isinstance(known, float) else float("nan")
+    landmarks = Landmarks(marks, ())
+    return Twin(
+        name,
+        glb,
+        skin.skeleton.names,
+        skin.skeleton.T_robot_bone,
+        inputs=inputs,
+        frame=model.frame,
+        landmarks=landmarks,
+        error_m=error,
+    )
+
+
+def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
+    """Return a skin whose vertices move with the two bones between which they lie, as shares of the way from one to the other.
+
+    Arguments:
+        vertices: of a surface at rest [m], shape (v, 3).
+        bones: places at rest, in their order along the body, same frame of reference [m], shape (b, 3).
+
+    Raises:
+        InputError: half of the vertices are farther from the chain than half of its length.
+    """
+    length = float(np.linalg.norm(np.diff(bones, axis=0), axis=1).sum()) or 1e-3
+    if len(bones) == 1:
+        owner, share, away = np.zeros(len(vertices), np.int64), np.zeros(len(vertices)), np.linalg.norm(vertices - bones, axis=1)
+    else:
+        along = np.diff(bones, axis=0)
+        off = vertices[:, None] - bones[:-1]
+        t = np.clip(np.einsum("vbi,bi->vb", off, along) / np.maximum((along**2).sum(axis=1), 1e-18), 0.0, 1.0)
+        apart = np.linalg.norm(off - t[..., None] * along, axis=2)
+        owner = apart.argmin(axis=1)
+        share, away = (part[np.arange(len(vertices)), owner] for part in (t, apart))
+    if np.median(away) > 0.5 * length:
+        raise InputError(
+            "the skin is not where the model's bones are",
+            where="--skin",
+            found=f"half of its vertices are more than {1e3 * float(np.median(away)):.3g} mm from them",
+            expected=f"at most half of the chain's length, {500.0 * length:.3g} mm",
+            hint="--skin-unit, or a surface in the frame in which the markers were measured",
+        )
+    weights, joints = np.zeros((len(vertices), INFLUENCES)), np.zeros((len(vertices), INFLUENCES), dtype=np.int64)
+    weights[:, 0], weights[:, 1] = 1.0 - share, share
+    joints[:, 0], joints[:, 1] = owner, np.minimum(owner + 1, len(bones) - 1)
+    joints[weights == 0.0] = 0
+    return Skin(skeleton_at(bones), vertices, joints, weights)
 
 
 def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[TwinFrame]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import closing
 from threading import Event
 from urllib.parse import parse_qs
@@ -41,8 +41,8 @@ class SerialLine:
         """Why the port is not there; empty where it is."""
         self._open()
 
-    def lines(self, stop: Event) -> Iterator[bytes]:
-        """Yield lines until `stop` is set; a port that is away is opened again and again."""
+    def run(self, hear: Callable[[bytes], None], stop: Event) -> None:
+        """Call hear(line) until `stop` is set; a port that is away is opened again and again."""
         held = b""
         with closing(self._line):
             while not stop.is_set():
@@ -55,7 +55,8 @@ class SerialLine:
                     held, self.away = b"", "unplugged"
                     self._line.close()
                 *whole, held = held[-LONGEST_LINE:].split(b"\n")
-                yield from whole
+                for line in whole:
+                    hear(line)
 
     def _open(self) -> bool:
         """Open the port, and return whether it is there."""

@@ -2,6 +2,10 @@
 
 A frame of the WebSocket holds one or more messages: topic length uint16, payload length uint32 (little-endian), topic, payload.
 Each viewer has its own set of messages that wait, one a topic: a slow one misses some and holds up nobody.
+
+Sockets and libraries buffer seconds of poses. So at most `IN_FLIGHT` frames are under way to a viewer: further ones wait, newest only,
+until it has confirmed one. A viewer confirms a frame by an empty frame once it has handled it, as the page does; for one that never does,
+the answer to a ping that follows each frame counts, which its library gives when it reads.
 """
 
 from __future__ import annotations
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 ENTRY = struct.Struct("<HI")
 SMALLEST_BUFFER = 1 << 16
 """Of a socket that sends [bytes]: what waits there is old when it arrives."""
+IN_FLIGHT = 3
+"""Frames that a viewer has not confirmed yet: 60 Hz need two where a round trip takes 30 ms."""
 LARGEST_FRAME, MOST_FRAMES = 4096, 240
 """Of what a viewer sends: bytes a frame, and frames a second."""
 ASKED_BY_PAGE = ("/ws", "/stream.json")
@@ -84,15 +90,29 @@ def unpack(frame: bytes) -> Iterator[Message]:
 
 
 class _Viewer:
-    """What waits for one viewer."""
+    """What waits for one viewer, and what is under way to it."""
 
     def __init__(self) -> None:
         self.waiting: dict[str, Message] = {}
         self.wake = asyncio.Event()
         self.gone = False
+        self.sent = self.confirmed = self._answered = 0
 
     def offer(self, messages: Mapping[str, Message]) -> None:
         self.waiting.update(messages)
+        self.wake.set()
+
+    def confirm(self) -> bool:
+        """Take note that a frame was handled; return whether there was one to confirm."""
+        if self.confirmed >= self.sent:
+            return False
+        self.confirmed += 1
+        self.wake.set()
+        return True
+
+    def answer(self, pong: asyncio.Future[float]) -> None:
+        """Take note of the answer to a ping; one that never came, since the viewer left, is no error."""
+        self._answered += not pong.cancelled() and pong.exception() is None
         self.wake.set()
 
     def leave(self) -> None:
@@ -100,8 +120,11 @@ class _Viewer:
         self.wake.set()
 
     def take(self) -> list[Message]:
-        taken, self.waiting = list(self.waiting.values()), {}
+        """Return what may be sent now."""
         self.wake.clear()
+        if self.sent - (self.confirmed or self._answered) >= IN_FLIGHT:
+            return []
+        taken, self.waiting = list(self.waiting.values()), {}
         return taken
 
 
@@ -237,27 +260,31 @@ class WebSocketServer:
         viewer.offer({name: message for name, message in self.hub.newest().items() if not name.endswith(f"/{GLB}")})
         self._viewers.add(viewer)
         self.visits += 1
-        listening = asyncio.create_task(self._listen(connection))
+        listening = asyncio.create_task(self._listen(connection, viewer))
         listening.add_done_callback(lambda _: viewer.leave())
         try:
             while not viewer.gone:
                 await viewer.wake.wait()
-                waiting = viewer.take()
-                if waiting:
+                if waiting := viewer.take():
+                    viewer.sent += 1
                     await connection.send(pack(waiting))
+                    if not viewer.confirmed:
+                        asyncio.ensure_future(await connection.ping()).add_done_callback(viewer.answer)
         except ConnectionClosed:
             pass
         finally:
             self._viewers.discard(viewer)
             listening.cancel()
 
-    async def _listen(self, connection: ServerConnection) -> None:
+    async def _listen(self, connection: ServerConnection, viewer: _Viewer) -> None:
         """Pass on what a viewer wants of the robot; garbage and floods end the connection."""
         from websockets.exceptions import ConnectionClosed
 
         second, count = 0, 0
         with contextlib.suppress(ConnectionClosed):
             async for frame in connection:
+                if not frame and viewer.confirm():
+                    continue
                 now = int(self._loop.time())
                 second, count = (now, 1) if now != second else (second, count + 1)
                 wanted = _wanted(frame) if count <= MOST_FRAMES else None
@@ -270,7 +297,8 @@ class WebSocketServer:
         """Answer a request for a file; None lets a viewer in."""
         headers, path = request.headers, request.path.partition("?")[0]
         host = headers.get("Host")
-        if not self.access.knows_host(host) or not same_origin(headers.get("Origin"), host):
+        reached_at = str(connection.transport.get_extra_info("sockname")[0])
+        if not self.access.knows_host(host, reached_at) or not same_origin(headers.get("Origin"), host):
             return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
         if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
             await asyncio.sleep(0.3)  # who guesses waits

@@ -21,7 +21,7 @@ from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, MqttSource, broker_address
+from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, MqttSource, broker_address, lets_anybody_in
 from femsense.xr.stream.publisher import Publisher, PublishOptions
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 
@@ -253,3 +253,14 @@ def test_what_is_no_broker_is_refused(text: str) -> None:
         broker_address(text)
     with pytest.raises(InputError, match="not a stream"):
         Bridge(Hub(), "ftp://x")
+
+
+@pytest.mark.parametrize(("password", "anybody"), [(None, True), ("secret", False)])
+def test_a_broker_that_lets_anybody_in_is_known_by_asking(password: str | None, anybody: bool) -> None:
+    hub = Hub()
+    with closing(hub):
+        broker = EmbeddedBroker(hub, port=0, access=Access(password=password))
+        known = broker_address(f"127.0.0.1:{broker.port}", password="secret")
+        assert lets_anybody_in(known) is anybody
+    assert lets_anybody_in(broker_address("127.0.0.1:1", password="secret"), timeout_s=0.2) is None
+    assert lets_anybody_in(broker_address("127.0.0.1:1")) is True  # nothing is asked of it

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +24,10 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import linear_network
 from femsense.xr.skinning import skin_vertices
+from femsense.xr.stream.payloads import model_bytes
 from femsense.xr.stream.readings import Reading, read_line, readings_of
 from femsense.xr.stream.sensor_source import frames_of_sensors, markers_of_sensors, sensor_twin
+from femsense.xr.user_skin import UserSkin
 
 CHANNELS = ("bend", "sway")
 REST = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
@@ -62,6 +65,12 @@ def take(source: str, count: int, send: object) -> list[Reading]:
             stop.set()
             break
     return found
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 @pytest.mark.parametrize(
@@ -150,12 +159,78 @@ def test_a_time_that_is_not_said_counts_from_the_beginning(tmp_path: Path) -> No
 
 
 def test_datagrams_are_readings() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_udp_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         found = take(f"udp://127.0.0.1:{port}", 2, lambda: out.sendto(b'{"bend": 1, "sway": 2}', ("127.0.0.1", port)))
     assert [row.tolist() for _, row in found] == [[1, 2], [1, 2]] and found[1][0] > found[0][0]
+
+
+def test_of_a_flood_the_newest_reading_is_taken_and_the_others_are_counted() -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for k in range(200):
+            out.sendto(f"{k / 500},{k},0".encode(), ("127.0.0.1", port))
+            time.sleep(0.0005)
+    assert within(3.0, lambda: readings.dropped == 199)
+    assert next(readings)[1].tolist() == [199, 0]
+    found: list[Reading] = []
+    Thread(target=lambda: found.extend(readings), daemon=True).start()
+    time.sleep(0.3)
+    assert found == [] and readings.trouble == ""  # nothing waits behind the last one
+    stop.set()
+
+
+@pytest.mark.parametrize("date", [True, False])
+def test_a_reading_is_as_old_as_its_sender_says(date: bool) -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+
+        def age_of(age_s: float) -> float:
+            made = (time.time() if date else time.monotonic()) - age_s
+            out.sendto(f"{made!r},1,2".encode(), ("127.0.0.1", port))
+            next(readings)
+            return time.monotonic() - readings.came
+
+        assert age_of(4.0) >= (4.0 if date else 0.0)  # of a clock that counts from anywhere, delays are known but for their least
+        assert age_of(0.0) < 2.0
+        time.sleep(1.0)
+        assert 0.8 <= age_of(0.9) < 2.0
+        assert age_of(-50.0) < 1.0 and age_of(0.0) < 1.0  # its clock was set
+    stop.set()
+
+
+def test_a_reading_that_was_overtaken_on_its_way_is_dropped() -> None:
+    port, stop = free_udp_port(), Event()
+    readings = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, stop)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for line in (b"5.0,1,1", b"5.2,2,2", b"5.1,3,3"):
+            out.sendto(line, ("127.0.0.1", port))
+    assert within(3.0, lambda: readings.overtaken == 1) and readings.dropped == 2
+    assert next(readings)[0] == 5.2
+    stop.set()
+
+
+def test_frames_of_a_websocket_are_readings_and_it_is_found_again() -> None:
+    server = pytest.importorskip("websockets.sync.server")
+    port = free_udp_port()
+    stop = Event()
+    readings = readings_of(f"ws://127.0.0.1:{port}/sensors", CHANNELS, stop)
+    assert within(3.0, lambda: "Connection refused" in readings.trouble)
+    for value in (1, 2):
+
+        def answer(connection: Any, value: int = value) -> None:
+            connection.send(json.dumps({"bend": value, "sway": 0}))
+            connection.send(f"{value},5".encode())
+            time.sleep(0.3)
+
+        with server.serve(answer, "127.0.0.1", port) as serving:
+            Thread(target=serving.serve_forever, daemon=True).start()
+            while next(readings)[1].tolist() != [value, 5]:
+                pass
+            serving.shutdown()
+    stop.set()
 
 
 def test_messages_of_a_broker_are_readings() -> None:
@@ -299,9 +374,12 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
         stream.write("1,0.4,-0.2\n")
         stream.flush()
         bent = next(frames)
-        stream.write("2,9,0\n3,,0\n")
+        stream.write("2,9,0\n")
         stream.flush()
-        odd, blind = next(frames), next(frames)
+        odd = next(frames)
+        stream.write("3,,0\n")
+        stream.flush()
+        blind = next(frames)
     np.testing.assert_allclose(still.bones[:, :3], twin.T_robot_bone[:, :3, 3], atol=1e-7)
     np.testing.assert_allclose(still.bones[:, 3:], np.tile([0, 0, 0, 1.0], (6, 1)), atol=1e-6)
     T = np.tile(np.eye(4), (6, 1, 1))
@@ -311,6 +389,33 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     assert bent.contacts is None and bent.status == "ok" and "bend = 9" in odd.status and "no number" in blind.status
     np.testing.assert_array_equal(blind.bones, odd.bones)
     assert still.read_at < bent.read_at < odd.read_at == blind.read_at  # what is blind shows what was read before
+
+
+def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refused(
+    model: ProprioceptiveModel, tmp_path: Path
+) -> None:
+    height = np.linspace(0.0, 0.1, 21)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.01
+    rest = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in height])
+    red = np.tile([1.0, 0.0, 0.0], (len(rest), 1))
+    worn = UserSkin(rest, np.array([[i, i + 1, i + 4] for i in range(len(rest) - 4)]), red)
+    twin = sensor_twin(replace(model, report={"error_mm": 2.5}), "arm", worn)
+    mesh = read_glb(twin.glb)
+    np.testing.assert_allclose(mesh.skin.rest, rest, atol=1e-7)
+    told = json.loads(model_bytes(twin, "robots/arm.glb"))
+    assert told["error_m"] == 2.5e-3 and [marker["name"] for marker in told["markers"]] == list("abcde")
+    file = tmp_path / "sensors.csv"
+    file.write_text("time_s,bend,sway\n0,0.2,0.1\n", encoding="utf-8")
+    bones = next(frames_of_sensors(readings_of(str(file), CHANNELS, Event()), model)).bones
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(bones[:, 3:]).as_matrix(), bones[:, :3]
+    middle = skin_vertices(mesh.skin, T[None])[0].reshape(21, 4, 3).mean(axis=1)
+    np.testing.assert_allclose(
+        middle[:, :2], np.outer(middle[:, 2], [0.2, 0.1]), atol=1e-4
+    )  # on the line that the markers are on
+    for wrong in (replace(worn, rest=1000.0 * rest), replace(worn, rest=np.add(rest, [0.0, 0.2, 0.0]))):
+        with pytest.raises(InputError, match="not where the model's bones are"):
+            sensor_twin(model, "arm", wrong)
 
 
 def test_bones_of_a_lying_body_have_the_axes_of_the_robot_at_rest(tmp_path: Path) -> None:
@@ -342,9 +447,7 @@ def test_a_source_without_readings_says_why() -> None:
 
 
 def test_a_line_that_is_no_reading_is_shown_until_one_is() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_udp_port()
     readings, found = readings_of(f"udp://127.0.0.1:{port}", CHANNELS, Event()), []
     assert readings.trouble == "nothing has come yet"
     Thread(target=lambda: found.append(next(readings)), daemon=True).start()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -18,7 +20,8 @@ from femsense.xr.stream.payloads import force_bytes, in_unity, pose_bytes, statu
 from femsense.xr.stream.websocket import pack
 
 UNITY = ROOT / "unity"
-TRANSCRIPT = UNITY / "Tests" / "transcript.txt"
+TRANSCRIPT = UNITY / "Tests" / "Editor" / "transcript.txt"
+STAND_INS = ROOT / "tests" / "support" / "unity_stand_ins.cs"
 
 
 def transcript() -> list[str]:
@@ -58,10 +61,54 @@ def test_the_transcript_is_what_is_sent() -> None:
     assert TRANSCRIPT.read_text(encoding="utf-8").splitlines() == transcript()
 
 
-@pytest.mark.skipif(shutil.which("mcs") is None or shutil.which("mono") is None, reason="no mono on this machine")
+NO_MONO = pytest.mark.skipif(shutil.which("mcs") is None or shutil.which("mono") is None, reason="no mono on this machine")
+
+
+@NO_MONO
 def test_unity_s_part_reads_the_transcript(tmp_path: Path) -> None:
     program = tmp_path / "transcript.exe"
-    sources = [str(UNITY / "Runtime" / "Messages.cs"), str(UNITY / "Tests" / "Transcript.cs")]
-    subprocess.run(["mcs", f"-out:{program}", *sources], check=True, capture_output=True, timeout=60)
+    sources = [UNITY / "Runtime" / "Messages.cs", UNITY / "Tests" / "Editor" / "Transcript.cs", UNITY / "Tests~" / "Program.cs"]
+    subprocess.run(["mcs", f"-out:{program}", *map(str, sources)], check=True, capture_output=True, timeout=60)
     done = subprocess.run(["mono", str(program), str(TRANSCRIPT)], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0 and "14 lines agree" in done.stdout, done.stdout
+
+
+@NO_MONO
+def test_the_package_compiles_against_what_it_uses_of_unity(tmp_path: Path) -> None:
+    sources = sorted(file for file in UNITY.rglob("*.cs") if "Tests~" not in file.parts)
+    library = ["-target:library", "-define:UNITY_5_3_OR_NEWER", "-nowarn:0649", f"-out:{tmp_path / 'package.dll'}"]
+    done = subprocess.run(
+        ["mcs", *library, str(STAND_INS), *map(str, sources)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0 and len(sources) == 8, done.stdout + done.stderr
+
+
+def guid_of(path: str) -> str:
+    """The identity of a file or folder of the package: always the same for its name."""
+    return hashlib.md5(f"org.femsense.stream/{path}".encode()).hexdigest()
+
+
+def test_each_file_and_folder_that_unity_sees_has_its_meta_file() -> None:
+    seen = {file.relative_to(UNITY).as_posix() for file in UNITY.rglob("*") if file.suffix != ".meta"}
+    hidden = {path for path in seen if path.startswith("Tests~") or path in ("Samples~", "Samples~/Desktop", "Samples~/Headset")}
+    metas = {file.relative_to(UNITY).as_posix().removesuffix(".meta"): file.read_text() for file in UNITY.rglob("*.meta")}
+    assert metas.keys() == seen - hidden
+    for path, text in metas.items():
+        assert f"guid: {guid_of(path)}\n" in text, path
+        assert ("folderAsset: yes" in text) == (UNITY / path).is_dir(), path
+
+
+def test_scenes_refer_to_scripts_and_assemblies_to_each_other() -> None:
+    scripts = {guid_of(file.relative_to(UNITY).as_posix()) for file in UNITY.rglob("*.cs")}
+    scenes = [file.read_text() for file in UNITY.rglob("*.unity")]
+    assert len(scenes) == 2
+    for scene in scenes:
+        assert set(re.findall(r"guid: (\w+)", scene)) <= scripts
+        assert set(re.findall(r"fileID: ([1-9]\d*)\}", scene)) <= set(re.findall(r"^--- !u!\d+ &(\d+)$", scene, re.MULTILINE))
+    known = {"glTFast", "UnityEngine.TestRunner", "UnityEditor.TestRunner"}
+    assemblies = [json.loads(file.read_text()) for file in UNITY.rglob("*.asmdef")]
+    known |= {assembly["name"] for assembly in assemblies}
+    assert len(assemblies) == 4 and all(set(assembly["references"]) <= known for assembly in assemblies)
+    package = json.loads((UNITY / "package.json").read_text())
+    assert "com.unity.cloud.gltfast" in package["dependencies"]
+    assert all((UNITY / sample["path"]).is_dir() for sample in package["samples"])

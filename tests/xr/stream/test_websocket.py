@@ -100,6 +100,25 @@ def test_pages_of_other_hosts_reach_nothing(headers: dict[str, str], status: int
         assert get(server, "/", **filled)[0] == status
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1", 200),
+        ("localhost:{port}", 200),
+        (f"{socket.gethostname().upper()}.", 200),
+        ("tunnel.example:443", 200),
+        ("evil.example", 403),
+        ("10.9.8.7", 403),
+        ("", 403),
+    ],
+)
+def test_with_a_password_too_a_foreign_host_is_refused_before_it_is_asked_for(host: str, status: int) -> None:
+    with served(Access("0.0.0.0", "secret", names=("tunnel.example",))) as (_, _publisher, server):
+        asked = {"Host": host.format(port=server.port)}
+        assert get(server, "/", **asked, Authorization=basic("secret"))[0] == status
+        assert get(server, "/", **asked)[0] == (401 if status == 200 else 403)
+
+
 def test_other_machines_only_with_a_password() -> None:
     with pytest.raises(InputError, match="only with a password"):
         Access("0.0.0.0")
@@ -156,6 +175,35 @@ def test_a_viewer_that_does_not_read_holds_up_nobody_and_then_gets_the_newest() 
         assert held < 8 * len(big)  # of forty: what lay in the sockets, and the newest
 
 
+@pytest.mark.parametrize("confirms", [True, False])
+def test_a_viewer_that_is_slower_than_the_source_sees_the_newest(confirms: bool) -> None:
+    with served() as (hub, _publisher, server), watch(server, max_queue=1) as viewer:
+        viewer.recv(5)
+        if confirms:
+            viewer.send(b"")
+        hub.publish([Message(POSE, b"first")])
+        assert viewer.recv(5)
+        for k in range(200):
+            hub.publish([Message(POSE, struct.pack("<I", k))])
+            time.sleep(0.002)
+        seen = []
+        while not seen or seen[-1] != 199:
+            seen.append(struct.unpack("<I", read_frame(viewer.recv(5))[POSE])[0])
+            if confirms:
+                viewer.send(b"")
+        assert len(seen) <= 6  # those that were under way, and the newest
+
+
+def test_what_is_confirmed_without_having_been_sent_counts_as_a_flood() -> None:
+    with served() as (_hub, _publisher, server), watch(server) as viewer:
+        viewer.recv(5)
+        with pytest.raises(websockets.ConnectionClosed):
+            for _ in range(5):
+                viewer.send(b"")
+            while True:
+                viewer.recv(5)
+
+
 def upgrade(port: int) -> bytes:
     return (
         f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -167,14 +215,13 @@ def upgrade(port: int) -> bytes:
     "bad",
     [
         "text",
-        b"",
         b"\x00",
         b"\xff" * 100,
         b"x" * 100_000,
         pack([Message("femsense/arm/pose", b"a lie")]),
         pack([Message("femsense/arm/command", b"{}")]),
     ],
-    ids=["text", "empty", "short", "ones", "oversized", "pose", "command"],
+    ids=["text", "short", "ones", "oversized", "pose", "command"],
 )
 def test_who_sends_what_viewers_may_not_send_is_let_go(bad: str | bytes) -> None:
     with served() as (hub, _publisher, server), watch(server) as good:

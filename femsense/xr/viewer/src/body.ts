@@ -1,6 +1,7 @@
 // One robot in the scene: its skinned mesh, what it is at rest, what was measured, and the forces on it.
 
 import {
+  AxesHelper,
   Bone,
   Box3,
   BufferAttribute,
@@ -14,14 +15,19 @@ import {
   PointsMaterial,
   SkinnedMesh,
   Vector3,
+  type Box2,
+  type Camera,
   type Object3D,
 } from "three";
 import { GLTFLoader, type GLTF } from "three/addons/loaders/GLTFLoader.js";
 import { ForceArrows } from "./arrows";
-import type { Contact } from "./data";
+import type { Contact, NamedPoint } from "./data";
 import { Painter, type Paint } from "./paint";
+import { tie } from "./ties";
 
 const SAMPLED = 600; // vertices that tell about where a body is
+const GREY = 0x6b7177; // of what is old
+const AMBER = 0xf08c00; // of what may be wrong
 const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
 
 export async function loadMesh(url: string): Promise<GLTF> {
@@ -43,7 +49,11 @@ export class Body {
   /** Residual that has the full colour [m]. */
   readonly residualScale: number;
   private readonly ghost = new Group();
-  private readonly cloud = new Points(new BufferGeometry(), new PointsMaterial({ size: 3, sizeAttenuation: false, vertexColors: true }));
+  private readonly cloud = new Points(new BufferGeometry(), cloudMaterial());
+  private readonly base: AxesHelper;
+  private readonly joints = dots(0xffffff, 7);
+  private readonly marks = dots(0xff5ad0, 10);
+  private markers: (() => Vector3)[] = [];
   private stale = false;
   private doubtful = false;
   private cloudSeen = false;
@@ -58,17 +68,37 @@ export class Body {
     this.arrows = new ForceArrows(this.size);
     this.painter = new Painter(this.size);
     this.robotFrame.rotation.x = -Math.PI / 2;
-    this.robotFrame.add(this.arrows.group, this.cloud);
+    this.base = new AxesHelper(0.2 * this.size).setColors(new Color(0xff7a70), new Color(0x7ee08a), new Color(0x7db8ff));
+    Object.assign(this.base.material, { depthTest: false, transparent: true });
+    this.robotFrame.add(this.arrows.group, this.cloud, this.base, this.joints);
+    this.showParts(false);
     this.cloud.frustumCulled = false;
-    this.cloud.visible = false;
     this.ghost.visible = false;
-    this.group.add(gltf.scene, this.robotFrame, this.ghost);
+    this.group.add(gltf.scene, this.robotFrame, this.ghost, this.marks);
     for (const skin of this.skins) this.prepare(skin);
   }
 
   /** Places the bones: x y z qx qy qz qw of each, robot frame. */
   pose(rows: Float32Array): void {
     poseBones(this.bones, rows);
+  }
+
+  /** Takes the markers that are shown with the bones. */
+  setMarkers(markers: NamedPoint[]): void {
+    this.markers = markers.map((marker) => tie(this, marker.position));
+  }
+
+  /** Shows base, bones and markers, also through the body. */
+  showParts(visible: boolean): void {
+    this.base.visible = this.joints.visible = this.marks.visible = visible;
+  }
+
+  /** Prepares what depends on the view, before each picture. */
+  face(camera: Camera, height: number, room: Box2 | null): void {
+    this.arrows.face(camera, height, room);
+    if (!this.base.visible) return;
+    this.joints.geometry.setFromPoints(this.bones.map((bone) => bone.position));
+    this.marks.geometry.setFromPoints(this.markers.map((place) => place()));
   }
 
   /** Returns the space that the body takes now, in glTF's frame. */
@@ -107,7 +137,7 @@ export class Body {
     this.fade();
   }
 
-  /** Takes much of the body's colour away: what it shows may be wrong. */
+  /** Colours all of the body: what it shows may be wrong. */
   setDoubtful(doubtful: boolean): void {
     if (doubtful === this.doubtful) return;
     this.doubtful = doubtful;
@@ -120,7 +150,7 @@ export class Body {
 
   private fade(): void {
     this.arrows.tell(this.stale ? "stale" : this.doubtful ? "doubtful" : "");
-    this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.6 : 0);
+    this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.93 : 0, this.stale ? GREY : AMBER);
   }
 
   get isStale(): boolean {
@@ -142,7 +172,7 @@ export class Body {
   }
 
   showCloud(visible: boolean): void {
-    this.cloud.visible = visible && this.cloud.geometry.getAttribute("position") !== undefined;
+    this.cloud.visible = visible;
   }
 
   get hasCloud(): boolean {
@@ -175,6 +205,23 @@ export class Body {
     const pale = new MeshBasicMaterial({ color: 0xb8c7db, transparent: true, opacity: 0.16, depthWrite: false });
     this.ghost.add(new Mesh(skin.geometry, pale));
   }
+}
+
+/** Small points that show through the body. */
+function dots(color: number, size: number): Points {
+  const points = new Points(new BufferGeometry(), new PointsMaterial({ color, size, sizeAttenuation: false, depthTest: false, transparent: true }));
+  points.frustumCulled = false;
+  points.renderOrder = 4;
+  return points;
+}
+
+/** Points of a measured cloud: drawn a little nearer than they are, since half of them lie behind the surface that they measure. */
+function cloudMaterial(): PointsMaterial {
+  const material = new PointsMaterial({ size: 4, sizeAttenuation: false, vertexColors: true });
+  material.onBeforeCompile = (shader) => {
+    shader.vertexShader = shader.vertexShader.replace("#include <project_vertex>", "#include <project_vertex>\n\tgl_Position = projectionMatrix * vec4(mvPosition.xyz * 0.98, mvPosition.w);");
+  };
+  return material;
 }
 
 /** Places bones by rows x y z qx qy qz qw in the robot frame, which is that of their parent. */

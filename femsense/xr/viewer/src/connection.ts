@@ -3,6 +3,7 @@
 import { unpack, type Message } from "./messages";
 
 export const NO_CONNECTION = "no connection";
+const CONFIRMED = new Uint8Array(0); // an empty frame: what came was handled, and the newest may follow
 const AGAIN_MS = [200, 500, 1000, 2000];
 
 export class Connection {
@@ -30,7 +31,9 @@ export class Connection {
       this.change("");
     });
     socket.addEventListener("message", (event) => {
-      if (event.data instanceof ArrayBuffer) this.take(unpack(event.data));
+      if (!(event.data instanceof ArrayBuffer)) return;
+      this.take(unpack(event.data));
+      if (socket.readyState === WebSocket.OPEN) socket.send(CONFIRMED);
     });
     socket.addEventListener("close", () => {
       this.change(this.away);

@@ -83,6 +83,12 @@ export function offerHeadset(stage: Stage): void {
   for (const id of ["panel", "dock", "dragging", "top"]) element(id).addEventListener("beforexrselect", (event) => event.preventDefault());
 }
 
+/** Says to the styles how tall the bar is: other things stand on it. */
+export function announceDock(): void {
+  const dock = element("dock");
+  new ResizeObserver(() => document.documentElement.style.setProperty("--dock", `${dock.offsetHeight}px`)).observe(dock);
+}
+
 /** Shows, where the panel is longer than its place, that there is more below. */
 export function announceMore(): void {
   const [panel, more] = [element("panel"), element("more")];

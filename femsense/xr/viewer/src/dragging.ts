@@ -20,7 +20,7 @@ import {
 import { clone } from "three/addons/utils/SkeletonUtils.js";
 import { poseBones, type Body } from "./body";
 import { amount, type NamedPoint } from "./data";
-import type { Reach } from "./messages";
+import type { Lease, Reach } from "./messages";
 import { tied, type Hand, type Hold } from "./headset";
 import { element } from "./readout";
 import { tie } from "./ties";
@@ -57,6 +57,9 @@ export class Dragging {
   private heard: Reach | null = null; // the newest answer, and that which is shown
   private shown: Reach | null = null;
   private seq = 0;
+  private lease: Lease | null = null;
+  /** Who this page is among those who may steer. */
+  readonly client = Array.from(crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16).padStart(2, "0")).join("");
   private readonly plane = new Plane();
   private readonly ray = new Raycaster();
   private readonly wish = new Vector3(); // in the world
@@ -76,7 +79,8 @@ export class Dragging {
     window.addEventListener("blur", () => this.release());
     window.addEventListener("keydown", (e) => this.key(e));
     window.addEventListener("keyup", (e) => e.key.startsWith("Arrow") && this.release());
-    element("arm").addEventListener("click", () => this.arm(!this.armed));
+    element("arm").addEventListener("click", () => (this.armed ? this.letGo() : this.arm(true)));
+    element<HTMLSelectElement>("handles").addEventListener("change", () => (this.chosen = element<HTMLSelectElement>("handles").selectedIndex));
     window.setInterval(() => this.repeat(), EVERY_MS);
   }
 
@@ -123,10 +127,37 @@ export class Dragging {
     this.stage.panelsChanged();
   }
 
-  /** Ends a drag and disarms: there is no connection, and when it is back nothing is to move by itself. */
+  get isArmed(): boolean {
+    return this.armed;
+  }
+
+  /** Ends a drag and disarms, and says so: after a stop nobody moves the robot before that. */
   letGo(): void {
     this.release();
     this.arm(false);
+    this.open();
+  }
+
+  /** Takes note of who steers. */
+  leased(lease: Lease): void {
+    if (lease === this.lease) return;
+    this.lease = lease;
+    if (lease.stopped && (this.armed || this.held !== null)) {
+      this.letGo();
+      this.tell("Stopped. Arm the robot again to go on.", "stopped", "");
+    } else if (this.held !== null && lease.client && lease.client !== this.client) {
+      this.tell("Somebody else is dragging this robot: yours comes after.", "stopped", "");
+    }
+  }
+
+  /** What each message says of its sender: the lease that it has, or 0 to ask for one. */
+  private sender(): object {
+    return { client: this.client, seq: this.seq++, lease: this.lease?.client === this.client ? this.lease.number : 0 };
+  }
+
+  /** Says that nothing is held. */
+  private open(): void {
+    if (this.subject) this.send(this.subject.id, { ...this.sender(), handle: "", held: false, armed: false });
   }
 
   /** Repeats the wish while it is held and seen. */
@@ -157,8 +188,8 @@ export class Dragging {
     if (this.held === null || !this.subject) return;
     this.sent = performance.now();
     const local = this.subject.body.robotFrame.worldToLocal(this.wish.clone());
-    const wish = { handle: this.subject.handles[this.held]!.name, target_m: { x: local.x, y: local.y, z: local.z }, held: true, armed: this.armed, seq: this.seq++ };
-    this.send(this.subject.id, wish);
+    const wish = { handle: this.subject.handles[this.held]!.name, target_m: { x: local.x, y: local.y, z: local.z }, held: true, armed: this.armed };
+    this.send(this.subject.id, { ...this.sender(), ...wish });
     this.draw();
   }
 
@@ -225,10 +256,11 @@ export class Dragging {
   }
 
   private arm(on: boolean): void {
+    if (on && this.held === null) this.open(); // after a stop an open hand has to be seen first
     this.armed = on && this.subject?.commands === true;
     const button = element("arm");
     button.setAttribute("aria-pressed", String(this.armed));
-    button.textContent = this.armed ? "Armed: the robot follows while you hold" : "Arm the robot";
+    button.textContent = this.armed ? "Disarm" : "Arm the robot";
   }
 
   private grab(event: PointerEvent): void {
@@ -271,9 +303,8 @@ export class Dragging {
 
   private release(): void {
     if (this.held === null) return;
-    const subject = this.subject;
-    if (subject) this.send(subject.id, { handle: subject.handles[this.held]?.name ?? "", held: false, armed: false, seq: this.seq++ });
     this.held = null;
+    this.open();
     this.stage.controls.enabled = true;
     this.line.visible = this.target.visible = false;
     this.stage.touch();
@@ -308,22 +339,10 @@ export class Dragging {
   }
 
   private choices(): void {
-    const list = element("handles");
-    list.hidden = (this.subject?.handles.length ?? 0) < 2;
-    list.replaceChildren(
-      ...(this.subject?.handles ?? []).map((handle, i) => {
-        const choice = document.createElement("button");
-        choice.className = "chip";
-        choice.textContent = handle.name;
-        choice.setAttribute("aria-pressed", String(i === this.chosen));
-        choice.addEventListener("click", () => {
-          this.chosen = i;
-          this.choices();
-        });
-        return choice;
-      }),
-    );
-    list.children[this.chosen]?.scrollIntoView({ block: "nearest", inline: "nearest" });
+    const names = (this.subject?.handles ?? []).map((handle) => handle.name);
+    element("handle-choice").hidden = names.length < 2;
+    element<HTMLSelectElement>("handles").replaceChildren(...names.map((name, i) => new Option(name, name, false, i === this.chosen)));
+    element("handle-count").textContent = `of ${names.length}`;
   }
 }
 

@@ -6,7 +6,7 @@ import { Connection, NO_CONNECTION, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
 import { amount, clockText, frameAt, isDoubtful, type Frame } from "./data";
 import { Dragging } from "./dragging";
-import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model, type Status } from "./messages";
+import { pack, readCloud, readField, readForces, readInputs, readLease, readModel, readPose, readReach, readStatus, type Lease, type Message, type Model, type Status } from "./messages";
 import type { Field, Paint } from "./paint";
 import { COUNT_MS, Pace } from "./pace";
 import { Plot } from "./plot";
@@ -24,6 +24,7 @@ const FRAMED_MS = 300; // how often it is asked whether all is in the picture
 interface Moment extends Frame {
   bones: Float32Array;
   field: Field | null;
+  cloud: Float32Array | null; // x y z residual of each measured point
 }
 
 /** Shows all robots of the stream beside this page; returns what programs may look at. */
@@ -46,6 +47,7 @@ class Streams {
   constructor(private readonly stage: Stage) {
     this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (away) => this.connected(away));
     this.dragging = new Dragging(stage, (robot, wish) => this.connection.send(pack(robot, "drag", wish)));
+    element("stop").addEventListener("click", () => this.stopAll());
     element("dock").hidden = false;
     element("about").textContent = "waiting for a robot …";
     element("cloud").hidden = element("drag").hidden = true;
@@ -71,6 +73,14 @@ class Streams {
     const told: unknown = await fetch("stream.json").then((answer) => answer.json(), () => null);
     const trouble = (told as { trouble?: unknown } | null)?.trouble;
     if (!this.robots.size) element("about").textContent = typeof trouble === "string" && trouble ? trouble : "waiting for a robot …";
+  }
+
+  /** Ends all motion, whoever steers. */
+  private stopAll(): void {
+    for (const robot of this.robots.values()) {
+      if (robot.model.commands) this.connection.send(pack(robot.id, "stop", { client: this.dragging.client }));
+    }
+    this.dragging.letGo();
   }
 
   private announce(id: string, model: Model | null): void {
@@ -103,7 +113,7 @@ class Streams {
       body.group.position.x = (i - (bodies.length - 1) / 2) * width;
       all.union(body.space().expandByScalar(0.1 * body.size).translate(body.group.position));
     });
-    this.stage.fit(all);
+    this.stage.fit(all, Math.min(...bodies.map((body) => body.space().min.y)));
     this.choose(this.chosen);
   }
 
@@ -165,13 +175,30 @@ class Streams {
     const answers = state !== "ended" && !!robot?.model.handles.length;
     if (!answers && this.dragging.on) element("drag").click();
     element("drag").hidden = !answers;
-    const said = this.paused ? `paused · ${words}` : words;
-    badge.dataset.state = this.paused && state === "live" ? "paused" : state;
+    const doubt = state === "live" && robot?.shown && isDoubtful(robot.shown) ? (robot.shown.forceless ? "outside of what was learnt" : "doubtful") : "";
+    const said = [this.paused ? "paused" : "", words, doubt].filter(Boolean).join(" · ");
+    badge.dataset.state = doubt ? "doubtful" : this.paused && state === "live" ? "paused" : state;
     if (badge.textContent !== said) badge.textContent = said;
     element("live").setAttribute("aria-pressed", String(!this.paused && state === "live"));
     element("panel").hidden = !robot?.shown;
     if (robot?.shown && robot.reach) this.dragging.answered(robot.reach, robot.ghost);
+    if (robot?.lease) this.dragging.leased(robot.lease);
+    this.alarm();
     if (robot && !this.stage.headset.alone) this.describe(robot, state);
+  }
+
+  /** Says so that nobody overlooks it that the robot moves, or will when a point is held. */
+  private alarm(): void {
+    const driven = [...this.robots.values()].filter((robot) => robot.model.commands && !this.away);
+    const moving = driven.some((robot) => robot.reach?.armed);
+    const words = this.dragging.isArmed
+      ? moving ? "The robot is moving: let go and it stops" : "Armed: the robot moves while you hold a point"
+      : moving ? "Somebody else is moving the robot" : "";
+    element("stop").hidden = driven.length === 0;
+    document.documentElement.dataset.alarm = this.dragging.isArmed ? "armed" : moving ? "moving" : "";
+    const said = element("alarm");
+    said.hidden = !words;
+    if (said.textContent !== words) said.textContent = words;
   }
 
   /** Brings the panel and the time line up to date. */
@@ -239,6 +266,7 @@ class Streams {
     Robot.dress = (body) => {
       body.showGhost(pressed("ghost"));
       body.showCloud(pressed("cloud"));
+      body.showParts(pressed("parts"));
       body.paint(element<HTMLSelectElement>("paint").value as Paint);
       body.arrows.group.visible = pressed("forces");
     };
@@ -246,7 +274,7 @@ class Streams {
       bodies(Robot.dress);
       this.legend(kind);
     });
-    const [ghost, cloud, forces] = ["ghost", "cloud", "forces"].map((id) => toggle(id, () => bodies(Robot.dress)));
+    const [ghost, cloud, forces, parts] = ["ghost", "cloud", "forces", "parts"].map((id) => toggle(id, () => bodies(Robot.dress)));
     const drag = toggle("drag", (on) => this.dragging.enable(on));
     const flip = (): void => this.pause(!this.paused);
     connectTools(this.stage, {
@@ -258,6 +286,8 @@ class Streams {
       f: forces!,
       b: ghost!,
       c: cloud!,
+      o: parts!,
+      Escape: () => this.stopAll(),
       m: paint,
       d: drag,
     });
@@ -274,11 +304,14 @@ class Robot {
   newest: Moment | null = null;
   shown: Moment | null = null;
   reach: ReturnType<typeof readReach> = null;
+  lease: Lease | null = null;
   ghost: Float32Array | null = null;
   private forces: ReturnType<typeof readForces> = null;
   private inputs: (number | null)[] | null = null;
   private field: Field | null = null;
   private painted: Field | null = null; // the field that the body has now
+  private cloud: Float32Array | null = null;
+  private measured: Float32Array | null = null; // the cloud that the body has now
   private arrived = -Infinity; // when the newest pose came [ms of the page]
   private told: Status = { state: "", detail: "", since_s: null };
   readonly pace = new Pace();
@@ -295,6 +328,7 @@ class Robot {
     if (this.gone) return;
     this.body = body;
     this.stage.robot.add(body.group);
+    body.setMarkers(this.model.markers.length ? this.model.markers : this.model.handles);
     Robot.dress(body);
     if (this.newest) this.put(this.newest);
   }
@@ -310,8 +344,9 @@ class Robot {
     else if (kind === "inputs") this.inputs = readInputs(payload);
     else if (kind === "status") this.told = readStatus(payload) ?? this.told;
     else if (kind === "reach") this.reach = readReach(payload);
+    else if (kind === "lease") this.lease = readLease(payload);
     else if (kind === "ghost") this.ghost = readPose(payload)?.bones ?? null;
-    else if (kind === "cloud") this.seen(readCloud(payload));
+    else if (kind === "cloud") this.cloud = readCloud(payload);
     else if (kind === "field") this.field = this.quantity(readField(payload));
     this.join();
   }
@@ -321,7 +356,7 @@ class Robot {
     const body = this.body;
     if (!body) return;
     const wanted = at === null ? this.newest : (this.history[frameAt(this.history, at)] ?? null);
-    if (wanted && wanted !== this.shown) {
+    if (wanted && (wanted !== this.shown || wanted.cloud !== this.measured)) {
       this.put(wanted);
       stage.touch();
     }
@@ -330,7 +365,7 @@ class Robot {
       body.setStale(stale);
       stage.touch();
     }
-    body.arrows.face(stage.camera, stage.pixelHeight, stage.room);
+    body.face(stage.camera, stage.pixelHeight, stage.room);
   }
 
   /** Returns whether it is live, and that in words. */
@@ -351,7 +386,8 @@ class Robot {
   about(): string {
     const vertices = this.body?.skins.reduce((sum, s) => sum + (s.geometry.getAttribute("position")?.count ?? 0), 0) ?? 0;
     const frame = this.model.inRobotFrame ? "" : " · markers' frame";
-    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}`;
+    const error = this.model.error === null ? "" : ` · ± ${(1000 * this.model.error).toPrecision(2)} mm where it was tested`;
+    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices${frame}${error}`;
   }
 
   private moved(pose: ReturnType<typeof readPose>): void {
@@ -362,7 +398,7 @@ class Robot {
     if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
     // as long as nobody speaks of forces, nothing estimates them
     this.newest = {
-      time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], forceless: true, field: null,
+      time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], forceless: true, field: null, cloud: null,
     };
     this.join();
     this.history.push(this.newest);
@@ -370,7 +406,7 @@ class Robot {
   }
 
   private join(): void {
-    if (this.newest) Object.assign(this.newest, this.forces ?? {}, { inputs: this.inputs, field: this.field });
+    if (this.newest) Object.assign(this.newest, this.forces ?? {}, { inputs: this.inputs, field: this.field, cloud: this.cloud });
   }
 
   private put(moment: Moment): void {
@@ -378,7 +414,12 @@ class Robot {
     this.body?.pose(moment.bones);
     this.body?.show(moment.contacts);
     this.body?.setDoubtful(isDoubtful(moment));
-    if (!this.body || moment.field === this.painted) return;
+    if (!this.body) return;
+    if (moment.cloud !== this.measured) {
+      this.measured = moment.cloud;
+      this.body.setCloud(moment.cloud ?? new Float32Array());
+    }
+    if (moment.field === this.painted) return;
     this.painted = moment.field;
     this.body.painter.setField(moment.field);
     this.body.painter.frame(0);
@@ -387,13 +428,4 @@ class Robot {
   private quantity(read: ReturnType<typeof readField>): Field | null {
     return read && this.model.field ? { ...this.model.field, ...read } : null;
   }
-
-  private seen(points: Float32Array | null): void {
-    if (!points || !this.body) return;
-    this.body.setCloud(points);
-    if (!points.length) this.body.showCloud(false);
-    else Robot.dress(this.body);
-    this.stage.touch();
-  }
 }
-

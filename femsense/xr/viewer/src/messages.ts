@@ -20,6 +20,7 @@ export interface Model {
   markers: NamedPoint[];
   cameras: NamedPoint[];
   commands: boolean;
+  error: number | null; // of a learnt model, root mean square distance of its markers from measured ones [m]
   duration: number | null; // of a run that is played over and over [s]
   field: { name: string; unit: string } | null; // what colours the body
 }
@@ -43,6 +44,13 @@ export interface Reach {
   ms: number;
   armed: boolean;
   inputs: { name: string; value: number; unit: string }[];
+}
+
+/** Who steers the robot. */
+export interface Lease {
+  client: string; // "": nobody
+  number: number;
+  stopped: boolean; // by somebody who pressed stop; who was armed is not any more
 }
 
 const text = new TextDecoder();
@@ -113,6 +121,7 @@ export function readModel(payload: Uint8Array): Model | null {
     cameras: list(told.cameras).map(named),
     commands: told.commands === true,
     duration: number(told.duration_s),
+    error: number(told.error_m),
     field: told.field ? quantity(told.field as Record<string, unknown>) : null,
   };
 }
@@ -152,6 +161,11 @@ export function readReach(payload: Uint8Array): Reach | null {
     armed: told.armed === true,
     inputs: list(told.inputs).map((i) => ({ name: String(i.name), value: number(i.value) ?? NaN, unit: String(i.unit ?? "") })),
   };
+}
+
+export function readLease(payload: Uint8Array): Lease | null {
+  const told = document(payload);
+  return told ? { client: String(told.client ?? ""), number: number(told.number) ?? 0, stopped: told.stopped === true } : null;
 }
 
 function quantity(told: Record<string, unknown>): { name: string; unit: string } {

@@ -1,6 +1,6 @@
 // What colours the body: nothing, motion from rest, stress, or how likely a contact is at each point.
 
-import { BufferAttribute, Vector4, type MeshStandardMaterial, type SkinnedMesh } from "three";
+import { BufferAttribute, Color, Vector4, type MeshStandardMaterial, type SkinnedMesh } from "three";
 import type { Contact } from "./data";
 
 export const PAINTS = ["none", "motion", "stress", "contact"] as const;
@@ -21,6 +21,7 @@ export class Painter {
   private readonly mode = { value: 0 };
   private readonly scale = { value: 1 };
   private readonly faded = { value: 0 };
+  private readonly fadedTo = { value: new Color() };
   private readonly places = { value: Array.from({ length: CONTACTS }, () => new Vector4(0, 0, 0, 0)) };
   private readonly attributes: BufferAttribute[] = [];
   private field: Field | null = null;
@@ -35,7 +36,7 @@ export class Painter {
     skin.geometry.setAttribute("paintField", attribute);
     this.attributes.push(attribute);
     material.onBeforeCompile = (shader) => {
-      Object.assign(shader.uniforms, { paintMode: this.mode, paintScale: this.scale, paintPlaces: this.places, paintFaded: this.faded });
+      Object.assign(shader.uniforms, { paintMode: this.mode, paintScale: this.scale, paintPlaces: this.places, paintFaded: this.faded, paintFadedTo: this.fadedTo });
       shader.vertexShader = shader.vertexShader
         .replace("#include <common>", "#include <common>\nattribute float paintField;\nvarying float vField;\nvarying float vMotion;\nvarying vec3 vPlace;")
         .replace("#include <skinning_vertex>", "#include <skinning_vertex>\nvMotion = length(transformed - position);\nvField = paintField;\nvPlace = transformed;");
@@ -44,7 +45,7 @@ export class Painter {
           "#include <common>",
           `#include <common>
           varying float vField; varying float vMotion; varying vec3 vPlace;
-          uniform int paintMode; uniform float paintScale; uniform float paintFaded; uniform vec4 paintPlaces[${CONTACTS}];`,
+          uniform int paintMode; uniform float paintScale; uniform float paintFaded; uniform vec3 paintFadedTo; uniform vec4 paintPlaces[${CONTACTS}];`,
         )
         .replace("#include <color_fragment>", `#include <color_fragment>\n${COLORING}`);
     };
@@ -57,9 +58,10 @@ export class Painter {
     this.scale.value = Math.max(largest, 1e-9);
   }
 
-  /** Takes a share of all colour away. */
-  fade(share: number): void {
+  /** Replaces a share of all colour by another. */
+  fade(share: number, to: number): void {
     this.faded.value = share;
+    this.fadedTo.value.set(to);
   }
 
   setField(field: Field | null): void {
@@ -109,4 +111,4 @@ if (paintMode > 0) {
   vec3 low = vec3(0.03, 0.02, 0.20), middle = vec3(0.10, 0.42, 0.42), high = vec3(0.95, 0.80, 0.10);
   diffuseColor.rgb = s < 0.5 ? mix(low, middle, 2.0 * s) : mix(middle, high, 2.0 * s - 1.0);
 }
-diffuseColor.rgb = mix(diffuseColor.rgb, vec3(0.147, 0.168, 0.202), paintFaded);`;
+diffuseColor.rgb = mix(diffuseColor.rgb, paintFadedTo, paintFaded);`;

@@ -53,10 +53,12 @@ class Player {
     this.duration = clip?.duration ?? 0;
     this.times = Array.from(clip?.tracks[0]?.times ?? [0]);
     const box = this.space();
+    const floor = box.min.y; // of the body; arrows may reach below
     stage.robot.add(body.group);
     body.arrows.largest = body.arrows.full = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
     for (const frame of run?.frames ?? []) for (const end of body.arrows.ends(frame.contacts)) box.expandByPoint(end);
-    stage.fit(box);
+    stage.fit(box, floor);
+    this.body.setMarkers(run?.markers ?? []);
     const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
     stage.headset.changed = (on) => {
       if (on) stage.headset.alignment = alignWith(stage, this.body, landmarks);
@@ -71,7 +73,7 @@ class Player {
 
   step(seconds: number): void {
     if (this.playing && this.duration > 0) this.seek((this.time + this.speed * seconds) % this.duration);
-    this.body.arrows.face(this.stage.camera, this.stage.pixelHeight, this.stage.room);
+    this.body.face(this.stage.camera, this.stage.pixelHeight, this.stage.room);
   }
 
   /** Shows a time [s]. */
@@ -197,6 +199,10 @@ function connect(stage: Stage, player: Player): void {
     player.body.arrows.group.visible = on;
     stage.touch();
   });
+  const parts = toggle("parts", (on) => {
+    player.body.showParts(on);
+    stage.touch();
+  });
   element("cloud").hidden = element("live").hidden = element("drag").hidden = true;
   connectTools(stage, {
     " ": () => player.play(!player.playing),
@@ -207,6 +213,7 @@ function connect(stage: Stage, player: Player): void {
     End: () => player.seek(player.duration),
     f: forces,
     b: ghost,
+    o: parts,
     m: paint,
   });
   player.seek(Number(asked.get("time") ?? 0) || 0);

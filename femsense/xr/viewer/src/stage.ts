@@ -23,7 +23,9 @@ import {
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
+import { niceLength } from "./body";
 import { Headset } from "./headset";
+import { Measures } from "./measures";
 
 const FIELD_OF_VIEW = 38; // on a screen [deg]
 const WIDEST = 10; // times as wide as what was in view: what is still farther away is no robot
@@ -31,13 +33,14 @@ const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stan
 
 /** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
 function free(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
-  const tabs = document.querySelector("#robots:not([hidden])") ? 42 : 0;
-  const dragging = document.querySelector<HTMLElement>("#dragging:not([hidden])");
+  const tabs = document.querySelector("#robots:not([hidden])") ? 50 : 0;
+  const tall = (id: string): number => document.querySelector<HTMLElement>(`#${id}:not([hidden])`)?.offsetHeight ?? 0;
   if (width <= 820 && height > 480) {
-    const [panel, below] = dragging ? [60, dragging.clientHeight + 12] : [0.3 * height, 0];
-    return { left: 10, right: 10, top: 80 + tabs + panel, bottom: 180 + below };
+    const dragging = tall("dragging");
+    return { left: 10, right: 10, top: 80 + tabs + (dragging ? 60 : 0.3 * height), bottom: 24 + tall("dock") + dragging + tall("measures") };
   }
-  return { left: 20, right: height > 480 ? 310 : 290, top: 70, bottom: 100 };
+  const left = tall("dragging") && width > 1000 ? 380 : 20;
+  return { left, right: height > 480 ? 310 : 290, top: 70, bottom: 36 + tall("dock") };
 }
 
 export class Stage {
@@ -52,6 +55,8 @@ export class Stage {
   private readonly sun = new DirectionalLight(0xfff2e0, 2.6);
   private dirty = true;
   private box = new Box3();
+  private floor = 0; // height of the ground, in glTF's frame [m]
+  private readonly measures = new Measures();
   private moved = false; // by the person who looks
 
   constructor(private readonly canvas: HTMLCanvasElement) {
@@ -78,17 +83,20 @@ export class Stage {
     this.controls.dampingFactor = 0.12;
     this.controls.addEventListener("change", () => this.touch());
     this.controls.addEventListener("start", () => (this.moved = true));
-    new ResizeObserver(() => this.resize()).observe(canvas);
+    const observer = new ResizeObserver(() => this.resize());
+    for (const one of [canvas, document.getElementById("dock")!]) observer.observe(one);
     this.resize();
   }
 
-  /** Fits ground, light and camera to the space that the body needs during the run, in glTF's frame [m]. */
-  fit(box: Box3): void {
+  /** Fits ground, light and camera to the space that the body needs, in glTF's frame [m]; it stands on the floor, which is the lowest
+   * that the body itself is. */
+  fit(box: Box3, floor = this.floor): void {
     this.box = box.clone();
+    this.floor = floor;
     this.headset.fit(box);
     const size = box.getSize(new Vector3()).length() || 1;
     const middle = box.getCenter(new Vector3());
-    this.layGround(size, middle, box.min.y - 0.002 * size);
+    this.layGround(size, middle, floor);
     this.sun.position.copy(middle).add(new Vector3(0.6, 1.4, 0.8).multiplyScalar(1.4 * size));
     this.sun.target.position.copy(middle);
     const shadow = this.sun.shadow.camera;
@@ -166,12 +174,19 @@ export class Stage {
       this.renderer.shadowMap.needsUpdate = this.dirty;
       this.dirty = false;
       this.renderer.render(this.scene, this.camera);
+      if (!this.renderer.xr.isPresenting) this.measures.follow(this.camera, this.robot, this.pixelsPerMetre());
     });
   }
 
   /** Height of the view in pixels; 0 in a headset. */
   get pixelHeight(): number {
     return this.renderer.xr.isPresenting ? 0 : this.canvas.clientHeight;
+  }
+
+  /** Pixels of a metre where the view turns about. */
+  private pixelsPerMetre(): number {
+    const away = this.camera.position.distanceTo(this.controls.target);
+    return this.canvas.clientHeight / (2 * away * Math.tan((this.camera.fov * Math.PI) / 360)) || 1;
   }
 
   /** What the panels leave free of the picture, which is −1 … 1 wide and high; null in a headset. */
@@ -197,11 +212,12 @@ export class Stage {
 
   private layGround(size: number, middle: Vector3, height: number): void {
     this.ground.clear();
-    const step = 10 ** Math.floor(Math.log10(size / 3)); // 1 cm, 10 cm, 1 m …
+    const step = niceLength(size / 14); // 1 cm, 2 cm, 5 cm …
     const half = Math.ceil((2.5 * size) / step) * step;
+    this.measures.grid(step);
     for (const [cell, color, opacity] of [
-      [step, 0x8fb3e0, 0.09],
-      [5 * step, 0xa9c8f0, 0.16],
+      [step, 0x8fb3e0, 0.12],
+      [5 * step, 0xa9c8f0, 0.2],
     ] as const) {
       const count = Math.max(2, 2 * Math.round(half / cell));
       const lines = new GridHelper(count * cell, count, color, color);
@@ -209,12 +225,12 @@ export class Stage {
       paint.transparent = true;
       paint.opacity = opacity;
       paint.depthWrite = false;
-      lines.position.set(Math.round(middle.x / cell) * cell, height, Math.round(middle.z / cell) * cell);
+      lines.position.set(Math.round(middle.x / cell) * cell, height - 0.001 * size, Math.round(middle.z / cell) * cell);
       this.ground.add(lines);
     }
-    const floor = new Mesh(new PlaneGeometry(2 * half, 2 * half), new ShadowMaterial({ opacity: 0.38 }));
+    const floor = new Mesh(new PlaneGeometry(2 * half, 2 * half), new ShadowMaterial({ opacity: 0.5 }));
     floor.rotation.x = -Math.PI / 2;
-    floor.position.set(middle.x, height - 0.0005 * size, middle.z);
+    floor.position.set(middle.x, height - 0.0015 * size, middle.z);
     floor.receiveShadow = true;
     this.ground.add(floor);
   }

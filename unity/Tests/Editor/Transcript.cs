@@ -1,5 +1,4 @@
 // Checks Messages.cs against a transcript that Python wrote: each line is bytes in hexadecimal and what is in them.
-// Without Unity: mcs -out:transcript.exe unity/Runtime/Messages.cs unity/Tests/Transcript.cs && mono transcript.exe unity/Tests/transcript.txt
 using System;
 using System.Globalization;
 using System.IO;
@@ -9,10 +8,11 @@ namespace Femsense
 {
     public static class Transcript
     {
-        public static int Main(string[] arguments)
+        /// <summary>Returns 0 where every line of a file is read as it says; says the first that is not.</summary>
+        public static int Run(string file)
         {
             int checkedLines = 0;
-            foreach (var line in File.ReadAllLines(arguments[0]))
+            foreach (var line in File.ReadAllLines(file))
             {
                 var parts = line.Split(' ');
                 var frame = Enumerable.Range(0, parts[0].Length / 2).Select(i => Convert.ToByte(parts[0].Substring(2 * i, 2), 16)).ToArray();
@@ -26,6 +26,7 @@ namespace Femsense
                 var wanted = parts.Skip(2).Select(p => double.Parse(p, CultureInfo.InvariantCulture)).ToArray();
                 var messages = Frames.Read(frame, frame.Length);
                 if (messages.Count != 1 || messages[0].Topic != parts[1]) return Fail(line, "topic");
+                if (!Frames.Write(parts[1], messages[0].Payload).SequenceEqual(frame)) return Fail(line, "written");
                 var pose = Pose.Read(messages[0].Payload);
                 if (wanted.Length == 0)
                 {

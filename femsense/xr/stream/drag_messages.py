@@ -1,0 +1,71 @@
+"""What clients say of a drag, and what they are told, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from femsense.control.motion import CONVERGING, NEAREST, REACHED, Motion
+from femsense.xr.stream.lease import Claim
+from femsense.xr.stream.payloads import read_document
+
+LONGEST = 4096
+"""Bytes of a wish."""
+LONGEST_NAME = 64
+"""Characters of the name that a client gives itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """Where someone wants a point."""
+
+    claim: Claim
+    handle: str
+    target_m: tuple[float, float, float] | None
+
+
+def read_wish(payload: bytes, way: str) -> Wish | None:
+    """Return the wish in a message that came some way, or None where there is none."""
+    told = read_document(payload, most=LONGEST)
+    if told is None:
+        return None
+    client, seq, number = told.get("client"), told.get("seq"), told.get("lease", 0)
+    if not isinstance(client, str) or not 0 < len(client) <= LONGEST_NAME or type(seq) is not int or type(number) is not int:
+        return None
+    claim = Claim(way, client, seq, number, told.get("held") is True, told.get("armed") is True)
+    return Wish(claim, str(told.get("handle")), place_of(told.get("target_m")))
+
+
+def in_plain_words(motion: Motion) -> str:
+    """Return what became of a wish, for somebody who drags and knows nothing of solvers."""
+    away = f"{1e3 * motion.error_m:.3g} mm"
+    held_back = f": {'; '.join(motion.limits)}" if motion.limits else ""
+    if motion.status == REACHED:
+        return f"The robot can bring the point there, to {away}"
+    if motion.status == CONVERGING:
+        return f"Looking for a way: {away} to go{held_back}"
+    if motion.status == NEAREST:
+        return f"The robot cannot bring it closer than {away}{held_back or ': nothing that drives it moves the point that way'}"
+    why = held_back if motion.equilibrium.converged else f": {motion.equilibrium.advice}"
+    return f"No way was found, {away} are left{why}"
+
+
+def rows_of(told: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    """Return the objects in a list of a document."""
+    rows = told.get(name)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def is_number(told: object) -> TypeGuard[float]:
+    return isinstance(told, int | float) and bool(np.isfinite(told))
+
+
+def place_of(told: object) -> tuple[float, float, float] | None:
+    """Return x, y, z of an object, or None."""
+    if not isinstance(told, dict):
+        return None
+    values = [float(v) for v in (told.get(axis) for axis in "xyz") if is_number(v)]
+    return (values[0], values[1], values[2]) if len(values) == 3 else None
