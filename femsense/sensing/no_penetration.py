@@ -71,7 +71,8 @@ def is_with(contact: Touch, shape: Shape | None) -> bool:
         return True
     first, second = contact.shape.points, shape.points
     apart = float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)))
-    return apart < 0.5 * float(np.linalg.norm(np.ptp(first, axis=0)))
+    extent = min(float(np.linalg.norm(np.ptp(points, axis=0))) for points in (first, second))
+    return apart < 0.5 * extent
 
 
 def is_rigid(model: Model, contact: Touch) -> bool:
