@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
@@ -43,14 +42,14 @@ class Moved:
 def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
     """Return the verdict of a frame, or that a moved camera fits it as well as its inferred contacts, or better than its contacts.
 
-    Asked are frames with inferred contacts, frames that fail the posterior check, and frames whose poses would lower Φ by more than noise does once in 1000.
+    Asked are frames with inferred contacts, frames that fail the posterior check, and those in which the linearised evidence of a pose step
+    exceeds its prior odds.
     """
     if best.frame.pixels is None or len(model.sensor.places):
         return found
     inferred = any(contact.source == "shape" for contact in best.contacts)
     failed = found.status in (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP)
-    limit = max(float(chi2.isf(1e-3, 6 * model.views)), 0.0 if model.limits is None else model.limits.pose)
-    if not (inferred or failed) and pose_gain(model, best) < limit:
+    if not (inferred or failed) and pose_gain(model, best) < MOVED:
         return found
     try:
         stood = _stood(model, best)
@@ -60,8 +59,7 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
     if stood is None or moved is None:
         return found
     numbers = _in_words(model, moved)
-    margin = EQUAL if inferred else 0.0 if failed else MOVED - limit
-    if moved.criterion > stood + margin:
+    if moved.criterion > stood + (EQUAL if inferred else 0.0):
         return found
     shown = _misfit_of_background(model, best) - _misfit_of_background(_at(model, moved.step), best) > EQUAL
     return verdict(Status.CAMERA_MOVED if shown else Status.CAMERA_MAY_HAVE_MOVED, **numbers)

@@ -22,7 +22,6 @@ from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Limits, Model
 from femsense.sensing.odds import INFERRED
-from femsense.sensing.pose_rows import pose_gain
 from femsense.sensing.prepare import pose_covariance, scan_of
 from femsense.sensing.proposals import inferred
 from femsense.sensing.types import Sensor
@@ -165,17 +164,18 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
         assert alone is not None
         if len(frames) >= SEVERAL:
             gains.append(max(inferred(others, alone)[0], 0.0))
-        checks.append((*check_values(others, alone), pose_gain(others, alone)))
+        checks.append(check_values(others, alone))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
     noises = tuple(
         replace(one, at_1m=model.scale * one.at_1m, floor=model.scale * one.floor, slope=model.scale * one.slope)
         for one in model.noises
     )
     bias, share = model.nuisance.sizes[:2]
-    knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share)
+    together = model.overdispersion
+    knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share, together=together)
     sensor = replace(model.sensor, knowledge=knowledge)
-    misfit, nuisance, behind, pose = np.array(checks).T
-    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01), _limit(pose, 1.0))
+    misfit, nuisance, behind = np.array(checks).T
+    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01))
     return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
 
 

@@ -53,7 +53,9 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     """Return contacts, forces and status of frame k. Raises FemsenseError."""
     found = estimate_frame(model, k, previous)
     best, sensor = found.best, model.sensor
+    began = time.perf_counter()
     status = camera_verdict(model, best, checked(model, best))
+    stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     contacts = contacts_of(model, best, previous)
     report = FrameReport(
         int(sensor.recording.frame_numbers[k]),
@@ -63,10 +65,10 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
         measurements(best.rows),
         found.rms_before_m,
         rms_of(best.rows, inliers(best)),
-        sum(found.stages_ms.values()),
+        sum(stages.values()),
         dict(best.state.tension),
         dict(best.state.pressure),
-        found.stages_ms,
+        stages,
     )
     state = replace(best.state, factor=None)
     return SensedFrame(

@@ -105,7 +105,13 @@ def fit(
     for _ in range(STEPS):
         eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
         phi += _prior(model, here)
-        step, eta_there, tau = _step(model, here, linear, eta, weight)
+        step, eta_there, tau, decrease = _step(model, here, linear, eta, weight)
+        if decrease < TOLERANCE:
+            if kappa.narrow:
+                converged = True
+                break
+            kappa = kappa.narrowed()
+            continue
         phi += _prior(model, replace(here, tau=tau)) - _prior(model, here)
         here = replace(here, tau=tau)
         there = None
@@ -215,7 +221,7 @@ def _prior(model: Model, here: Point) -> float:
     return total
 
 
-def _whitened(model: Model, here: Point, *, trust: bool) -> tuple[FloatArray, FloatArray]:
+def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArray, FloatArray]:
     """Return prior scales of (force along its axes, contact point) of all contacts and where they stand in them, shapes (5m,).
 
     trust: the contact point of an inferred contact moves by about an edge in one step.
@@ -241,8 +247,9 @@ def contact_columns(model: Model, here: Point | Fit, axes: FloatArray, linear: L
 
 def _step(
     model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, and the prior scales τ, shape (m,).
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, the prior scales τ, shape (m,), and by
+    how much Φ falls in the linear problem.
 
     τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
     expected under the posterior (MacKay 1992).
@@ -253,7 +260,7 @@ def _step(
     WA = A * weight[:, None]
     gram, tau = A.T @ WA, here.tau.copy()
     for _ in range(SIZINGS):
-        scale, at = _whitened(model, replace(here, tau=tau), trust=True)
+        scale, at = whitened(model, replace(here, tau=tau), trust=True)
         full = np.append(scale, np.ones(here.N.shape[1]))
         inverse = np.linalg.inv(np.eye(len(full)) + full[:, None] * gram * full)
         u = inverse @ (full * (WA.T @ (here.residual + J @ (at * scale))))
@@ -264,7 +271,9 @@ def _step(
                 tau[i] = np.clip(tau[i] * np.sqrt((u[f] @ u[f] + np.trace(inverse[f, f])) / 3.0), *TAU)
         if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
             break
-    return (u[: 5 * m] - at) * scale, u[5 * m :], last
+    change = u - np.append(at, eta)
+    decrease = float(change @ (np.eye(len(full)) + full[:, None] * gram * full) @ change)
+    return (u[: 5 * m] - at) * scale, u[5 * m :], last, decrease
 
 
 def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: FloatArray) -> Point | None:
@@ -289,7 +298,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta)
     J = contact_columns(model, here, here.axes, linear)
-    scale, at = _whitened(model, here, trust=False)
+    scale, at = whitened(model, here, trust=False)
     A = np.hstack([J * scale, here.N])
     H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
     P = np.linalg.inv(H)

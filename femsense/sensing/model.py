@@ -233,8 +233,6 @@ class Limits:
     misfit: float
     nuisance: float
     behind: float
-    pose: float
-    """Decrease of Φ by a step of the poses."""
 
 
 def with_state(start: Equilibrium, positions: FloatArray) -> Equilibrium:

@@ -35,6 +35,8 @@ CONE = float(np.sqrt(10.0 / 3.0))
 """Radius of a cone of pressure over its root mean square radius."""
 AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
+WINDOWED = 2.0
+"""A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
 SOME = 300
 """Rays that tell the angle between neighbours."""
 BLEEDING = 3.0
@@ -102,7 +104,7 @@ def _edge_of(
     pixel = np.array([_pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
     depth = np.linalg.norm(points - origins, axis=1)
     edge = np.asarray(BLEEDING * pixel[view] * depth)
-    matched = np.array([noise.kind == "stereo" for noise in noises])[view]
+    matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (sensor.knowledge.together > WINDOWED)
     beside = body.beside_rays(points, origins)
     return edge, np.asarray(matched & ((gap < edge) | ((beside > 0.0) & (beside < edge))))
 

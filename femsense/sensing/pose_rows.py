@@ -1,4 +1,4 @@
-"""What poses alone move: the background as rows, and by how much a step of the poses would lower Φ."""
+"""What poses alone move: the background as rows, and by how much a step of the poses would raise the evidence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.inference.rows import Rows
 from femsense.sensing.background import look, off_background
-from femsense.sensing.fit import contact_columns
+from femsense.sensing.fit import contact_columns, whitened
 from femsense.sensing.model import Fit, Model
 
 FAR = 0.1
@@ -42,12 +42,11 @@ def background_rows(model: Model, k: int) -> Rows | None:
 
 
 def pose_gain(model: Model, best: Fit) -> float:
-    """Return by how much pose steps of any size would lower Φ next to the contacts of a fit, to first order."""
+    """Return by how much pose steps of any size would lower −2 log evidence next to the contacts of a fit, to first order."""
     J = contact_columns(model, best, best.axes, best.linearised)
-    forces, q = J[:, np.arange(J.shape[1]) % 5 < 3], best.N.shape[1]
-    beside, W, P = np.hstack([forces, best.N]), best.weight[:, None], best.C[:, : 6 * model.views] * far(model)
-    prior = np.diag(np.append(np.zeros(forces.shape[1]), np.ones(q)))
-    own = P - beside @ (np.linalg.pinv((beside * W).T @ beside + prior) @ ((beside * W).T @ P))
+    beside = np.hstack([J * whitened(model, best, trust=False)[0], best.N])
+    W, P = best.weight[:, None], best.C[:, : 6 * model.views] * far(model)
+    own = P - beside @ np.linalg.solve(np.eye(beside.shape[1]) + (beside * W).T @ beside, (beside * W).T @ P)
     gain = _lowered(own, own * W, best.left(model.nuisance) * best.rows.std)
     background = background_rows(model, best.frame.index)
     if background is not None:
@@ -58,6 +57,6 @@ def pose_gain(model: Model, best: Fit) -> float:
 
 
 def _lowered(A: FloatArray, WA: FloatArray, residual: FloatArray) -> float:
-    """Return by how much columns A (r, q) with unit priors lower the weighted sum of squares of a residual."""
-    right = WA.T @ residual
-    return float(right @ np.linalg.solve(np.eye(A.shape[1]) + WA.T @ A, right))
+    """Return by how much columns A (r, q) with unit priors lower −2 log evidence, to first order."""
+    right, H = WA.T @ residual, np.eye(A.shape[1]) + WA.T @ A
+    return float(right @ np.linalg.solve(H, right) - np.linalg.slogdet(H)[1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from threading import Event, Thread
 
@@ -32,17 +31,19 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 def reader(rows: list[Reading], *, away: str = "", limits: ActuationLimits | None = None, paced: bool = False) -> ReadActuation:
     """Return an actuation that has read some rows, at once or at their own times; its source stays open."""
     stop, done = Event(), Event()
+    readings = Readings(lambda row: row, stop, away=lambda: away)
 
-    def items() -> Iterator[Reading]:
+    def send() -> None:
         before = rows[0][0] if rows else 0.0
         for row in rows:
-            time.sleep(max(0.0, row[0] - before) if paced else 0.0)
+            time.sleep(max(0.05, row[0] - before) if paced else 0.05)  # one at a time: only the newest is kept
             before = row[0]
-            yield row
+            readings.hear(row)
+        time.sleep(0.05)
         done.set()
-        stop.wait(10.0)
 
-    made = ReadActuation(COLUMNS, Readings(items(), lambda row: row, away=lambda: away), stop, "udp://x", limits)
+    made = ReadActuation(COLUMNS, readings, stop, "udp://x", limits)
+    Thread(target=send, daemon=True).start()
     assert done.wait(5.0)
     return made
 
@@ -68,7 +69,7 @@ def test_values_are_interpolated_at_the_time_of_the_frame() -> None:
 def test_a_delay_takes_older_values() -> None:
     late = reader(RAMP, paced=True, limits=ActuationLimits(delay_s=0.3))
     now = time.monotonic()
-    assert value(late, now)[0] == pytest.approx(1.0, abs=0.5) and value(late, now + 0.3)[0] == pytest.approx(4.0, abs=0.3)
+    assert value(late, now - 0.05)[0] == pytest.approx(1.0, abs=0.5) and value(late, now + 0.3)[0] == pytest.approx(4.0, abs=0.3)
     late.close()
 
 
