@@ -1,0 +1,124 @@
+"""Contacts and forces by one objective: `--method evidence`, from clouds and from markers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import T_ROBOT_CAMERA, arm, record
+from touched_arm import INPUTS, PLACE, touched
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.pose import invert_pose, move_pose, transform_points
+from femsense.model.recording import Recording
+from femsense.model.recording_parts import Tool
+from femsense.sensing.contact_free import learn
+from femsense.sensing.estimate_frame import estimate_frame
+from femsense.sensing.model import Model
+from femsense.sensing.no_penetration import gap_rows, in_touch
+from femsense.sensing.odds import VISIBLE, odds_of
+from femsense.sensing.pipeline import estimate
+from femsense.sensing.prepare import first_sensor
+from femsense.sensing.status import Status, verdict
+from femsense.sensing.types import Run, SensingOptions
+
+EVIDENCE = SensingOptions(method="evidence")
+PUSH = np.array([0.0, 0.0, -0.15])
+
+
+def estimated(recording: Recording, **options: Any) -> Run:
+    chosen = replace(EVIDENCE, **options)
+    return estimate(arm(), recording, calibrate(arm(), recording), options=chosen)
+
+
+def model_of(recording: Recording) -> Model:
+    return learn(first_sensor(arm(), recording, calibrate(arm(), recording), options=EVIDENCE))
+
+
+def test_a_visible_contact_has_its_force_and_place_within_its_interval(tmp_path: Path):
+    run = estimated(touched(tmp_path, PUSH, ball=True))
+    (contact,) = run.contacts
+    assert [frame.status for frame in run.frames] == ["ok"] * 4
+    assert (contact.frame, contact.source) == (3, "cloud")
+    assert contact.force_n == pytest.approx(0.15, rel=0.1) and abs(contact.force_n - 0.15) < 3 * contact.std_n
+    assert np.linalg.norm(contact.position_m[:2] - PLACE[:2]) < 0.004
+
+
+def test_a_contact_that_no_camera_sees_is_inferred(tmp_path: Path):
+    run = estimated(touched(tmp_path, PUSH, ball=False))
+    (contact,) = run.contacts
+    assert (contact.frame, contact.source) == (3, "shape") and abs(contact.force_n - 0.15) < 3 * contact.std_n
+
+
+def test_without_a_contact_none_is_reported(tmp_path: Path):
+    run = estimated(touched(tmp_path, np.zeros(3), ball=False))
+    assert not run.contacts and [frame.status for frame in run.frames] == ["ok"] * 4
+
+
+def test_a_moved_camera_is_told_from_a_contact_by_the_background(tmp_path: Path):
+    nudge = np.array([0.0, 0.0, 0.0, 0.0, 0.002, 0.0])
+    run = estimated(touched(tmp_path, np.zeros(3), ball=False, nudge=nudge, wall=True))
+    assert "the camera seems to have moved by 2.0 mm" in run.frames[3].status
+    assert [frame.status for frame in run.frames[:3]] == ["ok"] * 3
+
+
+def test_markers_alone_give_the_force_at_a_given_place():
+    force = np.array([0.0, 0.1, -0.2])
+    recording, _ = record(INPUTS, noise=1e-4, forces={3: (PLACE, force)})
+    recording = replace(recording, free=np.array([True, True, True, False]))
+    run = estimate(arm(), recording, calibrate(arm(), recording), at=PLACE, options=EVIDENCE)
+    contact = run.contacts[-1]
+    assert contact.source == "given" and np.linalg.norm((contact.force_n_xyz - force)[1:]) < 0.02
+
+
+def test_a_gap_is_a_row_whose_derivative_is_that_of_the_gap(tmp_path: Path):
+    """Nodes that move away from the ball open the gap by as much as the row says."""
+    recording = replace(touched(tmp_path, PUSH, ball=True), tools=(Tool("ball", "ball", 0.006),))
+    model = model_of(recording)
+    best = estimate_frame(model, 3, None).best
+    (contact,) = best.contacts
+    assert contact.shape is not None and contact.shape.kind == "sphere" and in_touch(model, contact, best.state.positions)
+    assert odds_of(model, contact, best.rows) < VISIBLE  # a ball at the surface is likely to touch
+    here = gap_rows(model, best.frame, best.contacts, best.state.positions)
+    lower = np.zeros_like(best.state.positions)
+    lower[:, 2] = -1e-4
+    there = gap_rows(model, best.frame, best.contacts, best.state.positions + lower)
+    assert there[0].residual - here[0].residual == pytest.approx(-here[0].of(lower[None])[:, 0], abs=2e-6)
+
+
+def test_an_object_that_lies_in_the_undeformed_body_overlaps_it_without_a_contact(tmp_path: Path):
+    recording = replace(touched(tmp_path, PUSH, ball=True), tools=(Tool("ball", "ball", 0.006),))
+    model = model_of(recording)
+    best = estimate_frame(model, 3, None).best
+    (row,) = gap_rows(model, best.frame, (), best.frame.predicted.positions)
+    assert row.residual[0] > 3.0 * row.std[0]
+
+
+def test_the_evidence_of_a_true_contact_falls_when_it_is_dropped(tmp_path: Path):
+    best = estimate_frame(model_of(touched(tmp_path, PUSH, ball=True)), 3, None).best
+    assert best.drop_gain[0] > best.odds[0] + 10.0 and best.converged
+
+
+def test_a_status_is_an_enum_with_a_text():
+    told = verdict(Status.UNDETERMINED, force_n=0.48, std_n=0.26)
+    assert str(told) == "contact, size not determined (0.48 ± 0.26 N)" and told.trusted
+    assert not verdict(Status.NOT_CONVERGED).trusted and str(verdict(Status.OK)) == "ok"
+
+
+def test_contact_free_clouds_correct_the_pose_of_the_camera(tmp_path: Path):
+    recording = touched(tmp_path, np.zeros(3), ball=False)
+    calibration = calibrate(arm(), recording)
+    step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5e-4])
+    off = replace(
+        calibration,
+        poses=tuple(move_pose(T, step) for T in calibration.poses),
+        T_robot_camera=move_pose(calibration.T_robot_camera, step),
+        joint_covariance=np.diag([1e-6] * 3 + [1e-6] * 3),
+    )
+    found = learn(first_sensor(arm(), recording, off, options=EVIDENCE)).sensor.calibration.poses[0]
+    seen = transform_points(invert_pose(T_ROBOT_CAMERA), PLACE[None])
+    after, before = (float(np.linalg.norm(transform_points(T, seen)[0] - PLACE)) for T in (found, off.poses[0]))
+    assert before > 4e-4 and after < 0.3 * before
