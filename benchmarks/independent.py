@@ -1,6 +1,6 @@
 """Recordings of touched soft robots by an independent generator, and how far the program's forces are from their truth.
 
-    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--law] [--diamond FOLDER]
+    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--method NAME …] [--law] [--diamond FOLDER]
     python benchmarks/independent.py --list
 
 Below OUT, each case has `robot/`, `recording/` and `truth.json`; with `--run` the installed `femsense` calibrates and estimates
@@ -10,11 +10,12 @@ every case and a table follows. Everything that is drawn comes from the seed. Ne
 from __future__ import annotations
 
 import argparse
+from collections import defaultdict
 from pathlib import Path
 
 from independent.cases import CASES
 from independent.declared import declare_law
-from independent.grade import grade, heading, run, summary
+from independent.grade import Row, grade, heading, results_of, run, summary
 from independent.make import make
 
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
@@ -36,6 +37,9 @@ def main() -> int:
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
     ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest, whose forces push")
+    ask.add_argument(
+        "--method", action="append", metavar="NAME", help="of femsense estimate; may be repeated: one run, all tables"
+    )
     ask.add_argument("--law", action="store_true", help="with --run: the robot declares the law of the truth")
     ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
     ask.add_argument("--list", action="store_true", help="name the cases")
@@ -46,7 +50,7 @@ def main() -> int:
     unknown = set(given.case) - {c.name for c in CASES}
     if unknown:
         ask.error(f"no such case: {', '.join(sorted(unknown))}")
-    rows = []
+    rows: dict[str, list[Row]] = defaultdict(list)
     for case in CASES:
         if case.name not in given.case if given.case else case.calm or case.near_clamp or case.nudges:
             continue
@@ -64,13 +68,14 @@ def main() -> int:
             )
         if given.run:
             asked = declare_law(folder, folder / "law") if given.law else folder
-            note = run(asked, at=given.at, timeout=given.timeout)
-            row = grade(asked / ("run-at" if given.at else "run"), folder / "truth.json", note=note)
-            rows.append(row)
-            print(heading() if len(rows) == 1 else "", end="\n" if len(rows) == 1 else "")
-            print(row.line(), flush=True)
-    if rows:
-        print(summary(rows))
+            for method in given.method or ["rays"]:
+                note = run(asked, at=given.at, method=method, timeout=given.timeout)
+                row = grade(results_of(asked, at=given.at, method=method), folder / "truth.json", note=f"{method}, {note}")
+                print("" if any(rows.values()) else f"{heading()}\n", end="")
+                rows[method].append(row)
+                print(row.line(), flush=True)
+    for method, graded in rows.items():
+        print(f"{method}:\n{summary(graded)}")
     return 0
 
 

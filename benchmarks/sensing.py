@@ -1,6 +1,6 @@
-"""Forces from clouds against their truth: the published method beside what is done here, with places found and given.
+"""Forces from clouds against their truth, by each method in one run, with places found and given.
 
-    python benchmarks/sensing.py FOLDER …                    # recordings of another program (`data/touches`)
+    python benchmarks/sensing.py FOLDER … [--method NAME …] [--found]   # recordings of another program (`data/touches`, `data/lab`)
     python benchmarks/sensing.py --rates [--keep FOLDER]     # raw cloud → force, by stage (`data/diamond`)
 
 A folder holds robot/, recording/ and truth.json: {"contacts": [{"frame", "point" [m, deformed], "force" [N], "rest" [m,
@@ -22,12 +22,12 @@ from femsense import Run, SensingOptions, calibrate, estimate, load_recording, l
 
 NEAR = 0.09
 """A contact farther from the truth than this is another one [m]."""
-METHODS = {"paper": SensingOptions(method="paper"), "rays": SensingOptions()}
+METHODS = {name: SensingOptions(method=name) for name in ("paper", "rays", "evidence")}
 
 
 def graded(run: Run, truth: list[dict[str, Any]], *, given: bool) -> str:
     """Return one row of the table: errors, places, missed and false contacts, coverage, time by stage."""
-    relative, place, within, missed, used = [], [], [], 0, set()
+    relative, place, over_std, missed, used = [], [], [], 0, set()
     contacts = [c for c in run.contacts if c.force_n > 0]
     for true in truth:
         force = float(np.linalg.norm(true["force"]))
@@ -42,15 +42,17 @@ def graded(run: Run, truth: list[dict[str, Any]], *, given: bool) -> str:
         distance, i = min(near)
         used.add(i)
         relative.append(abs(contacts[i].force_n / force - 1.0))
-        within.append(abs(contacts[i].force_n - force) < 1.96 * contacts[i].std_n)
+        over_std.append(abs(contacts[i].force_n - force) / max(contacts[i].std_n, 1e-9))
         place.append(1e3 * distance)
     false = 0 if given else len(contacts) - len(used)
-    stages = {name: np.median([f.stages_ms[name] for f in run.frames if f.stages_ms]) for f in run.frames for name in f.stages_ms}
-    times = ", ".join(f"{name} {value:.0f}" for name, value in stages.items()) or f"{np.median([f.ms for f in run.frames]):.0f}"
+    touched = [f for f in run.frames if f.frame in {true["frame"] for true in truth}]
+    stages = {name: np.median([f.stages_ms.get(name, 0.0) for f in touched]) for f in touched for name in f.stages_ms}
+    times = ", ".join(f"{name} {value:.0f}" for name, value in stages.items()) or f"{np.median([f.ms for f in touched]):.0f}"
     if not relative:
-        return f"| – | – | – | {missed}/{len(truth)} | {false} | – | {times} |"
+        return f"| – | – | – | {missed}/{len(truth)} | {false} | – | – | {times} |"
     errors = f"{np.median(relative):.1%} | {np.quantile(relative, 0.95):.1%} | {np.median(place):.1f}"
-    return f"| {errors} | {missed}/{len(truth)} | {false} | {np.mean(within):.0%} | {times} |"
+    std = f"{np.mean(np.array(over_std) < 1.96):.0%} | {np.sqrt(np.mean(np.square(over_std))):.2f}"
+    return f"| {errors} | {missed}/{len(truth)} | {false} | {std} | {times} |"
 
 
 def main() -> None:
@@ -61,20 +63,25 @@ def main() -> None:
     parser.add_argument(
         "--keep", type=Path, help="with --rates: where recordings and rows stay; those that are there are not made again"
     )
+    parser.add_argument("--method", action="append", choices=METHODS, help="may be repeated; else all")
+    parser.add_argument("--found", action="store_true", help="not at the true places")
     asked = parser.parse_args()
     if asked.rates:
         with tempfile.TemporaryDirectory() as name:
             print_rates(asked.points, asked.keep or Path(name))
         return
-    print("| case | place | method | error of force (median) | (95 %) | place [mm] | missed | false | within 95 % | ms a frame |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print(
+        "| case | place | method | error of force (median) | (95 %) | place [mm] | missed | false | within 95 % | rms of error/σ | ms a frame |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for folder in asked.folders:
         robot, recording = load_robot(folder / "robot"), load_recording(folder / "recording")
         document = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         truth, calibration = document["contacts"], calibrate(robot, recording)
         rest = [p["point"] for p in document.get("patches", [])] or list({tuple(t["rest"]): None for t in truth})
-        for name, options in METHODS.items():
-            for at in (None, rest):
+        for name in asked.method or METHODS:
+            for at in (None,) if asked.found else (None, rest):
+                options = METHODS[name]
                 run = estimate(robot, recording, calibration, at=at, options=options)
                 print(
                     f"| {folder.name} | {'found' if at is None else 'given'} | {name} {graded(run, truth, given=at is not None)}",

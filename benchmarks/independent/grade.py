@@ -186,9 +186,14 @@ def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str)
             row.wrong_quietly += abs(error) > WRONG * size and not row.covered[-1] and status == "ok"
 
 
-def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:
+def results_of(folder: Path, *, at: bool = False, method: str = "rays") -> Path:
+    """Folder of a run."""
+    return folder / f"run{'-at' * at}{'' if method == 'rays' else f'-{method}'}"
+
+
+def run(folder: Path, *, at: bool = False, method: str = "rays", timeout: float = 900.0) -> str:
     """Run `femsense calibrate` and `estimate` on a case; what went wrong and how long it took, in words."""
-    robot, recording, results = str(folder / "robot"), str(folder / "recording"), str(folder / ("run-at" if at else "run"))
+    robot, recording, results = str(folder / "robot"), str(folder / "recording"), str(results_of(folder, at=at, method=method))
     calibration = str(folder / "calibration.json")
     places: list[str] = []
     if at:
@@ -198,7 +203,7 @@ def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:
     begin = time.perf_counter()
     for words in (
         ["calibrate", robot, recording, "-o", calibration, "--json"],
-        ["estimate", robot, recording, "-c", calibration, "-o", results, "--json", *places],
+        ["estimate", robot, recording, "-c", calibration, "-o", results, "--json", "--method", method, *places],
     ):
         try:
             done = subprocess.run(
