@@ -25,8 +25,8 @@ MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
 EQUAL = 16.3
 """Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
-STEPS, STILL = 8, 1e-3
-"""Steps of the pose at most, and the share of FAR below which one is the last."""
+STEPS, FIRST, STILL = 8, 1, 1e-3
+"""Steps of the pose at most, steps before a search may be given up, and the share of FAR below which a step is the last."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,25 +53,29 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
         return found
     try:
         stood = _stood(model, best)
-        moved = moved_cameras(model, best)
+        bound = np.inf if stood is None else stood + (EQUAL if inferred else 0.0)
+        moved = moved_cameras(model, best, bound)
     except FemsenseError:
         return found
     if stood is None or moved is None:
         return found
     numbers = _in_words(model, moved)
-    if moved.criterion > stood + (EQUAL if inferred else 0.0):
+    if moved.criterion > bound:
         return found
     shown = _misfit_of_background(model, best) - _misfit_of_background(_at(model, moved.step), best) > EQUAL
     return verdict(Status.CAMERA_MOVED if shown else Status.CAMERA_MAY_HAVE_MOVED, **numbers)
 
 
-def moved_cameras(model: Model, best: Fit) -> Moved | None:
-    """Return the poses that fit the frame best with its visible contacts alone; None where there is no equilibrium."""
+def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | None:
+    """Return the poses that fit the frame best with its visible contacts alone; None where there is no equilibrium.
+
+    bound: J that makes the search worth while; after FIRST steps far above it, the search ends.
+    """
     visible = [i for i, contact in enumerate(best.contacts) if contact.source != "shape"]
     contacts, forces, tau = [best.contacts[i] for i in visible], best.forces[visible], best.tau[visible]
     step, found, lowest = np.zeros(6 * model.views), None, np.inf
     start = best.state if visible else best.frame.predicted
-    for _ in range(STEPS):
+    for i in range(STEPS):
         there = _at(model, step)
         frame = _seen_from(there, best.frame)
         fitted = fit(there, frame, contacts, forces, start, tau=tau)
@@ -81,7 +85,7 @@ def moved_cameras(model: Model, best: Fit) -> Moved | None:
         if fitted.criterion < lowest:
             lowest = fitted.criterion
             found = Moved(step - change, lowest + MOVED)
-        if np.abs(change / far(model)).max() < STILL:
+        if np.abs(change / far(model)).max() < STILL or (i >= FIRST and lowest + MOVED > bound + EQUAL):
             break
         step, forces, tau, start = step - change, fitted.forces, fitted.tau, fitted.state
     return found

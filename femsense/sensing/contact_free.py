@@ -45,10 +45,6 @@ class ContactFree:
 def learn(sensor: Sensor) -> Model:
     """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
     model = _first_model(sensor)
-    first = free_clouds(sensor.recording)
-    if len(first):
-        background = background_of(sensor, int(first[0]))
-        model = replace(model, sensor=replace(sensor, background=background))
     for turn in range(2):
         frames = _contact_free(model)
         if not frames:
@@ -57,7 +53,8 @@ def learn(sensor: Sensor) -> Model:
         if turn == 0:
             model = _at_the_mean(model, [one.fit for one in frames])
     frames = _contact_free(model)
-    return _with_limits(model, frames)
+    background = background_of(model.sensor, frames[0].frame.index) if frames else None  # from where the cameras are known to be
+    return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
 
 
 def _first_model(sensor: Sensor) -> Model:
