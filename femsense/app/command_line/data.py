@@ -8,19 +8,23 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, required
+from femsense.app.command_line.parameters import Json, OneRobot, required
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 
 
 def import_(
+    context: typer.Context,
     source: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             metavar="SOURCE…",
             help="A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras.",
             show_default=False,
         ),
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RECORDING", help="The folder to write.", show_default=False)],
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="RECORDING", help="The folder to write.", show_default=False)
+    ] = None,
     format: Annotated[
         str | None,
         typer.Option("--format", metavar="NAME", help="If the guess is wrong; see docs/importing.md.", show_default=False),
@@ -80,12 +84,20 @@ def import_(
         typer.Option("--offset", metavar="S", help="The frames' time minus that file's; else from motion.", show_default=False),
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Import even where RECORDING holds an import.")] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
     from femsense.app.import_command import columns_named, free_named, import_into, import_text, shifts_named
     from femsense.io.importers.frames import Options
 
+    if (many := several(context, source, one_each=False)) is not None:
+        return many
+    source = required(context, source or None, "'SOURCE…'", "argument")
+    output = required(context, output, "'-o' / '--output'", "option")
     shifts, spans = shifts_named(shift or []), free_named(free or [])
     options = Options(
         format, tuple(topic or ()), columns_named(map_ or []), unit, depth_unit, up, clock, rate, base, shifts, every, spans
@@ -184,8 +196,11 @@ def _line_mesh(source: Path, output: Path, *, size: float | None, most: int | No
 
 def simulate(
     context: typer.Context,
-    robot: RobotPath,
-    script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],
+    robot: OneRobot = None,
+    scripts: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="SCRIPT…", help="What the virtual rig does (TOML); several are many jobs.", show_default=False),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -200,11 +215,18 @@ def simulate(
     noise: Annotated[
         float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")
     ] = 0.2,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""
     from femsense.app.commands import script_plan, simulate_into
 
+    if (many := several(context, scripts)) is not None:
+        return many
+    robot, script = required(context, robot, "'ROBOT'", "argument"), only(context, scripts)
     if plan:
         return Answer(*script_plan(robot, script, noise=1e-3 * noise, folder=output))
     output = required(context, output, "'-o' / '--output'", "option")

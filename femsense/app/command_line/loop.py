@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, required, split_names
+from femsense.app.command_line.parameters import Json, OneRobot, required, split_names
+from femsense.app.command_line.several import Dask, Jobs, Memory, several
 from femsense.core.errors import InputError
 
 
 def improve(
     context: typer.Context,
-    robot: RobotPath,
+    robot: OneRobot = None,
     recordings: Annotated[
         list[Path] | None, typer.Argument(metavar="RECORDING", help="What the effects are found on.", show_default=False)
     ] = None,
@@ -65,7 +66,11 @@ def improve(
     workers: Annotated[
         int | None,
         typer.Option(
-            "--workers", metavar="N", min=1, help="Threads that work; by default one a core, four at most.", show_default=False
+            "--workers",
+            metavar="N",
+            min=0,
+            help="Threads that work; by default one a core, four at most. With --jobs: processes.",
+            show_default=False,
         ),
     ] = None,
     plan: Annotated[
@@ -82,6 +87,9 @@ def improve(
     actuation: Annotated[
         str, typer.Option("--actuation", metavar="tension|displacement", help="With --plan: what drives the cables.")
     ] = "tension",
+    jobs: Jobs = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find what the model lacks and write the better robot."""
@@ -92,6 +100,9 @@ def improve(
     from femsense.report.loop.document import Loop
     from femsense.report.loop.text import loop_text
 
+    if (many := several(context, recordings, one_each=False)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
     set_workers(workers)
     if plan and recordings:
         raise InputError(

@@ -21,7 +21,19 @@ RobotPath = Annotated[
         metavar="ROBOT", help="A folder with robot.toml, or the name of a robot that comes along.", show_default=False
     ),
 ]
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A folder with recording.toml.", show_default=False)]
+OneRobot = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="ROBOT", help="A folder with robot.toml, or the name of a robot that comes along.", show_default=False
+    ),
+]
+"""A robot that a table of jobs may name instead."""
+Recordings = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="RECORDING…", help="A folder with recording.toml; several, or a pattern, are many jobs.", show_default=False
+    ),
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="A folder that femsense estimate wrote.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")]
 
@@ -43,7 +55,7 @@ def repeat_options(words: list[str]) -> list[str]:
 
 
 def required(context: typer.Context, value: T | None, name: str, kind: str) -> T:
-    """Return what only --plan can do without."""
+    """Return what only --plan or --jobs can do without."""
     if value is None:
         error = TyperException(f"Missing {kind} {name}.")
         error.ctx = context  # type: ignore[attr-defined]

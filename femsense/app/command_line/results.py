@@ -10,6 +10,7 @@ import typer
 
 from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import Json, RunPath
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -234,11 +235,25 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of results.", show_default=False)],
+    context: typer.Context,
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="DIR…", help="A folder of results; several, or one of many jobs, are many jobs.", show_default=False
+        ),
+    ] = None,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
+    holds_many = any((folder / "many.json").is_file() for folder in folders or [])
+    if (many := several(context, folders, output=False, is_many=holds_many)) is not None:
+        return many
+    folder = only(context, folders)
     page = write_report(folder)
     return Answer({"report": str(page)}, f"written: {page}")

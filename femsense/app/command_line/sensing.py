@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, places
+from femsense.app.command_line.parameters import Json, OneRobot, Recordings, RobotPath, places, required
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 
 USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
 
@@ -22,10 +23,15 @@ class SensingMethod(StrEnum):
 
 
 def calibrate(
-    robot: RobotPath,
-    recording: RecordingPath,
+    context: typer.Context,
+    robot: OneRobot = None,
+    recordings: Recordings = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("calibration.json"),
     correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
@@ -37,6 +43,10 @@ def calibrate(
     from femsense.io.robot_toml import load_robot
     from femsense.report.text import calibration_text
 
+    if (many := several(context, recordings)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
+    recording = only(context, recordings)
     check_target(output, folder=False, kind=CALIBRATION)
     calibration = calibrate_recording(load_robot(robot), load_recording(recording), correct=correct)
     if not calibration.settled:
@@ -48,16 +58,19 @@ def calibrate(
 
 
 def estimate(
-    robot: RobotPath,
-    recording: RecordingPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="The folder to write.", show_default=False)],
+    context: typer.Context,
+    robot: OneRobot = None,
+    recordings: Recordings = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="RUN", help="The folder to write.", show_default=False)
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
             "-c",
             "--calibration",
             metavar="FILE",
-            help="Of femsense calibrate; made first where it is not given.",
+            help="Of femsense calibrate, or its folder of many; made first where not given.",
             show_default=False,
         ),
     ] = None,
@@ -82,6 +95,10 @@ def estimate(
     ] = 0.0,
     correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
     again: Annotated[bool, typer.Option("--again", help="Compute even where RUN holds this result already.")] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
@@ -89,6 +106,11 @@ def estimate(
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
+    if (many := several(context, recordings)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
+    recording = only(context, recordings)
+    output = required(context, output, "'-o' / '--output'", "option")
     if push and not at:
         raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
     options = SensingOptions(method=method.value, friction=friction, push=push, smooth_s=smooth, correct=correct)

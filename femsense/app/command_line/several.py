@@ -1,0 +1,110 @@
+"""What the commands of one recording share that take many: `--jobs`, `--workers`, `--dask`, `--memory`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+
+from femsense.app.command_line.answer import Answer, ManyJobs
+from femsense.app.command_line.parameters import required
+
+T = TypeVar("T")
+Jobs = Annotated[
+    str | None,
+    typer.Option(
+        "--jobs",
+        metavar="TABLE|GLOB",
+        help="Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern.",
+        show_default=False,
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", metavar="N", min=0, help="Many jobs: so many processes; by default one a core.", show_default=False
+    ),
+]
+Dask = Annotated[
+    str | None,
+    typer.Option(
+        "--dask", metavar="ADDRESS|local|FILE", help="Many jobs: on workers of dask; see docs/many.md.", show_default=False
+    ),
+]
+Memory = Annotated[
+    float | None,
+    typer.Option("--memory", metavar="GB", help="Many jobs: what a worker may take at most.", show_default=False),
+]
+MANY = ("jobs", "workers", "dask", "memory")
+
+
+def several(
+    context: typer.Context,
+    units: Sequence[str | Path] | None,
+    *,
+    output: bool = True,
+    one_each: bool = True,
+    is_many: bool = False,
+) -> Answer | None:
+    """Return the answer that many jobs are to run; None where the command is asked of one recording only.
+
+    Arguments:
+        context: of the command.
+        units: what a job is about, from the command line.
+        output: all results go below `-o`.
+        one_each: several units are several jobs. False: they are one joint job, and only `--jobs` asks for more.
+        is_many: one unit stands for many.
+    """
+    from femsense.many.jobs import is_glob
+
+    given = context.params
+    asked = [name for name in MANY if given[name] is not None]
+    if not one_each:
+        if given["jobs"] is None:
+            if given["dask"] is not None or given["memory"] is not None:
+                raise typer.BadParameter("--dask and --memory are of many jobs, and --jobs says which")
+            return None
+    elif not is_many and not asked and len(units or []) < 2 and not any(map(is_glob, units or [])):
+        return None
+    if given["jobs"] is not None and units:
+        raise typer.BadParameter(f"--jobs says what the jobs are about, and {units[0]} stands on the command line too")
+    if given["jobs"] is None:
+        required(context, units or None, _label(context), "argument")
+    if output and (given["output"] is None or _source(context, "output") != "COMMANDLINE"):
+        required(context, None, "'-o' / '--output'", "option")
+    options = {p.name: p for p in context.command.params if p.param_type_name == "option" and p.name is not None}
+    left_out = {*MANY, "output", "json", "again"}
+    chosen = {name: given[name] for name in options if name not in left_out and _source(context, name) == "COMMANDLINE"}
+    return Answer(
+        {},
+        "",
+        many=ManyJobs(
+            context.command,
+            chosen,
+            given.get("robot"),
+            list(units or []),
+            given["jobs"],
+            given["output"] if output else None,
+            given["workers"],
+            given["dask"],
+            given["memory"],
+            bool(given.get("again")),
+        ),
+    )
+
+
+def only(context: typer.Context, units: Sequence[T] | None) -> T:
+    """Return the one recording that a command is asked of."""
+    return required(context, units or None, _label(context), "argument")[0]
+
+
+def _label(context: typer.Context) -> str:
+    last = [p for p in context.command.params if p.param_type_name == "argument"][-1]
+    return f"'{(last.metavar or last.name or '').rstrip('…')}'"
+
+
+def _source(context: typer.Context, name: str) -> str:
+    source = context.get_parameter_source(name)
+    return "" if source is None else source.name
