@@ -67,7 +67,7 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
     work = partial(run_job, memory_bytes=None if in_process else memory, in_process=in_process)
     with only_writer(out), open_engine(asked.workers, asked.dask, memory) as engine, _shown(command, say) as progress:
         outcomes = run_jobs(jobs, work, engine, again=asked.again, progress=progress)
-    folders = {job.name: job.writes if job.writes.is_dir() else job.writes.parent for job in jobs}
+    folders = {job.name: job.writes.parent if job.writes.suffix in (".json", ".html") else job.writes for job in jobs}
     _summarise(out, command, outcomes, folders)
     return _answer(out, command, outcomes)
 
@@ -75,10 +75,7 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
 def _folder_of_all(asked: ManyJobs) -> Path:
     if asked.output is not None:
         return asked.output.expanduser().absolute()
-    if not asked.units:
-        return Path(str(asked.jobs)).expanduser().absolute().parent
-    first = expanded(asked.units)
-    return first[0] if len(first) == 1 and read_summary(first[0]) else first[0].parent
+    return expanded(asked.units or [str(asked.jobs)])[0].parent
 
 
 def _summarise(out: Path, command: str, outcomes: Sequence[Outcome], folders: Mapping[str, Path]) -> None:
@@ -104,8 +101,6 @@ def _jobs(asked: ManyJobs, command: str, out: Path) -> list[Job]:
         parts = [_of_row(row, command, options, asked.robot) for row in rows]
     else:
         units = expanded(asked.units or [str(asked.jobs)])
-        if command == "report" and len(units) == 1 and (held := read_summary(units[0])) is not None:
-            units = [place for place in held[2].values() if place.is_dir() and place != units[0]]
         parts = [("", asked.robot, [str(unit)], {}) for unit in units]
     firsts = [Path(units[0].rpartition("=")[2] if len(units) > 1 else units[0]) for _, _, units, _ in parts]
     names = [own or name for (own, *_), name in zip(parts, _names(parts, firsts))]

@@ -29,6 +29,8 @@ AHEAD_DASK = 4
 """The same of a cluster, where a worker should find its next job without asking the driver …"""
 FEWEST_DASK = 200
 """… and no fewer jobs than this: a cluster that starts small sees how much there is to do."""
+CONNECT = "10s"
+"""A scheduler that does not answer for so long is not there."""
 TTL = "1 hour"
 """For so long a dask worker may be silent: compiled code can hold Python's lock for minutes."""
 
@@ -189,7 +191,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         "distributed.scheduler.worker-ttl": TTL,
         "distributed.scheduler.allowed-failures": 0,  # the driver counts, and knows which job was running
         "distributed.nanny.pre-spawn-environ": limits.ONE_THREAD,
-        "distributed.comm.timeouts.connect": "20s",
+        "distributed.comm.timeouts.connect": CONNECT,
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask_.config.set(settings))
@@ -208,6 +210,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
             elif file.suffix in (".yaml", ".yml"):
                 client = distributed.Client(stack.enter_context(_jobqueue(file, workers)))
             elif file.suffix == ".json":
+                file.stat()  # dask waits for a file that is missing
                 client = distributed.Client(scheduler_file=str(file))
             else:
                 client = distributed.Client(where)
@@ -228,16 +231,11 @@ def _jobqueue(file: Path, workers: int | None) -> Any:
     import yaml
 
     try:
-        import dask_jobqueue
+        from dask_jobqueue import JobQueueCluster
+        from dask_jobqueue.local import LocalCluster  # a queue on this machine, to try a file
     except ImportError:
         raise MissingDependency('--dask FILE needs dask-jobqueue: pip install "femsense[dask]"') from None
-    kinds: dict[str, Any] = {
-        str(getattr(kind, "config_name", "")): kind
-        for kind in vars(dask_jobqueue).values()
-        if isinstance(kind, type)
-        and issubclass(kind, dask_jobqueue.JobQueueCluster)
-        and kind is not dask_jobqueue.JobQueueCluster
-    }
+    kinds = {kind.job_cls.default_config_name(): kind for kind in {*JobQueueCluster.__subclasses__(), LocalCluster}}
     try:
         document = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,10 @@ from femsense.io.tables import read_csv
 
 RECORDS = ".many"
 """Folder below the folder of all results that holds one record and one log for each job."""
+MANY = "many.json"
+"""File that says what a folder of all results holds."""
+SUMMARY = (MANY, "summary.csv", "summary.parquet", "summary.html", "poison.csv")
+"""Files beside the results: `recordings/*` names them too, and they are no recordings."""
 GLOB = "*?["
 
 
@@ -50,18 +55,30 @@ def is_glob(text: str | Path) -> bool:
 
 
 def expanded(paths: Iterable[str | Path]) -> list[Path]:
-    """Return absolute paths, with patterns replaced by what they match, sorted. Raises InputError for a pattern without a match."""
+    """Return absolute paths: patterns replaced by what they match, sorted; a folder of many results by these.
+
+    Raises InputError for a pattern without a match.
+    """
     found = list[Path]()
     for path in paths:
         text = str(Path(path).expanduser())
         if not is_glob(text):
-            found.append(Path(text).absolute())
+            found += parts_of(Path(text).absolute()) or [Path(text).absolute()]
             continue
         matches = sorted(Path(match).absolute() for match in glob.glob(text, recursive=True))
         if not matches:
             raise InputError("nothing matches this pattern", where=text, expected="files or folders")
         found += matches
-    return found
+    return [path for path in found if path.name not in SUMMARY] if len(found) > 1 else found
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """Return the folders of the results that a folder of many results holds; none where it is another folder."""
+    try:
+        places = json.loads((folder / MANY).read_text(encoding="utf-8"))["folders"].values()
+        return [folder / place for place in places if place and (folder / place).is_dir() and place != "."]
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return []
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:

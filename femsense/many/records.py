@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -39,7 +39,7 @@ class Record:
     outcome: Outcome
     stamp: str
     key: str
-    outputs: Mapping[str, int]
+    outputs: dict[str, int]
     """Entry of the result → size of a file [bytes], number of files of a folder."""
 
 
@@ -61,8 +61,13 @@ def write_record(job: Job, record: Record) -> None:
 
 
 def is_valid(job: Job, record: Record | None) -> bool:
-    """Return whether a result is recorded and all of it stands there."""
-    return record is not None and record.outcome.is_good and bool(record.outputs) and record.outputs == outputs_of(job)
+    """Return whether a result is recorded and all of it stands there; more may stand beside it, such as a report."""
+    return (
+        record is not None
+        and record.outcome.is_good
+        and len(record.outputs) > 0
+        and record.outputs.items() <= outputs_of(job).items()
+    )
 
 
 def outputs_of(job: Job) -> dict[str, int]:

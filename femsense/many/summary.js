@@ -17,7 +17,8 @@
     .bar input { flex: 1 1 240px; max-width: 420px; }
     #jobs th button { all: unset; cursor: pointer; font-weight: 600; } #jobs th button:focus-visible { outline: 2px solid var(--accent); }
     #jobs tr.bad td:nth-child(2) { color: var(--warn); font-weight: 600; }
-    #jobs td { max-width: 360px; } main:has(#jobs) { max-width: 1400px; }` });
+    #jobs td { max-width: 360px; } #jobs td:first-child { white-space: nowrap; }
+    body:has(#jobs) :is(main, header, footer) { max-width: 1400px; }` });
   const words = make("input", { type: "search", placeholder: "words, or column>number such as largest_force_n>1", ariaLabel: "Filter" });
   const counts = new Map();
   for (const row of rows) counts.set(row[STATUS], (counts.get(row[STATUS]) || 0) + 1);
@@ -44,7 +45,7 @@
     const all = tests();
     const chosen = rows.map((_, i) => i).filter((i) => (!status.value || rows[i][STATUS] === status.value) && all.every((test) => test(rows[i])));
     if (by >= 0) chosen.sort(compare);
-    body.replaceChildren(...chosen.map((i) => make("tr", { className: ["done", "kept"].includes(rows[i][STATUS]) ? "" : "bad" },
+    body.replaceChildren(...chosen.map((i) => make("tr", { className: rows[i][STATUS] === "done" ? "" : "bad" },
       ...shown.map((j) => {
         const cell = rows[i][j], text = numeric[j] ? number(cell) : String(cell ?? "");
         return make("td", { className: numeric[j] ? "n" : "" }, j === 0 && links[i] ? make("a", { href: encodeURI(links[i]), textContent: text }) : text);

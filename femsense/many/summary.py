@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import femsense
-from femsense.core.errors import InputError
 from femsense.io.files import check_target, json_text, write_beside, write_csv, write_json, write_text
 from femsense.io.own_files import FileKind, check_files
-from femsense.many.jobs import RECORDS
+from femsense.many.jobs import MANY, RECORDS
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import read_record
 from femsense.report.page import Chapter, Html, page, tiles
@@ -25,7 +24,7 @@ COLUMNS = ("name", "status", "reason", "seconds", "peak_gb", "host", "folder")
 """Columns of every summary; those of the command follow."""
 POISON_COLUMNS = ("name", "reason", "deaths")
 OWN = {
-    "many.json": FileKind("many jobs of femsense", b"{", f'"format": "{MANY_FORMAT}'.encode()),
+    MANY: FileKind("many jobs of femsense", b"{", f'"format": "{MANY_FORMAT}'.encode()),
     "summary.csv": FileKind("a summary of femsense", ",".join(COLUMNS).encode()),
     "summary.parquet": FileKind("a summary of femsense", b"PAR1"),
     "summary.html": FileKind("a page of femsense", b"<!DOCTYPE html>", b'content="femsense"'),
@@ -71,15 +70,15 @@ def write_summary(folder: Path, command: str, outcomes: Sequence[Outcome], folde
     else:
         (folder / "poison.csv").unlink(missing_ok=True)
     write_text(folder / "summary.html", summary_page(folder, command, lines))
-    counts = dict(Counter(o.status.value for o in outcomes))
+    counts = dict(Counter(map(_status, outcomes)))
     document = {"format": MANY_FORMAT, "command": command, "jobs": len(outcomes), "counts": counts}
-    write_json(folder / "many.json", {**document, "folders": {o.name: line.folder for o, line in zip(outcomes, lines)}})
+    write_json(folder / MANY, {**document, "folders": {o.name: line.folder for o, line in zip(outcomes, lines)}})
 
 
 def read_summary(folder: Path) -> tuple[str, list[Outcome], dict[str, Path]] | None:
     """Return command, outcomes and folders of the many jobs whose results a folder holds; None where it holds none."""
     try:
-        document = json.loads((folder / "many.json").read_text(encoding="utf-8"))
+        document = json.loads((folder / MANY).read_text(encoding="utf-8"))
         if document["format"] != MANY_FORMAT:
             return None
         command, places = str(document["command"]), {str(k): folder / str(v) for k, v in document["folders"].items()}
@@ -109,6 +108,11 @@ def table_of(lines: Sequence[Line]) -> tuple[list[str], list[list[Scalar]]]:
             ]
         )
     return [*COLUMNS, *own], rows
+
+
+def _status(outcome: Outcome) -> str:
+    """Return a status as files have it: they are the same whether a result is new or was there."""
+    return Status.DONE.value if outcome.status is Status.KEPT else outcome.status.value
 
 
 def _from(folder: Path, place: Path) -> str:
@@ -157,7 +161,7 @@ def summary_page(folder: Path, command: str, lines: Sequence[Line]) -> str:
     figures = [
         ("jobs", str(len(lines)), f"femsense {command}"),
         ("with a result", str(good), f"{len(lines) - good} without"),
-        ("working time", _duration(sum(o.seconds for o in ran)), f"{len({o.host for o in ran})} machines"),
+        ("working time", _duration(sum(o.seconds for o in ran)), _count({o.host for o in ran}, "machine")),
         ("slowest", _duration(slowest.seconds) if slowest else "–", slowest.name if slowest else ""),
     ]
     script = files("femsense.many").joinpath("summary.js").read_text(encoding="utf-8")
@@ -181,15 +185,11 @@ def _links(folder: Path, place: str) -> str:
     return f"{place}/report.html" if (folder / place / "report.html").is_file() else f"{place}/"
 
 
+def _count(things: Collection[str], name: str) -> str:
+    return f"{len(things)} {name}" + ("" if len(things) == 1 else "s")
+
+
 def _duration(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
-
-
-def merged(folder: Path) -> None:
-    """Write the summary of a folder once more, with links to pages that have been made since. Raises InputError."""
-    found = read_summary(folder)
-    if found is None:
-        raise InputError("no summary of many jobs", where=folder, expected="many.json")
-    write_summary(folder, *found)

@@ -251,8 +251,7 @@ def report(
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    holds_many = any((folder / "many.json").is_file() for folder in folders or [])
-    if (many := several(context, folders, output=False, is_many=holds_many)) is not None:
+    if (many := several(context, folders, output=False)) is not None:
         return many
     folder = only(context, folders)
     page = write_report(folder)

@@ -55,9 +55,8 @@ def several(
         units: what a job is about, from the command line.
         output: all results go below `-o`.
         one_each: several units are several jobs. False: they are one joint job, and only `--jobs` asks for more.
-        is_many: one unit stands for many.
     """
-    from femsense.many.jobs import is_glob
+    from femsense.many.jobs import is_glob, parts_of
 
     given = context.params
     asked = [name for name in MANY if given[name] is not None]
@@ -66,7 +65,7 @@ def several(
             if given["dask"] is not None or given["memory"] is not None:
                 raise typer.BadParameter("--dask and --memory are of many jobs, and --jobs says which")
             return None
-    elif not is_many and not asked and len(units or []) < 2 and not any(map(is_glob, units or [])):
+    elif not asked and len(units or []) < 2 and not any(is_glob(unit) or parts_of(Path(unit)) for unit in units or []):
         return None
     if given["jobs"] is not None and units:
         raise typer.BadParameter(f"--jobs says what the jobs are about, and {units[0]} stands on the command line too")
