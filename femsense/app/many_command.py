@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from femsense.app.command_line.answer import Answer, ManyJobs
 from femsense.core.errors import FemsenseError, InputError
@@ -21,7 +22,7 @@ from femsense.many.drive import Progress, run_jobs
 from femsense.many.engines import open_engine
 from femsense.many.jobs import RECORDS, Job, Row, expanded, is_glob, names_of, read_table
 from femsense.many.limits import available_cores, memory_share
-from femsense.many.outcome import Outcome, Scalar
+from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import AGAIN
 from femsense.many.summary import check_summary_folder, read_summary, write_summary
 
@@ -98,7 +99,9 @@ def _jobs(asked: ManyJobs, command: str, out: Path) -> list[Job]:
         rows = read_table(Path(asked.jobs).expanduser())
         if not rows:
             raise InputError("no jobs", where=asked.jobs, found="a header and no rows", expected="one row for each job")
-        parts = [_of_row(row, command, options, asked.robot) for row in rows]
+        hints = get_type_hints(inspect.unwrap(asked.command.callback))
+        paths = {name for name in options if "Path" in str(hints.get(name))}
+        parts = [_of_row(row, command, options, paths, asked.robot) for row in rows]
     else:
         units = expanded(asked.units or [str(asked.jobs)])
         parts = [("", asked.robot, [str(unit)], {}) for unit in units]
@@ -177,9 +180,9 @@ def _words(option: Any, value: Any) -> list[str]:
 
 
 def _of_row(
-    row: Row, command: str, options: Mapping[str, Any], robot: str | None
+    row: Row, command: str, options: Mapping[str, Any], paths: Collection[str], robot: str | None
 ) -> tuple[str, str | None, list[str], dict[str, list[str]]]:
-    """Return name, robot, units and options of a row of a table. Raises InputError."""
+    """Return name, robot, units and options of a row of a table; `paths` names options that are paths. Raises InputError."""
     cells = dict(row.cells)
     name, robot = cells.pop("name", ""), cells.pop("robot", robot)
     if name.startswith(".") or "/" in name or "\\" in name:
@@ -200,18 +203,17 @@ def _of_row(
             raise InputError(
                 "unknown column", where=row.where, found=column, expected=", ".join(known), hint=did_you_mean(column, known)
             )
-        own[option.name] = _cell_words(option, text, row, column)
+        own[option.name] = _cell_words(option, text, row, column, is_path=option.name in paths)
     return name, robot, units, own
 
 
-def _cell_words(option: Any, text: str, row: Row, column: str) -> list[str]:
-    """Return an option whose value stands in a cell. Raises InputError."""
+def _cell_words(option: Any, text: str, row: Row, column: str, *, is_path: bool) -> list[str]:
+    """Return an option whose value stands in a cell. Raises InputError for a flag that is neither yes nor no."""
     flag = max(option.opts, key=len)
     if option.is_flag:
         if text.lower() not in (*TRUE, *FALSE):
             raise InputError("neither yes nor no", where=f"{row.where}: {column}", found=text, expected="yes or no")
         return [flag] if text.lower() in TRUE else list(option.secondary_opts[:1])
-    is_path = "path" in type(option.type).__name__.lower()
     values = shlex.split(text) if option.multiple else [text]
     return [word for value in values for word in (flag, _placed(value, row.folder) if is_path else value)]
 
@@ -298,7 +300,8 @@ def row_of(command: str, document: Mapping[str, Any]) -> dict[str, Scalar]:
 def _answer(out: Path, command: str, outcomes: Sequence[Outcome]) -> Answer:
     counts = Counter(o.status.value for o in outcomes)
     bad = [o for o in outcomes if not o.is_good]
-    lines = [f"{command}: {', '.join(f'{n} {status}' for status, n in counts.items())}, of {len(outcomes)} jobs"]
+    said = ", ".join(f"{n} {'were there' if status == Status.KEPT else status}" for status, n in counts.items())
+    lines = [f"{command}: {said}, of {len(outcomes)} jobs"]
     lines += [f"  {o.name}: {o.status.value}: {o.reason.splitlines()[0] if o.reason else ''}" for o in bad[:LISTED]]
     lines += [f"  … and {len(bad) - LISTED} more"] if len(bad) > LISTED else []
     poison = out / "poison.csv"

@@ -69,7 +69,7 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
         if not matches:
             raise InputError("nothing matches this pattern", where=text, expected="files or folders")
         found += matches
-    return [path for path in found if path.name not in SUMMARY] if len(found) > 1 else found
+    return [path for path in found if path.name not in (*SUMMARY, RECORDS)] if len(found) > 1 else found
 
 
 def parts_of(folder: Path) -> list[Path]:

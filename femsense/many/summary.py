@@ -98,7 +98,7 @@ def table_of(lines: Sequence[Line]) -> tuple[list[str], list[list[Scalar]]]:
         rows.append(
             [
                 o.name,
-                o.status.value,
+                _status(o),
                 o.reason or None,
                 round(o.seconds, 3),
                 peak,
