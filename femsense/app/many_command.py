@@ -9,12 +9,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
 from femsense.app.command_line.answer import Answer, ManyJobs
-from femsense.core.errors import FemsenseError, InputError
+from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.folder_lock import only_writer
 from femsense.io.robot_toml import find_robot
@@ -69,7 +70,12 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
     with only_writer(out), open_engine(asked.workers, asked.dask, memory) as engine, _shown(command, say) as progress:
         outcomes = run_jobs(jobs, work, engine, again=asked.again, progress=progress)
     folders = {job.name: job.writes.parent if job.writes.suffix in (".json", ".html") else job.writes for job in jobs}
-    _summarise(out, command, outcomes, folders)
+    try:
+        _summarise(out, command, outcomes, folders)
+    except OSError as error:
+        raise DataError(
+            f"{out}: the summary is not written: {error.strerror}; results are kept, and the same command goes on"
+        ) from error
     return _answer(out, command, outcomes)
 
 
@@ -101,6 +107,8 @@ def _jobs(asked: ManyJobs, command: str, out: Path) -> list[Job]:
             raise InputError("no jobs", where=asked.jobs, found="a header and no rows", expected="one row for each job")
         hints = get_type_hints(inspect.unwrap(asked.command.callback))
         paths = {name for name in options if "Path" in str(hints.get(name))}
+        foreign = asked.others - {max(p.opts, key=len).lstrip("-") for p in options.values()}
+        rows = [replace(row, cells={c: v for c, v in row.cells.items() if c.replace("_", "-") not in foreign}) for row in rows]
         parts = [_of_row(row, command, options, paths, asked.robot) for row in rows]
     else:
         units = expanded(asked.units or [str(asked.jobs)])

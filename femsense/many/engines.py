@@ -144,13 +144,15 @@ class Dask:
     """A cluster of dask.distributed with one thread a worker."""
 
     def __init__(self, client: Any) -> None:
-        self.client = client
+        self.client, self.known = client, 1
         self.executor = client.get_executor(pure=False, retries=1)
 
     @property
     def workers(self) -> int:
-        """Threads of all workers that are there now."""
-        return sum(self.client.nthreads().values())
+        """Threads of all workers that are there now; as last known, where the scheduler does not answer."""
+        with contextlib.suppress(Exception):
+            self.known = sum(self.client.nthreads().values())
+        return self.known
 
     @property
     def ahead(self) -> int:
@@ -186,7 +188,8 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         import distributed
     except ImportError:
         raise MissingDependency('--dask needs dask.distributed: pip install "femsense[dask]"') from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ["distributed", *(name for name in logging.root.manager.loggerDict if name.startswith("distributed."))]:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what goes wrong is said in one line instead
     settings = {
         "distributed.scheduler.worker-ttl": TTL,
         "distributed.scheduler.allowed-failures": 0,  # the driver counts, and knows which job was running

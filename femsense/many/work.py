@@ -90,14 +90,10 @@ def _called(job: Job, call: Call) -> Outcome:
     try:
         result = call(job.words)
         status, reason, row = Status.NO_RESULT if result.reason else Status.DONE, result.reason, result.row
-    except MemoryError as error:
-        status, reason = Status.OUT_OF_MEMORY, f"a worker may not take more memory ({_line(error)}): --memory, or fewer --workers"
-    except FemsenseError as error:
-        status, reason = Status.NO_RESULT if error.exit_status == 1 else Status.FAILED, str(error)
     except Exception as error:
-        status, reason = Status.FAILED, _line(error)
-    if status is Status.FAILED and os.strerror(errno.ENOSPC) in reason:
-        status = Status.DISK_FULL
+        status, reason = _kind_of(error), str(error) if isinstance(error, FemsenseError) else _line(error)
+    if status is Status.OUT_OF_MEMORY:
+        reason += "; a worker may not take more memory: --memory, or fewer --workers"
     return Outcome(
         name=job.name,
         status=status,
@@ -107,6 +103,18 @@ def _called(job: Job, call: Call) -> Outcome:
         peak_bytes=limits.peak_memory(),
         host=socket.gethostname(),
     )
+
+
+def _kind_of(error: BaseException) -> Status:
+    """Return the status of a job that raised an error: by its causes, since a full disk or memory is reported as what failed."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError):
+            return Status.OUT_OF_MEMORY
+        if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+            return Status.DISK_FULL
+        cause = cause.__cause__ or cause.__context__
+    return Status.NO_RESULT if isinstance(error, FemsenseError) and error.exit_status == 1 else Status.FAILED
 
 
 def _line(error: BaseException) -> str:

@@ -100,6 +100,8 @@ def test_a_table_says_robot_recording_and_options(run: Any, lab: Path) -> None:
     lines = ["robot,recording,name,at,push", "beam,recordings/a,first,,", 'beam,recordings/b,second,"0.1,0.015,0.015",yes']
     (lab / "jobs.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     said = run("estimate", "--jobs", lab / "jobs.csv", "-o", lab / "runs", *IN_PROCESS, "--json")
+    same = run("calibrate", "--jobs", lab / "jobs.csv", "-o", lab / "cal", *IN_PROCESS)
+    assert same.status == 0, same.err
     first, second = said.json["jobs"]
     assert (
         said.status == 1

@@ -32,6 +32,8 @@ class ManyJobs:
     dask: str | None
     memory_gb: float | None
     again: bool
+    others: frozenset[str]
+    """Options of other commands: their columns of a table are of no concern here."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

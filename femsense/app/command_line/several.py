@@ -90,6 +90,7 @@ def several(
             given["dask"],
             given["memory"],
             bool(given.get("again")),
+            _options_of_others(context),
         ),
     )
 
@@ -102,6 +103,14 @@ def only(context: typer.Context, units: Sequence[T] | None) -> T:
 def _label(context: typer.Context) -> str:
     last = [p for p in context.command.params if p.param_type_name == "argument"][-1]
     return f"'{(last.metavar or last.name or '').rstrip('…')}'"
+
+
+def _options_of_others(context: typer.Context) -> frozenset[str]:
+    """Return the names of the options of all commands that take tables, without dashes in front."""
+    group = None if context.parent is None else context.parent.command
+    parameters = [command.params for command in getattr(group, "commands", {}).values()]
+    tables = [params for params in parameters if any(p.name == "jobs" for p in params)]
+    return frozenset(max(p.opts, key=len).lstrip("-") for params in tables for p in params if p.param_type_name == "option")
 
 
 def _source(context: typer.Context, name: str) -> str:
