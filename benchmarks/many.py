@@ -1,6 +1,8 @@
 """Many short recordings over processes and over dask: efficiency, overhead of a task, memory, and what happens when things die.
 
-    python benchmarks/many.py OUT [--count 200] [--only efficiency|trouble|paper]
+    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|paper]
+
+`overhead`: ten times COUNT jobs that write one line, on two processes: time of a worker beside each, and memory of the driver.
 
 `efficiency`: COUNT recordings of the finger are simulated, and each fifth of them is calibrated, on one process, on two, and on a local
 dask cluster of two. Printed for each: wall time, efficiency (time inside the tasks over workers × wall time), overhead of a task
@@ -25,12 +27,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tomli_w
 
-from femsense.many.jobs import RECORDS
+from femsense.io.files import write_text
+from femsense.many.drive import Progress, run_jobs
+from femsense.many.engines import processes
+from femsense.many.jobs import RECORDS, Job
+from femsense.many.outcome import Outcome, Status
+from femsense.many.work import Result, work_on
 
 WORDS = [sys.executable, "-m", "femsense"]
 ENGINES = {
@@ -159,6 +167,48 @@ def efficiency(root: Path, count: int) -> list[Measured]:
         print(f"{name}: {'the same bytes on all engines' if len(hashes[name]) == 1 else 'OTHER bytes'}", flush=True)
     (root / "measured.json").write_text(json.dumps([asdict(m) for m in found], indent=2), encoding="utf-8")
     return found
+
+
+# Overhead
+
+
+def write_line(job: Job) -> Outcome:
+    """Do next to nothing, as a job."""
+    return work_on(job, _write, memory_bytes=2_000_000_000)
+
+
+def _write(words: Sequence[str]) -> Result:
+    write_text(Path(words[0]) / "line.txt", words[0])
+    return Result({})
+
+
+def overhead(root: Path, count: int) -> None:
+    """Print what a task costs beside its work, and whether the driver grows."""
+    out = fresh(root / "overhead")
+    jobs = [
+        Job(f"{i:05d}", (str(out / f"{i:05d}"),), (), out / f"{i:05d}", out / RECORDS / "write" / f"{i:05d}.json")
+        for i in range(count)
+    ]
+    early, first, began = 0.0, 0, time.perf_counter()
+
+    def watch(now: Progress) -> None:
+        nonlocal early, first, began
+        if not early and now.finished >= count / 10:
+            early, first, began = resident_mb(os.getpid()), now.finished, time.perf_counter()
+
+    with processes(2) as engine:
+        outcomes = run_jobs(jobs, write_line, engine, progress=watch)
+        wall, late = time.perf_counter() - began, resident_mb(os.getpid())
+    beside = 2 * wall / (count - first) - sum(o.seconds for o in outcomes) / count
+    again = time.perf_counter()
+    with processes(2) as engine:
+        kept = run_jobs(jobs, write_line, engine)
+    again = time.perf_counter() - again
+    print(
+        f"{count} jobs on two processes: {1e3 * beside:.1f} ms of a worker beside each; driver {early:.0f} MB at a tenth, {late:.0f} MB at "
+        f"the end; a rerun that keeps all {sum(o.status is Status.KEPT for o in kept)}: {1e3 * again / count:.2f} ms each",
+        flush=True,
+    )
 
 
 # Trouble
@@ -345,10 +395,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=200)
-    parser.add_argument("--only", choices=("efficiency", "trouble", "paper"))
+    parser.add_argument("--only", choices=("overhead", "efficiency", "trouble", "paper"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     root = given.out.absolute()
+    if given.only in (None, "overhead"):
+        overhead(root, 10 * given.count)
     if given.only in (None, "efficiency"):
         efficiency(root, given.count)
     if given.only in (None, "trouble"):

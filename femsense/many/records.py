@@ -21,7 +21,6 @@ from typing import Any
 
 import femsense
 from femsense.io.files import PART_PREFIX, file_hash, folder_hash, json_text, write_json
-from femsense.io.provenance import RECORDING_PARTS, robot_input
 from femsense.many.jobs import Job
 from femsense.many.outcome import LONGEST_REASON, Outcome, Status
 
@@ -129,9 +128,10 @@ def _content(path: Path, stats: Stats) -> str:
     """Return the hash of what lies at a path; `stats` only says that it has not changed since."""
     if path.is_file():
         return file_hash(path)
-    if (path / "robot.toml").is_file():
-        from femsense.io.robot_toml import load_robot
+    from femsense.io.provenance import RECORDING_PARTS, robot_input  # takes a second, which a job that is kept need not wait for
+    from femsense.io.robot_toml import load_robot
 
+    if (path / "robot.toml").is_file():
         return str(robot_input(load_robot(path))["sha256"])
     if (path / "recording.toml").is_file():
         parts = [path / part for part in RECORDING_PARTS]

@@ -81,6 +81,8 @@ def test_from_scripts_to_forces_with_one_table_and_a_second_run_that_does_nothin
     assert [row["name"] for row in rows_of(lab / "runs")] == ["a", "b"] and float(
         rows_of(lab / "runs")[0]["largest_force_n"]
     ) > 0.05
+    said = run("inspect", lab / "runs")
+    assert said.status == 0 and "the results of many recordings" in said.out and "done  2" in said.out
     assert json.loads((lab / "runs/a/run.json").read_text())["inputs"]["calibration"]
     before = (lab / "runs/summary.csv").read_bytes()
     said = run(*words, *IN_PROCESS)

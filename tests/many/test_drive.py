@@ -99,7 +99,7 @@ def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_others_go_on(tmp
         job(tmp_path, "worse", "abort"),
         job(tmp_path, "b", "write"),
     ]
-    with processes(1) as engine:
+    with processes(2) as engine:
         found = {o.name: o for o in run_jobs(jobs, work, engine)}
     assert found["a"].is_good and found["b"].is_good
     assert (found["bad"].status, found["bad"].deaths) == (Status.CRASHED, 2) and "SIGKILL" in found["bad"].reason
