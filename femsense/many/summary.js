@@ -17,7 +17,7 @@
     .bar input { flex: 1 1 240px; max-width: 420px; }
     #jobs th button { all: unset; cursor: pointer; font-weight: 600; } #jobs th button:focus-visible { outline: 2px solid var(--accent); }
     #jobs tr.bad td:nth-child(2) { color: var(--warn); font-weight: 600; }
-    #jobs td { max-width: 360px; } #jobs td:first-child { white-space: nowrap; }
+    #jobs td { max-width: 360px; } #jobs td.reason { min-width: 260px; } #jobs td:first-child { white-space: nowrap; }
     body:has(#jobs) :is(main, header, footer) { max-width: 1400px; }` });
   const words = make("input", { type: "search", placeholder: "words, or column>number such as largest_force_n>1", ariaLabel: "Filter" });
   const counts = new Map();
@@ -48,7 +48,7 @@
     body.replaceChildren(...chosen.map((i) => make("tr", { className: rows[i][STATUS] === "done" ? "" : "bad" },
       ...shown.map((j) => {
         const cell = rows[i][j], text = numeric[j] ? number(cell) : String(cell ?? "");
-        return make("td", { className: numeric[j] ? "n" : "" }, j === 0 && links[i] ? make("a", { href: encodeURI(links[i]), textContent: text }) : text);
+        return make("td", { className: numeric[j] ? "n" : columns[j] }, j === 0 && links[i] ? make("a", { href: encodeURI(links[i]), textContent: text }) : text);
       }))));
     found.textContent = `${chosen.length} of ${rows.length}`;
     headers.forEach((header, k) => header.setAttribute("aria-sort", shown[k] === by ? (up ? "ascending" : "descending") : "none"));
