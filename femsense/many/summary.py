@@ -112,7 +112,7 @@ def table_of(lines: Sequence[Line]) -> tuple[list[str], list[list[Scalar]]]:
 
 def _status(outcome: Outcome) -> str:
     """Return a status as files have it: they are the same whether a result is new or was there."""
-    return outcome.status.value
+    return Status.DONE.value if outcome.status is Status.KEPT else outcome.status.value
 
 
 def _from(folder: Path, place: Path) -> str:
