@@ -227,7 +227,7 @@ def wait_for(condition: object, seconds: float = 120.0) -> bool:
 def ended(run: subprocess.Popen[str]) -> tuple[int, str]:
     """Return exit status and the first line of what a command said last."""
     out, err = run.communicate()
-    lines = [line for line in (err + out).splitlines() if line.strip() and "compiling" not in line and " left" not in line]
+    lines = [line for line in (err + out).splitlines() if line.strip() and "compiling" not in line and " running" not in line]
     return run.returncode, lines[0] if lines else ""
 
 

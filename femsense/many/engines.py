@@ -188,7 +188,8 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         import distributed
     except ImportError:
         raise MissingDependency('--dask needs dask.distributed: pip install "femsense[dask]"') from None
-    for name in ["distributed", *(name for name in logging.root.manager.loggerDict if name.startswith("distributed."))]:
+    known = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed.", "tornado."))]
+    for name in ["distributed", "tornado", *known]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what goes wrong is said in one line instead
     settings = {
         "distributed.scheduler.worker-ttl": TTL,
