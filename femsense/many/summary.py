@@ -11,13 +11,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 import femsense
 from femsense.io.files import check_target, json_text, write_beside, write_csv, write_json, write_text
 from femsense.io.own_files import FileKind, check_files
 from femsense.many.jobs import MANY, RECORDS
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import read_record
-from femsense.report.page import Chapter, Html, page, tiles
+from femsense.report.page import Chapter, render
 
 MANY_FORMAT = "femsense-many-1"
 COLUMNS = ("name", "status", "reason", "seconds", "peak_gb", "host", "folder")
@@ -166,12 +168,10 @@ def summary_page(folder: Path, command: str, lines: Sequence[Line]) -> str:
     ]
     script = files("femsense.many").joinpath("summary.js").read_text(encoding="utf-8")
     text = json_text(data, indent=None).replace("<", "\\u003c")
-    body = Html(
-        f'{tiles(figures)}\n<div id="jobs"></div>\n<noscript>This table needs JavaScript; summary.csv holds the same.</noscript>\n'
-        f'<script type="application/json" id="data">{text}</script>\n<script>\n{script}</script>'
-    )
+    body = render("many.html", figures=figures, data=Markup(text), script=Markup(script))
     head = f"{good} of {len(lines)} recordings have a result"
-    return page(folder.absolute().name, f"femsense {command}, version {femsense.__version__}", [Chapter("Jobs", body, head)])
+    kind = f"femsense {command}, version {femsense.__version__}"
+    return f"{render('page.html', title=folder.absolute().name, kind=kind, chapters=[Chapter('Jobs', body, head)])}\n"
 
 
 def _shown(cell: Scalar) -> Scalar:

@@ -9,34 +9,16 @@ from typing import Annotated, TypeVar
 import typer
 
 from femsense.app.command_line.answer import Answer, ManyJobs
-from femsense.app.command_line.parameters import required
+from femsense.app.command_line.parameters import option, required
 
 T = TypeVar("T")
 Jobs = Annotated[
     str | None,
-    typer.Option(
-        "--jobs",
-        metavar="TABLE|GLOB",
-        help="Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern.",
-        show_default=False,
-    ),
+    option("--jobs", "TABLE|GLOB", "Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
 ]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers", metavar="N", min=0, help="Many jobs: so many processes; by default one a core.", show_default=False
-    ),
-]
-Dask = Annotated[
-    str | None,
-    typer.Option(
-        "--dask", metavar="ADDRESS|local|FILE", help="Many jobs: on workers of dask; see docs/many.md.", show_default=False
-    ),
-]
-Memory = Annotated[
-    float | None,
-    typer.Option("--memory", metavar="GB", help="Many jobs: what a worker may take at most.", show_default=False),
-]
+Workers = Annotated[int | None, option("--workers", "N", "Many jobs: so many processes; by default one a core.", min=0)]
+Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see docs/many.md.")]
+Memory = Annotated[float | None, option("--memory", "GB", "Many jobs: what a worker may take at most.")]
 MANY = ("jobs", "workers", "dask", "memory")
 
 
@@ -46,7 +28,6 @@ def several(
     *,
     output: bool = True,
     one_each: bool = True,
-    is_many: bool = False,
 ) -> Answer | None:
     """Return the answer that many jobs are to run; None where the command is asked of one recording only.
 
