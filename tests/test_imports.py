@@ -20,6 +20,7 @@ ROOMS = (
     ("core",),
     ("fem", "pointcloud", "qp"),
     ("model",),
+    ("inference",),
     ("io",),
     ("calib",),
     ("control",),
