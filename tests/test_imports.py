@@ -20,6 +20,7 @@ ROOMS = (
     ("core",),
     ("fem", "pointcloud", "qp"),
     ("model",),
+    ("inference",),
     ("io",),
     ("calib",),
     ("control",),
@@ -29,6 +30,7 @@ ROOMS = (
     ("xr",),
     ("live",),
     ("report",),
+    ("many",),
     ("app",),
     ("__main__",),
 )

@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer.exceptions import TyperException
@@ -24,6 +24,11 @@ from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import repeat_options
 from femsense.app.compiling import announced_compiling
 from femsense.core.errors import FemsenseError
+
+if TYPE_CHECKING:
+    from femsense.many.jobs import Job
+    from femsense.many.outcome import Outcome
+    from femsense.many.work import Result
 
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
@@ -100,6 +105,10 @@ def run(arguments: Sequence[str], *, program: typer.Typer = app) -> int:
             with announced_compiling(words, say):
                 with _clean_stdout(as_json):
                     answer = program(args=words, prog_name="femsense", standalone_mode=False)
+                    if isinstance(answer, Answer) and answer.many is not None:
+                        from femsense.app.many_command import run_many
+
+                        answer = run_many(answer.many, run_job, say=say)
                 if isinstance(answer, Answer):
                     return _print(answer, as_json, notes)
             return _fail(stopped, STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)
@@ -112,6 +121,31 @@ def run(arguments: Sequence[str], *, program: typer.Typer = app) -> int:
             if os.environ.get("FEMSENSE_DEBUG") == "1":
                 raise
             return _fail(*_explained(error), as_json, notes)
+
+
+def run_job(job: Job, *, memory_bytes: int | None, in_process: bool) -> Outcome:
+    """Run one of many jobs, in a worker."""
+    from femsense.many.work import work_on
+
+    return work_on(job, _result, memory_bytes=memory_bytes, in_process=in_process)
+
+
+def _result(words: Sequence[str]) -> Result:
+    """Run the words of a job. Raises FemsenseError; MemoryError; InputError for wrong usage and for internal errors."""
+    from femsense.app.many_command import row_of
+    from femsense.core.errors import InputError
+    from femsense.many.work import Result
+
+    notes: list[str] = []
+    with _calm_warnings(notes, True):
+        try:
+            answer = app(args=repeat_options(list(words)), prog_name="femsense", standalone_mode=False)
+        except (FemsenseError, MemoryError):
+            raise
+        except Exception as error:
+            raise InputError(_explained(error)[0]) from error
+    row = {**row_of(words[0], answer.document), "warnings": len(notes) or None}
+    return Result(row, answer.text if answer.exit_status else "")
 
 
 def _print(answer: Answer, as_json: bool, notes: list[str]) -> int:

@@ -15,6 +15,7 @@ from femsense.app.inspection.results import (
     inspect_folder,
     inspect_line,
     inspect_loop,
+    inspect_many,
     inspect_run,
     inspect_script,
     inspect_table,
@@ -159,6 +160,7 @@ TITLES = {
     "calibration": "a calibration",
     "run": "the results of an estimate",
     "loop": "the result of a closed loop",
+    "many": "the results of many recordings",
     "script": "a script of the virtual rig",
     "unfinished": "results that are not finished",
     "capture": "a capture of another program",
@@ -202,6 +204,7 @@ def _kind_of_folder(folder: Path) -> tuple[str, Inspector]:
         ("contacts.csv", "run", inspect_run),
         ("frames.csv", "recording", inspect_recording),
         (UNFINISHED, "unfinished", inspect_unfinished),
+        ("many.json", "many", inspect_many),
     )
     return next(((kind, inspect) for name, kind, inspect in signs if (folder / name).is_file()), ("unknown", inspect_folder))
 

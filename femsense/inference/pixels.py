@@ -81,17 +81,37 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
     triangle, on = answer["primitive_ids"].numpy().astype(np.int64), np.empty(m, dtype=np.bool_)
     positions = read_only(positions)
     _along_rays(
-        positions, read_only(skin.triangles), pixels.points, rays, pixels.ray_std, triangle, answer["primitive_uvs"].numpy(),
-        residual, std, weights, direction, on,
-    )  # fmt: skip
+        positions,
+        read_only(skin.triangles),
+        pixels.points,
+        rays,
+        pixels.ray_std,
+        triangle,
+        answer["primitive_uvs"].numpy(),
+        residual,
+        std,
+        weights,
+        direction,
+        on,
+    )
     far = np.flatnonzero(~on | (residual > FAR * std))
     if len(far):
         close = scene.compute_closest_points(tensor(pixels.points[far]))
         _closest(
-            positions, read_only(skin.triangles), pixels.points, pixels.ray_std, far,
-            close["primitive_ids"].numpy().astype(np.int64), close["primitive_uvs"].numpy(),
-            residual, std, weights, direction, triangle, on,
-        )  # fmt: skip
+            positions,
+            read_only(skin.triangles),
+            pixels.points,
+            pixels.ray_std,
+            far,
+            close["primitive_ids"].numpy().astype(np.int64),
+            close["primitive_uvs"].numpy(),
+            residual,
+            std,
+            weights,
+            direction,
+            triangle,
+            on,
+        )
     through = np.where(on & (residual < 0.0), BEHIND, 1.0)
     other = log_odds_of_other(pixels.robot_share, pixels.ray_std, skin.size, through)
     return rows_on(

@@ -313,9 +313,26 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
     odds = np.array([odds_of(model, contact, here.rows) for contact in here.contacts])
     covariance = force_map @ P[: 5 * m, : 5 * m] @ force_map.T
     return Fit(
-        frame, here.contacts, freeze(here.forces), here.tau, here.axes, here.state, here.rows, linear, here.C, here.N, eta, weight, phi, evidence,
-        odds, covariance, places, gain, converged,
-    )  # fmt: skip
+        frame,
+        here.contacts,
+        freeze(here.forces),
+        here.tau,
+        here.axes,
+        here.state,
+        here.rows,
+        linear,
+        here.C,
+        here.N,
+        eta,
+        weight,
+        phi,
+        evidence,
+        odds,
+        covariance,
+        places,
+        gain,
+        converged,
+    )
 
 
 def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:

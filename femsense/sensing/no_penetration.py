@@ -163,6 +163,17 @@ def _row(
     direction = slope / max(float(np.linalg.norm(slope)), 1e-12)
     view = 0 if frame.scan is None or not len(frame.scan.others_view) else int(np.bincount(frame.scan.others_view).argmax())
     return rows_on(
-        model.skin, positions, np.array([triangle]), weights[None], direction[None], np.array([-gap]), np.array([gap_std(model, shape)]), np.array([odds]),
-        np.ones(1), (place - gap * direction)[None], np.array([view]), model.views, pixel=False,
-    )  # fmt: skip
+        model.skin,
+        positions,
+        np.array([triangle]),
+        weights[None],
+        direction[None],
+        np.array([-gap]),
+        np.array([gap_std(model, shape)]),
+        np.array([odds]),
+        np.ones(1),
+        (place - gap * direction)[None],
+        np.array([view]),
+        model.views,
+        pixel=False,
+    )

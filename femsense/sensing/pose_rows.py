@@ -36,9 +36,19 @@ def background_rows(model: Model, k: int) -> Rows | None:
     off, by_pose, r = off[told], by_pose[told], int(told.sum())
     zeros = np.zeros((r, 3))
     return Rows(
-        off, np.ones(r), np.full(r, OTHER), np.full(r, 1.0 / model.overdispersion), np.zeros((r, 3), dtype=np.int64), zeros, zeros, by_pose,
-        np.zeros((r, len(model.skin.field))), np.zeros(r), zeros, np.zeros(r, dtype=np.bool_),
-    )  # fmt: skip
+        off,
+        np.ones(r),
+        np.full(r, OTHER),
+        np.full(r, 1.0 / model.overdispersion),
+        np.zeros((r, 3), dtype=np.int64),
+        zeros,
+        zeros,
+        by_pose,
+        np.zeros((r, len(model.skin.field))),
+        np.zeros(r),
+        zeros,
+        np.zeros(r, dtype=np.bool_),
+    )
 
 
 def pose_gain(model: Model, best: Fit) -> float:

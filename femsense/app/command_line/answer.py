@@ -4,11 +4,36 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import typer
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ManyJobs:
+    """A command that is asked of many recordings; `femsense.app.many_command` runs it."""
+
+    command: Any
+    """Of the command line, with its parameters."""
+    given: dict[str, Any]
+    """Parameter → value, of the options on the command line that each job gets."""
+    robot: str | None
+    """For all jobs."""
+    units: Sequence[str | Path]
+    """What each job is about; may hold patterns. Empty: `jobs` says it."""
+    jobs: str | None
+    """A table, or a pattern."""
+    output: Path | None
+    """Folder of all results; None: each result stands in what it is about."""
+    workers: int | None
+    dask: str | None
+    memory_gb: float | None
+    again: bool
+    others: frozenset[str]
+    """Options of other commands: their columns of a table are of no concern here."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -22,6 +47,8 @@ class Answer:
     exit_status: int = 0
     then: Callable[[], None] | None = field(default=None)
     """What goes on after it was said, until Ctrl-C."""
+    many: ManyJobs | None = None
+    """Jobs to run first: what they come to is the answer."""
 
 
 @contextlib.contextmanager

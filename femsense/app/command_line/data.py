@@ -8,15 +8,17 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, argument, filled, option, required
+from femsense.app.command_line.parameters import Json, OneRobot, argument, filled, option, required
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 
 
 def import_(
+    context: typer.Context,
     source: Annotated[
-        list[str],
+        list[str] | None,
         argument("SOURCE…", "A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras."),
-    ],
-    output: Annotated[Path, option("-o --output", "RECORDING", "The folder to write.")],
+    ] = None,
+    output: Annotated[Path | None, option("-o --output", "RECORDING", "The folder to write.")] = None,
     format: Annotated[str | None, option("--format", "NAME", "If the guess is wrong; see docs/importing.md.")] = None,
     topic: Annotated[list[str] | None, option("--topic", "NAME", "What to take, where there is a choice.")] = None,
     map_: Annotated[
@@ -40,12 +42,20 @@ def import_(
     actuation: Annotated[Path | None, option("--actuation", "FILE", "A CSV file with the inputs over time.")] = None,
     offset: Annotated[float | None, option("--offset", "S", "The frames' time minus that file's; else from motion.")] = None,
     again: Annotated[bool, option("--again", help="Import even where RECORDING holds an import.")] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
     from femsense.app.import_command import columns_named, free_named, import_into, import_text, shifts_named
     from femsense.io.importers.frames import Options
 
+    if (many := several(context, source, one_each=False)) is not None:
+        return many
+    source = required(context, source or None, "'SOURCE…'", "argument")
+    output = required(context, output, "'-o' / '--output'", "option")
     said = {"columns": columns_named(map_ or []), "shifts": shifts_named(shift or []), "free": free_named(free or [])}
     options = filled(Options, locals(), topics=tuple(topic or ()), **said)
     with progress_bar("import") as progress:
@@ -109,18 +119,25 @@ def _line_mesh(source: Path, output: Path, *, size: float | None, most: int | No
 
 def simulate(
     context: typer.Context,
-    robot: RobotPath,
-    script: Annotated[Path, argument("SCRIPT", "What the virtual rig does (TOML).")],
+    robot: OneRobot = None,
+    scripts: Annotated[list[Path] | None, argument("SCRIPT…", "What the virtual rig does (TOML); several are many jobs.")] = None,
     output: Annotated[
         Path | None, option("-o --output", "RECORDING", "The recording to write; with --plan a folder for the map of forces.")
     ] = None,
     plan: Annotated[bool, option("--plan", help="Say what this experiment could show; record nothing.")] = False,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""
     from femsense.app.commands import script_plan, simulate_into
 
+    if (many := several(context, scripts)) is not None:
+        return many
+    robot, script = required(context, robot, "'ROBOT'", "argument"), only(context, scripts)
     if plan:
         return Answer(*script_plan(robot, script, noise=1e-3 * noise, folder=output))
     output = required(context, output, "'-o' / '--output'", "option")

@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, argument, filled, option, required, split_names
+from femsense.app.command_line.parameters import Json, OneRobot, argument, filled, option, required, split_names
+from femsense.app.command_line.several import Dask, Jobs, Memory, several
 from femsense.core.errors import InputError
 
 
 def improve(
     context: typer.Context,
-    robot: RobotPath,
+    robot: OneRobot = None,
     recordings: Annotated[list[Path] | None, argument("RECORDING", "What the effects are found on.")] = None,
     output: Annotated[Path | None, option("-o --output", "OUT", "The folder to write; with --plan a script (TOML).")] = None,
     validation: Annotated[list[Path] | None, option("--validation", "RECORDING …", "What they are tested on.")] = None,
@@ -44,7 +45,8 @@ def improve(
     ] = False,
     again: Annotated[bool, option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[
-        int | None, option("--workers", "N", "Threads that work; by default one a core, four at most.", min=1)
+        int | None,
+        option("--workers", "N", "Threads that work; by default one a core, four at most. With --jobs: processes.", min=0),
     ] = None,
     plan: Annotated[
         bool, option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
@@ -53,6 +55,9 @@ def improve(
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
     frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
     actuation: Annotated[str, option("--actuation", "tension|displacement", "With --plan: what drives the cables.")] = "tension",
+    jobs: Jobs = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find what the model lacks and write the better robot."""
@@ -63,6 +68,9 @@ def improve(
     from femsense.loop.improve import ImproveOptions
     from femsense.report.loop.text import loop_text
 
+    if (many := several(context, recordings, one_each=False)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
     set_workers(workers)
     if plan and recordings:
         raise InputError(

@@ -44,7 +44,11 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
 
 
 RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-RecordingPath = Annotated[Path, argument("RECORDING", "A folder with recording.toml.")]
+OneRobot = Annotated[str | None, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
+"""A robot that a table of jobs may name instead."""
+Recordings = Annotated[
+    list[Path] | None, argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")
+]
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
 Json = Annotated[bool, option("--json", help="One JSON object on standard output, nothing else there.")]
 
@@ -75,7 +79,7 @@ def repeat_options(words: list[str]) -> list[str]:
 
 
 def required(context: typer.Context, value: T | None, name: str, kind: str) -> T:
-    """Return what only --plan can do without."""
+    """Return what only --plan or --jobs can do without."""
     if value is None:
         error = TyperException(f"Missing {kind} {name}.")
         error.ctx = context  # type: ignore[attr-defined]

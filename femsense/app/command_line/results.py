@@ -6,8 +6,11 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import typer
+
 from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import Json, RunPath, argument, filled, option, run_of
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -196,11 +199,20 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
 
 def report(
-    folder: Annotated[Path, argument("DIR", "A folder of results.")],
+    context: typer.Context,
+    folders: Annotated[
+        list[Path] | None, argument("DIR…", "A folder of results; several, or one of many jobs, are many jobs.")
+    ] = None,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    page = write_report(run_of(folder))
+    if (many := several(context, folders, output=False)) is not None:
+        return many
+    page = write_report(run_of(only(context, folders)))
     return Answer({"report": str(page)}, f"written: {page}")

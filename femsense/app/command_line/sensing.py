@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, filled, option, places
+from femsense.app.command_line.parameters import Json, OneRobot, Recordings, RobotPath, filled, option, places, required
+from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
 
 USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
 
@@ -23,10 +24,15 @@ class SensingMethod(StrEnum):
 
 
 def calibrate(
-    robot: RobotPath,
-    recording: RecordingPath,
+    context: typer.Context,
+    robot: OneRobot = None,
+    recordings: Recordings = None,
     output: Annotated[Path, option("-o --output", "FILE", "The file to write.")] = Path("calibration.json"),
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
@@ -39,6 +45,10 @@ def calibrate(
     from femsense.io.robot_toml import load_robot
     from femsense.report.text import calibration_text
 
+    if (many := several(context, recordings)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
+    recording = only(context, recordings)
     check_target(output, folder=False, kind=CALIBRATION)
     body, frames = load_robot(robot), load_recording(recording)
     warn_of_pictures(body, frames)
@@ -52,11 +62,13 @@ def calibrate(
 
 
 def estimate(
-    robot: RobotPath,
-    recording: RecordingPath,
-    output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
+    context: typer.Context,
+    robot: OneRobot = None,
+    recordings: Recordings = None,
+    output: Annotated[Path | None, option("-o --output", "RUN", "The folder to write.")] = None,
     calibration: Annotated[
-        Path | None, option("-c --calibration", "FILE", "Of femsense calibrate; made first where it is not given.")
+        Path | None,
+        option("-c --calibration", "FILE", "Of femsense calibrate, or its folder of many; made first where not given."),
     ] = None,
     at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Where forces act, in metres on the body at rest.")] = None,
     method: Annotated[
@@ -70,6 +82,10 @@ def estimate(
     smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
+    jobs: Jobs = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    memory: Memory = None,
     json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
@@ -77,6 +93,11 @@ def estimate(
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
+    if (many := several(context, recordings)) is not None:
+        return many
+    robot = required(context, robot, "'ROBOT'", "argument")
+    recording = only(context, recordings)
+    output = required(context, output, "'-o' / '--output'", "option")
     if push and not at:
         raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
     options = filled(SensingOptions, locals(), method=method.value)

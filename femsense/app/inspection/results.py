@@ -48,6 +48,14 @@ def inspect_unfinished(folder: Path, report: Report, problems: list[str]) -> Non
     )
 
 
+def inspect_many(folder: Path, report: Report, problems: list[str]) -> None:
+    """Report the results of many recordings."""
+    data = read_object(folder / "many.json")
+    problems += _expect(data, "femsense-many-1", ("command", "jobs", "counts"), folder / "many.json")
+    report |= {key: data[key] for key in ("command", "jobs", "counts") if key in data}
+    report["table"], report["page"] = str(folder / "summary.csv"), str(folder / "summary.html")
+
+
 def inspect_calibration(file: Path, report: Report, problems: list[str]) -> None:
     """Report poses, inputs and residuals of calibration.json."""
     data = read_object(file)
