@@ -12,6 +12,7 @@ from femsense.calib.files import read_calibration
 from femsense.report import words
 from femsense.report.drawing import AFTER, as_image, draw_bars, name_axes, new_axes, whole_numbers
 from femsense.report.page import Chapter, Html, panels, section, table, tiles, together
+from femsense.report.text import has_unknown_inputs
 
 MARKERS = 40
 
@@ -74,6 +75,8 @@ def _rotation_vector(T: Any) -> list[float]:
 
 
 def _inputs(c: Calibration) -> Html | None:
+    if not has_unknown_inputs(c):
+        return None
     names = list(dict.fromkeys([*c.cable_tension_n, *c.cable_displacement_m]))
     rows = [
         [

@@ -35,7 +35,7 @@ def import_(
             "--map", metavar="NAME=TARGET", help="Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.", show_default=False
         ),
     ] = None,
-    unit: Annotated[str | None, typer.Option("--unit", metavar="m|cm|mm", help="Of lengths.", show_default=False)] = None,
+    unit: Annotated[str | None, typer.Option("--unit", metavar="m|cm|mm|in|ft", help="Of lengths.", show_default=False)] = None,
     up: Annotated[
         str | None, typer.Option("--up", metavar="x|y|z", help="The vertical axis; it is turned to z.", show_default=False)
     ] = None,

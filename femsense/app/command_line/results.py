@@ -38,7 +38,7 @@ def export(
         typer.Option("--skin", metavar="FILE", help="A surface of your own: STL, OBJ, PLY or glTF.", show_default=False),
     ] = None,
     skin_unit: Annotated[
-        str | None, typer.Option("--skin-unit", metavar="UNIT", help="Of its coordinates: m, cm or mm.", show_default=False)
+        str | None, typer.Option("--skin-unit", metavar="m|cm|mm", help="Of its coordinates.", show_default=False)
     ] = None,
     vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
     arrows: Annotated[bool, typer.Option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,

@@ -15,6 +15,7 @@ from femsense.core.text import did_you_mean
 from femsense.io.importers.c3d import open_c3d, read_c3d_header
 from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.folders import CLOUDS, PAIRS, folder_kind, open_clouds, open_redwood, open_tum
+from femsense.io.importers.foreign import export_hint
 from femsense.io.importers.frames import Options, Source
 from femsense.io.importers.kinect import open_kinect
 from femsense.io.importers.mapping import check_names, check_taken, check_targets, resolved
@@ -96,7 +97,7 @@ def _opened(path: str | Path, said: Options) -> Source:
             where=source,
             found=found,
             expected="--format " + "|".join(FORMATS),
-            hint=UNPACK if packed else None if name is None else did_you_mean(name, FORMATS),
+            hint=UNPACK if packed else export_hint(source) if name is None else did_you_mean(name, FORMATS),
         )
     return FORMATS[name](source, said)
 

@@ -49,6 +49,9 @@ def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable
         base += f", {lost} of them without a result"
     if doubted:
         base += f", {doubted} of them not to be trusted"
+    if contacts is not None and contacts.undetermined.any():
+        weak = len(set(contacts.frame[contacts.undetermined].tolist()))
+        base += f", {words.counted(weak, 'frame')} with a contact whose size is not determined"
     strongest = strongest_contact(contacts, frames)
     if contacts is None or strongest is None:
         return f"{base}."
