@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.report.loop.document import Loop
 from femsense.report.loop.text import loop_text
 from femsense.report.text import calibration_text, known_part, run_text
+from femsense.sensing.run_files import read_run, write_run
 from femsense.sensing.types import ContactForce
 
 
@@ -68,4 +70,19 @@ def test_a_run_whose_forces_noise_may_make_has_no_contact(tmp_path: Path) -> Non
     assert "the frames with contact" in felt and "largest force" in felt
     weak = run_text(replace(run, contacts=tuple(replace(one, std_n=one.force_n) for one in run.contacts)))
     assert "median of all frames" in weak and "largest force" not in weak
-    assert any(line.split() == ["contacts", "none"] for line in weak.splitlines())
+    assert any(line.split() == ["contacts", "none"] for line in run_text(replace(run, contacts=())).splitlines())
+
+
+def test_a_contact_that_was_seen_and_whose_size_is_not_determined_is_reported_as_one(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    weak = replace(run, contacts=tuple(replace(one, force_n=0.48, std_n=0.26, source="cloud") for one in run.contacts[:2]))
+    text = run_text(weak)
+    assert "contacts none" not in " ".join(text.split())
+    assert "2 frames with a contact whose size is not determined" in text
+    assert "contact, size not determined (0.48 ± 0.26 N)" in text and "largest force" not in text
+    folder = write_run(weak, tmp_path / "run", inputs={})
+    notes = [row["note"] for row in csv.DictReader((folder / "frames.csv").open(encoding="utf-8"))]
+    assert notes.count("contact, size not determined (0.48 ± 0.26 N)") == 2 and notes.count("") == len(notes) - 2
+    assert len(read_run(folder, robot=run.robot).frames) == len(run.frames)
+    inferred = replace(weak, contacts=tuple(replace(one, source="shape") for one in weak.contacts))
+    assert any(line.split() == ["contacts", "none"] for line in run_text(inferred).splitlines())

@@ -12,14 +12,18 @@ from femsense.app.command_line.parameters import Json
 
 
 def learn(
-    sensors: Annotated[
-        Path, typer.Argument(metavar="SENSORS.csv", help="time_s, and a column for each sensor.", show_default=False)
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SENSORS.csv MARKERS.csv …",
+            help="time_s and a column for each sensor; frame,marker,x_m,y_m,z_m. Two files a recording.",
+            show_default=False,
+        ),
     ],
-    markers: Annotated[Path, typer.Argument(metavar="MARKERS.csv", help="frame,marker,x_m,y_m,z_m.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL", help="The ONNX file.", show_default=False)],
     test: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(metavar="SENSORS MARKERS", help="State the error on another recording.", show_default=False),
+        typer.Option(metavar="SENSORS MARKERS", help="State the error on another recording, too.", show_default=False),
     ] = None,
     adapt: Annotated[
         Path | None,
@@ -40,11 +44,11 @@ def learn(
     json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
-    from femsense.app.learn_command import LearnFiles, learn_into
+    from femsense.app.learn_command import LearnFiles, learn_into, pairs_of
 
     with progress_bar("learn") as progress:
         document, text = learn_into(
-            LearnFiles(sensors, markers, test, adapt, calibration, robot_frame),
+            LearnFiles(pairs_of(files), test, adapt, calibration, robot_frame),
             output,
             end_to_end=end_to_end,
             bones=bones,

@@ -49,16 +49,20 @@ def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable
         base += f", {lost} of them without a result"
     if doubted:
         base += f", {doubted} of them not to be trusted"
-    if contacts is not None and contacts.undetermined.any():
-        weak = len(set(contacts.frame[contacts.undetermined].tolist()))
-        base += f", {words.counted(weak, 'frame')} with a contact whose size is not determined"
     strongest = strongest_contact(contacts, frames)
     if contacts is None or strongest is None:
-        return f"{base}."
+        weak = "" if contacts is None else _undetermined(contacts)
+        return f"{base}; {weak}." if weak else f"{base}."
     return (
         f"{base}; largest force {force_text(contacts.size_n[strongest], contacts.std_n[strongest])} in frame "
         f"{contacts.frame[strongest]}."
     )
+
+
+def _undetermined(contacts: ContactTable) -> str:
+    """Return in how many frames a contact was seen whose size is not determined; nothing where there is none."""
+    count = len(set(contacts.frame[contacts.undetermined].tolist()))
+    return f"size not determined in {words.counted(count, 'frame')}" if count else ""
 
 
 def _count(facts: RunFacts, contacts: ContactTable | None) -> int:
@@ -69,9 +73,10 @@ def _count(facts: RunFacts, contacts: ContactTable | None) -> int:
 def _summary(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> Html:
     items = [("Frames ok", f"{facts.frames_ok} of {facts.frames}", "")]
     touched = 0 if contacts is None else len(set(contacts.frame[contacts.sensed].tolist()))
-    items.append(
-        ("Contacts", str(_count(facts, contacts)), f"in {words.counted(touched, 'frame')}" if contacts is not None else "")
+    where = (
+        "" if contacts is None else "; ".join(filter(None, [f"in {words.counted(touched, 'frame')}", _undetermined(contacts)]))
     )
+    items.append(("Contacts", str(_count(facts, contacts)), where))
     if frames is not None and len(frames):
         rows = frames.good & (frames.contacts > 0) if (frames.good & (frames.contacts > 0)).any() else frames.good
         before, after = median_of(frames.before_m[rows]), median_of(frames.after_m[rows])
