@@ -143,10 +143,10 @@ def learn(
     model = ProprioceptiveModel(
         data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report, data.frame, spread
     )
-    return model if test is None else replace(model, report={**report, "test": tested(model, test, report["error_mm"])})
+    return model if test is None else replace(model, report={**report, "test": errors_on(model, test, report["error_mm"])})
 
 
-def tested(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> dict[str, Any]:
+def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> dict[str, Any]:
     """Return the errors of a model on data that it was not made from, and whether its intervals hold there, as plain tables.
 
     `growth` is the error there over the stated one.
