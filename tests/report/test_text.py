@@ -26,6 +26,15 @@ def test_a_residual_far_above_the_noise_is_said_to_be_an_error_of_the_model(nois
     assert ("error of the model  24.998 mm of it: markers repeat to 0.300 mm" in text) == said
 
 
+def test_inputs_that_are_absolute_have_nothing_at_the_start() -> None:
+    known = {"tension_std_n": {"top": 0.0}, "displacement_std_m": {"top": 0.0}}
+    text = calibration_text(make_calibration(cable_tension_n={"top": 0.0}, cable_displacement_m={"top": -5.9e-4}, **known))
+    assert "cable top" not in text and "at the start" not in text
+    unknown = {"tension_std_n": {"top": 0.02}, "displacement_std_m": {"top": 1e-4}}
+    text = calibration_text(make_calibration(cable_tension_n={"top": 0.4}, cable_displacement_m={"top": 2e-3}, **unknown))
+    assert "0.400 N ± 0.02 N, 2.00 mm ± 0.1 mm at the start" in text
+
+
 def test_a_loop_says_how_large_the_error_of_the_model_is() -> None:
     parts = {"held_out_m": 0.0121, "noise_source": "marker_noise_m of recording.toml"}
     text = loop_text(Loop.model_validate({"verdict": "unexplained", "model_error": parts}))
@@ -78,7 +87,7 @@ def test_a_contact_that_was_seen_and_whose_size_is_not_determined_is_reported_as
     weak = replace(run, contacts=tuple(replace(one, force_n=0.48, std_n=0.26, source="cloud") for one in run.contacts[:2]))
     text = run_text(weak)
     assert "contacts none" not in " ".join(text.split())
-    assert "2 frames with a contact whose size is not determined" in text
+    assert "a contact whose size is not determined in 1 frame" in text
     assert "contact, size not determined (0.48 ± 0.26 N)" in text and "largest force" not in text
     folder = write_run(weak, tmp_path / "run", inputs={})
     notes = [row["note"] for row in csv.DictReader((folder / "frames.csv").open(encoding="utf-8"))]
