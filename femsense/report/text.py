@@ -120,7 +120,8 @@ def run_text(run: Run) -> str:
     doubted = len({c.frame for c in sensed(run.contacts)} - {frame.frame for frame in run.frames if frame.status == "ok"})
     weak = undetermined(run.contacts)
     if weak:
-        touched = f"{touched}; {len({c.frame for c in weak})} frames with a contact whose size is not determined".removeprefix(
+        count = len({c.frame for c in weak})
+        touched = f"{touched}; a contact whose size is not determined in {count} frame{'s' if count > 1 else ''}".removeprefix(
             "none; "
         )
     rows.append(["contacts", f"{touched}, {doubted} of them not ok" if doubted else touched])

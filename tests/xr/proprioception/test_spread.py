@@ -14,7 +14,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.files import read_labelled
 from femsense.xr.proprioception.labelled import Labelled, joined, labelled
-from femsense.xr.proprioception.learn import LearnOptions, learn, errors_on
+from femsense.xr.proprioception.learn import LearnOptions, errors_on, learn
 from femsense.xr.proprioception.linear import train_ridge
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.model_file import load_model, save_model
