@@ -46,7 +46,7 @@ def with_all_parts(
             verdict = (
                 "named with a value for each"
                 if better
-                else "the values of each are not told apart"
+                else "the values of each are not distinguished"
                 if gain <= price
                 else "values of each predict the held-out data worse"
             )
