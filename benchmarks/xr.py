@@ -186,8 +186,8 @@ def other_days(folder: Path) -> None:
         line = train_ridge(day.select(few).readings, day.select(few).targets, penalty=1e-4)
         print(f"{name}: {drift(model, day).text}")
         print(
-            f"   corrected by {mended.report['adapted']['by']}: {found['error_mm']:.2f} mm on the {len(left)} other frames, {100 * found['coverage']:.0f} % within the "
-            f"interval; a linear map of the labelled frames {1e3 * marker_rms(line(left.readings) - left.targets):.2f} mm"
+            f"   corrected by {mended.report['adapted']['by']}: {found['error_mm']:.2f} mm on the {len(left)} other frames, "
+            f"{100 * found['coverage']:.0f} % within the interval; a linear map of them {1e3 * marker_rms(line(left.readings) - left.targets):.2f} mm"
         )
 
 

@@ -154,7 +154,10 @@ def _marker_rows(robot: Robot, recording: Recording, k: int, calibration: Calibr
 def _places(robot: Robot, calibration: Calibration, state: Equilibrium) -> tuple[IntArray, BoolArray]:
     """Return nodes at which the resolution is stated, and whether a camera sees each, shape (p,)."""
     surface = body_surface(robot.body.mesh)
-    nodes = spread_features(robot.body, CANDIDATES, among=flat_nodes(surface, robot.body.mesh.nodes))
+    flat = np.setdiff1d(flat_nodes(surface, robot.body.mesh.nodes), robot.body.clamped)
+    nodes = spread_features(robot.body, CANDIDATES, among=flat if len(flat) else None)
+    if not len(nodes):
+        raise DataError("every node of the surface is clamped: no force moves this robot")
     seen = _seen(calibration, state, surface.triangles, nodes)
     few = [spread_features(robot.body, count, among=nodes[which]) for count, which in ((SEEN, seen), (HIDDEN, ~seen))]
     return np.concatenate(few), np.repeat([True, False], [len(part) for part in few])

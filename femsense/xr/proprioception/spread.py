@@ -3,11 +3,12 @@
 The map is linear in its last layer, with features f(x) = (φ(z), z, 1), so its predictive variance is that of Bayesian linear
 regression (Bishop 2006, section 3.3.2; for networks the Laplace approximation of the last layer):
 
-    s²(x) = 1 + κ fᵀ (FᵀF + λ n I)⁻¹ f
+    s²(x) = 1 + κ fᵀ (FᵀF / n + λ I)⁻¹ f / p
 
-F are the features of the n rows that it was trained on. Rows that follow each other are alike, so n of them count as n / κ; κ is
-the likeliest for errors on blocks in time that were held out. The interval of a marker has the radius q s(x), where q is the 95 %
-quantile of |error| / s(x) on such blocks. Blocks at the end, predicted from what came before them, hold what a session drifts.
+F are the p features of the n rows that it was trained on. The leverage beside κ is 1 on average over those rows; it does not fall with n,
+since rows that follow each other, and motions that are repeated, tell the same. κ is the likeliest for errors on blocks in time that
+were held out. The interval of a marker has the radius q s(x), where q is the 95 % quantile of |error| / s(x) on such blocks. Blocks at the
+end, predicted from what came before them, hold what a session drifts.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from femsense.xr.proprioception.network import Network
 LEVEL = 0.95
 REGULAR = 1e-3
 """λ, relative to the mean square of a feature."""
-KAPPAS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+KAPPAS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 PARTS = 6
 """Parts in time of a recording."""
 BETWEEN = -1
@@ -36,7 +37,7 @@ class Spread:
     """What the radius of an interval is computed from."""
 
     root: FloatArray
-    """L⁻¹ of FᵀF + λ n I = L Lᵀ, shape (p, p)."""
+    """L⁻¹ of p (FᵀF / n + λ I) = L Lᵀ, shape (p, p)."""
     kappa: float
     """κ, see above."""
     quantile: FloatArray
@@ -58,7 +59,7 @@ class HeldOut:
     distance: FloatArray
     """Of each marker [m], shape (n, m)."""
     leverage: FloatArray
-    """fᵀ (FᵀF + λ n I)⁻¹ f, shape (n,)."""
+    """fᵀ (FᵀF / n + λ I)⁻¹ f / p, shape (n,)."""
     group: IntArray
     """`BETWEEN` where rows before and after were trained on; else which of the groups that come later, or from another recording,
     shape (n,)."""
@@ -163,13 +164,13 @@ def features(network: Network, inputs: FloatArray) -> FloatArray:
 
 
 def root_of(network: Network, inputs: FloatArray) -> FloatArray:
-    """Return L⁻¹ of FᵀF + λ n I = L Lᵀ of the rows that a network was trained on."""
+    """Return L⁻¹ of p (FᵀF / n + λ I) = L Lᵀ of the rows that a network was trained on."""
     F = features(network, inputs)
     usual = float((F**2).mean())
-    lower = np.linalg.cholesky(F.T @ F + REGULAR * usual * len(F) * np.eye(F.shape[1]))
+    lower = np.linalg.cholesky(F.shape[1] * (F.T @ F / len(F) + REGULAR * usual * np.eye(F.shape[1])))
     return np.asarray(np.linalg.inv(lower))
 
 
 def leverage(root: FloatArray, network: Network, inputs: FloatArray) -> FloatArray:
-    """Return fᵀ (FᵀF + λ n I)⁻¹ f of inputs, shape (n,)."""
+    """Return fᵀ (FᵀF / n + λ I)⁻¹ f / p of inputs, shape (n,)."""
     return np.asarray(((features(network, inputs) @ root.T) ** 2).sum(axis=1))
