@@ -61,7 +61,7 @@ MORE_CONTACT_COLUMNS = (
     "fz_std_n",
 )
 NOTE_COLUMN = "note"
-"""Last column of frames.csv: a contact that was seen and whose size is not determined."""
+"""Last column of frames.csv where a run has such: a contact that was seen and whose size is not determined."""
 FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before_m", "rms_after_m", "ms")
 
 
@@ -128,8 +128,8 @@ def write_run(
         cables, chambers = run.robot.body.cable_names, run.robot.body.chamber_names
         columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables), *(f"pressure_{name}_pa" for name in chambers)]
         notes = _notes(run)
-        rows = [[*_frame_row(frame, cables, chambers), notes.get(frame.frame, "")] for frame in run.frames]
-        write_csv(part / "frames.csv", [*columns, NOTE_COLUMN], rows)
+        rows = [[*_frame_row(frame, cables, chambers), *([notes.get(frame.frame, "")] if notes else [])] for frame in run.frames]
+        write_csv(part / "frames.csv", [*columns, *([NOTE_COLUMN] if notes else [])], rows)
         _write_states(run.states, part / "states.npz")
         write_json(part / "run.json", _run_document(run, inputs, seconds))
     return Path(folder)
