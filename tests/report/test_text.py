@@ -16,6 +16,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.report.loop.document import Loop
 from femsense.report.loop.text import loop_text
 from femsense.report.text import calibration_text, known_part, run_text
+from femsense.report.write import write_report
 from femsense.sensing.run_files import read_run, write_run
 from femsense.sensing.types import ContactForce
 
@@ -73,6 +74,20 @@ def test_other_forces_are_told_whole(force: list[float], std: list[float]) -> No
     assert known_part(contact(force, std)) == ""
 
 
+def test_terminal_and_report_name_the_same_largest_force(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    good = next(frame.frame for frame in run.frames if frame.status == "ok")
+    weak, sure = (
+        replace(run.contacts[0], frame=good, contact=i, track=i, force_n=f, std_n=s)
+        for i, (f, s) in enumerate(((0.9, 0.5), (0.2, 0.01)))
+    )
+    both = replace(run, contacts=(weak, sure))
+    folder = write_run(both, tmp_path / "run", inputs={"robot": {"path": None}, "recording": {"path": None}})
+    assert "largest force        0.200 ± 0.010 N" in run_text(both)
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert "largest force 0.200 ± 0.010 N" in page.replace("\u202f", " ").replace("\u00a0", " ")
+
+
 def test_a_run_whose_forces_noise_may_make_has_no_contact(tmp_path: Path) -> None:
     run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
     felt = run_text(run)
@@ -93,5 +108,6 @@ def test_a_contact_that_was_seen_and_whose_size_is_not_determined_is_reported_as
     notes = [row["note"] for row in csv.DictReader((folder / "frames.csv").open(encoding="utf-8"))]
     assert notes.count("contact, size not determined (0.48 ± 0.26 N)") == 1 and notes.count("") == len(notes) - 1
     assert len(read_run(folder, robot=run.robot).frames) == len(run.frames)
+    assert "contact, size not determined (0.48 ± 0.26 N)" in write_report(folder).read_text(encoding="utf-8")
     inferred = replace(weak, contacts=tuple(replace(one, source="shape") for one in weak.contacts))
     assert any(line.split() == ["contacts", "none"] for line in run_text(inferred).splitlines())

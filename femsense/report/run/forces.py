@@ -30,7 +30,7 @@ from femsense.report.drawing import (
 from femsense.report.page import Html, panels, paragraph, table, together
 from femsense.report.run.document import KnownLoad
 from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
-from femsense.sensing.run_arrays import NOISE
+from femsense.sensing.run_arrays import NOISE, undetermined_text
 from femsense.sensing.run_files import read_states
 
 ROWS = 150
@@ -197,7 +197,7 @@ def contacts_table(contacts: ContactTable | None) -> Html | None:
             str(contacts.frame[i]),
             words.number(float(contacts.time_s[i])),
             str(contacts.contact[i]),
-            f"not determined ({size})" if contacts.undetermined[i] else size,
+            undetermined_text(contacts.size_n[i], contacts.std_n[i]) if contacts.undetermined[i] else size,
             _vector(factor * contacts.force_n[i]),
             _vector(1e3 * contacts.place_m[i], 1),
             contacts.source[i] or words.NOTHING,
