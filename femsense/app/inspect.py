@@ -102,7 +102,7 @@ def _compare(target: Path, report: Report, robot: str | Path) -> None:
     warn_of_clouds(body, loaded)
     warn_of_markers(body, loaded)
     report["robot"] = body.name
-    report["forces"] = _resolution(body, loaded)
+    report["force_resolution"] = _resolution(body, loaded)
 
 
 def _resolution(robot: Robot, recording: Recording) -> Report:
@@ -150,9 +150,10 @@ def describe(report: Mapping[str, Any]) -> str:
 
         return "\n".join([*lines, accuracy_text(report["accuracy"])])
     lines += section_lines(
-        {key: value for key, value in report.items() if key not in ("path", "kind", "forces", "problems", "warnings")}, 2
+        {key: value for key, value in report.items() if key not in ("path", "kind", "force_resolution", "problems", "warnings")},
+        2,
     )
-    if forces := report.get("forces"):
+    if forces := report.get("force_resolution"):
         lines += ["", forces.get("text") or f"forces that this camera resolves: not known. {forces['unknown']}"]
     for title in ("problems", "warnings"):
         texts = report.get(title, [])
