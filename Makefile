@@ -1,6 +1,7 @@
 # make demo      the whole chain on the recording that comes along, into femsense-demo/
-# make test      lint, types, all tests, and a sample of the sabotages: key lines are broken, and tests must notice
+# make test      lint, types, all tests, and a sample of the sabotages: a line is broken, and its test must fail
 # make sabotage  every sabotage
+# make mutants   ROOM=core: the share of mutants of a room that its tests notice (minutes to hours)
 # make lint      ruff and mypy
 # make clean     what the targets above have made
 #
@@ -16,7 +17,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 
-.PHONY: demo test sabotage lint clean
+.PHONY: demo test sabotage mutants lint clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed
@@ -24,10 +25,13 @@ demo: $(VENV)/.installed
 
 test: lint
 	$(RUN)/python -m pytest -n $(JOBS)
-	$(RUN)/python scripts/sabotage.py --green --sample 64 --seed 20411 --seconds 330 --jobs $(JOBS)
+	$(RUN)/python scripts/sabotage.py --sample 12 --jobs $(JOBS)
 
 sabotage: $(VENV)/.installed-dev
 	$(RUN)/python scripts/sabotage.py --jobs $(JOBS)
+
+mutants: $(VENV)/.installed-dev
+	$(RUN)/python scripts/mutants.py $(ROOM) --jobs $(JOBS)
 
 lint: $(VENV)/.installed-dev
 	$(RUN)/ruff check .

@@ -1,242 +1,123 @@
-"""Break key lines one at a time (a sign, a transpose, millimetres for metres, a factor) and demand that named tests turn red.
+"""Break one line at a time and check that the test named for it fails.
 
-    python scripts/sabotage.py [WORD …] [--list] [--jobs N] [--sample N [--seed S] [--seconds T]] [--green]
+    python scripts/sabotage.py [WORD …] [--sample N] [--seed S] [--jobs N]
 
-The lines stand in scripts/sabotages/<room>.toml.
-With words only those entries run whose file or tests contain one of them; `--sample` draws so many, spread over all files, each
-with the first of its tests alone. No entry begins later than `--seconds`. The work is done in copies of the repository, one a
-job. The tests must be green there first; `--green` says that they have just been seen so.
-
-Exit status 0: every sabotage was noticed; 1: one survived,
-or an entry names a line or a test that is not there (all entries are looked at for that, whichever run).
+The lines stand in scripts/sabotages.toml. With words, only entries whose file or test contains one of them run; `--sample` draws N
+of them, with a new seed each time, which is printed. Exit status 1: a test passed on broken code, or an entry names a line or a
+test that does not exist. The named tests are expected to pass on the code as it is.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import queue
 import random
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 import tomllib
-from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PARTS = ("docs", "femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml", "hatch_build.py")
-MOST_S = 600.0
-"""Tests that take longer than this [s] have noticed: what is broken does not end."""
+NEEDED = ("femsense", "tests", "meshes", "examples", "docs", "benchmarks", "scripts", "pyproject.toml")
+LONGEST_S = 600.0
+"""A broken solver may never end: a test that runs longer than this counts as failed."""
 
 
 @dataclass(frozen=True)
 class Sabotage:
-    """One line to break and the tests that must notice."""
+    """One line to break and the test that must fail."""
 
     file: str
     """Path from the root of the repository."""
     line: str
-    """Text that stands in the file exactly once."""
+    """Text that occurs exactly once in the file."""
     broken: str
-    """What it is replaced by."""
-    tests: tuple[str, ...]
-    """Node ids of pytest, in tests/; the cheapest first."""
+    """Its replacement."""
+    test: str
+    """Node id of pytest."""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.line} → {self.broken}"
+
+    def stale(self, root: Path = ROOT) -> str:
+        """Return what is wrong with the entry itself, "" where its line and its test exist."""
+        source, (test, _, function) = root / self.file, self.test.partition("::")
+        if (count := source.read_text(encoding="utf-8").count(self.line) if source.is_file() else 0) != 1:
+            return f"the line occurs {count} times in the file"
+        defined = rf"^def {re.escape(function.partition('[')[0])}\("
+        found = (root / test).is_file() and re.search(defined, (root / test).read_text(encoding="utf-8"), re.MULTILINE)
+        return "" if found else f"there is no {self.test}"
 
 
-def load_sabotages(folder: Path = ROOT / "scripts" / "sabotages") -> list[Sabotage]:
-    """Return all entries, room by room. Each table is called after its file in the room."""
-    found = []
-    for room in sorted(folder.glob("*.toml")):
-        for file, entries in tomllib.loads(room.read_text(encoding="utf-8")).items():
-            found += [Sabotage(f"femsense/{room.stem}/{file}", **{**e, "tests": tuple(e["tests"])}) for e in entries]
-    return found
+def load(file: Path = ROOT / "scripts" / "sabotages.toml") -> list[Sabotage]:
+    return [Sabotage(**entry) for entry in tomllib.loads(file.read_text(encoding="utf-8"))["sabotage"]]
 
 
-# Entries that are no longer true
-
-
-def what_is_stale(sabotage: Sabotage, root: Path = ROOT) -> str:
-    """Return what an entry names that is not there, "" where all of it is."""
-    path = root / sabotage.file
-    count = path.read_text(encoding="utf-8").count(sabotage.line) if path.is_file() else 0
-    if count != 1:
-        return f"the line stands {count} times in the file"
-    missing = [test for test in sabotage.tests if not _is_test(test, root)]
-    return f"no test is called {missing[0]}" if missing else ""
-
-
-def _is_test(name: str, root: Path) -> bool:
-    file, _, function = name.partition("::")
-    path = root / "tests" / file
-    wanted = rf"^\s*def {re.escape(function.partition('[')[0])}\("
-    return path.is_file() and re.search(wanted, path.read_text(encoding="utf-8"), re.MULTILINE) is not None
-
-
-# What runs
-
-
-def draw(sabotages: Sequence[Sabotage], count: int, rng: random.Random) -> list[Sabotage]:
-    """Return so many entries, one of each file before the second of any, each with its first test alone."""
-    by_file: dict[str, list[Sabotage]] = {}
-    for sabotage in rng.sample(list(sabotages), len(sabotages)):
-        by_file.setdefault(sabotage.file, []).append(sabotage)
-    drawn = list[Sabotage]()
-    while by_file and len(drawn) < count:
-        for file in list(by_file)[: count - len(drawn)]:
-            drawn.append(by_file[file].pop())
-        by_file = {file: rest for file, rest in by_file.items() if rest}
-    return [replace(sabotage, tests=sabotage.tests[:1]) for sabotage in drawn]
-
-
-def copy_repository(folder: Path) -> Path:
+def copy_repository(root: Path, folder: Path) -> Path:
     """Copy what the tests need into a folder, compiled kernels too; data that stand beside the repository are linked."""
-    copy = folder / ROOT.name
-    copy.mkdir(parents=True)
-    for part in PARTS:
-        source = ROOT / part
-        if source.is_dir():
-            shutil.copytree(source, copy / part, symlinks=True)
-        elif source.is_file():
-            shutil.copy2(source, copy / part)
-    beside = ROOT.parent / "shared"
-    if beside.exists():
-        (folder / "shared").symlink_to(beside)
+    copy = folder / root.name
+    for part in (root / name for name in NEEDED if (root / name).exists()):
+        if part.is_dir():
+            shutil.copytree(part, copy / part.name, symlinks=True, ignore=shutil.ignore_patterns("node_modules"))
+        else:
+            shutil.copy2(part, copy / part.name)
+    if (root.parent / "shared").exists():
+        (folder / "shared").symlink_to(root.parent / "shared")
     return copy
 
 
-def red(copy: Path, tests: Sequence[str], *, most_s: float = MOST_S) -> tuple[bool, str]:
-    """Run tests in the copy; return whether any fails, and the last line of the report."""
-    one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-    environment = {**os.environ, **one_thread, "PYTHONPATH": str(copy), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    options = ["-x", "--no-header", "--tb=no", "--disable-warnings"]
-    command = [sys.executable, "-m", "pytest", *options, *(f"tests/{test}" for test in tests)]
-    try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=most_s, check=False)
-    except subprocess.TimeoutExpired:
-        return True, "took too long"
-    lines = (done.stdout + done.stderr).strip().splitlines() or ["no report"]
-    summary = next((line for line in reversed(lines) if " passed" in line or " failed" in line), lines[-1])
-    if done.returncode not in (0, 1) or (done.returncode == 1 and " failed" not in summary):
-        return False, f"the tests did not run: {summary}"  # a name that no test has is no red
-    return done.returncode == 1, summary
+def result_of(sabotage: Sabotage, root: Path = ROOT) -> str:
+    """Run the test in a copy of the repository with the line broken; return "failed", "SURVIVED", "skipped" or "DID NOT RUN".
 
-
-@contextmanager
-def broken(copy: Path, sabotage: Sabotage) -> Iterator[None]:
-    """Break the line in the copy, and put it back with the kernels that were compiled from the whole file.
-
-    Kernels of other files that take in one of this file keep what they took in: its tests have to call the file itself.
+    numba compiles the kernels of the changed file again. A kernel of another file that inlines one of them stays as it was: the
+    test has to call the broken file itself.
     """
-    path = copy / sabotage.file
-    original, status = path.read_text(encoding="utf-8"), path.stat()
-    aside = copy / "compiled"
-    aside.mkdir()
-    for kernel in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"):
-        kernel.rename(aside / kernel.name)
-    path.write_text(original.replace(sabotage.line, sabotage.broken), encoding="utf-8")
-    try:
-        yield
-    finally:
-        path.write_text(original, encoding="utf-8")
-        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-        for kernel in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"):
-            kernel.unlink()
-        for kernel in aside.iterdir():
-            kernel.rename(path.parent / "__pycache__" / kernel.name)
-        aside.rmdir()
-
-
-def try_one(copy: Path, sabotage: Sabotage) -> tuple[str, str]:
-    """Break one line, run its tests, mend it; return "red", "SURVIVED" or "skipped", and a remark."""
-    began = time.monotonic()
-    with broken(copy, sabotage):
-        noticed, remark = red(copy, sabotage.tests)
-    result = "red" if noticed else "skipped" if "skipped" in remark and "passed" not in remark else "SURVIVED"
-    return result, f"{time.monotonic() - began:5.1f} s  {remark}"
-
-
-def try_all(chosen: Sequence[Sabotage], copies: Sequence[Path], *, most_s: float) -> list[str]:
-    """Try entries, one a copy at a time; return the results of those that began in time."""
-    idle: queue.SimpleQueue[Path] = queue.SimpleQueue()
-    for copy in copies:
-        idle.put(copy)
-    end = time.monotonic() + most_s
-
-    def run(sabotage: Sabotage) -> str:
-        if time.monotonic() > end:
-            return "left"
-        copy = idle.get()
+    with tempfile.TemporaryDirectory(prefix="sabotage-") as folder:
+        copy = copy_repository(root, Path(folder))
+        broken = copy / sabotage.file
+        broken.write_text(broken.read_text(encoding="utf-8").replace(sabotage.line, sabotage.broken), encoding="utf-8")
+        command = [sys.executable, "-m", "pytest", "-x", "--tb=no", "-p", "no:cacheprovider", sabotage.test]
+        threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+        environment = {**os.environ, **threads, "PYTHONPATH": str(copy), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
         try:
-            result, remark = try_one(copy, sabotage)
-        finally:
-            idle.put(copy)
-        print(f"{result:8}  {shown(sabotage)}  {remark}", flush=True)
-        return result
-
-    with ThreadPoolExecutor(len(copies)) as pool:
-        return list(pool.map(run, chosen))
-
-
-def shown(sabotage: Sabotage) -> str:
-    line, changed = (" ".join(text.split())[:44] for text in (sabotage.line, sabotage.broken))
-    return f"{sabotage.file:40}  {line:44}  →  {changed:44}"
+            done = subprocess.run(
+                command, cwd=copy, env=environment, capture_output=True, text=True, timeout=LONGEST_S, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return "failed"
+    if done.returncode == 0:
+        return "SURVIVED" if " passed" in done.stdout else "skipped"
+    return "failed" if done.returncode == 1 and " failed" in done.stdout else "DID NOT RUN"
 
 
-def options_of(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Break key lines one at a time and demand that named tests turn red.")
-    parser.add_argument("words", nargs="*", help="only entries whose file or tests contain one of these")
-    parser.add_argument("--list", action="store_true", help="only say what would run")
-    parser.add_argument("--jobs", type=int, default=1, help="how many run at a time")
-    parser.add_argument("--sample", type=int, help="draw so many, spread over all files")
-    today = datetime.now(tz=UTC).toordinal()
-    parser.add_argument("--seed", type=int, default=today, help="of the drawing; by default the day's own")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="none begins later than this [s]")
-    parser.add_argument("--green", action="store_true", help="the tests have just been seen to be green")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: Sequence[str]) -> int:
-    options = options_of(arguments)
-    sabotages = load_sabotages()
-    stale = [(sabotage, why) for sabotage in sabotages if (why := what_is_stale(sabotage))]
-    for sabotage, why in stale:
-        print(f"STALE     {shown(sabotage)}  {why}")
-    dead = {id(sabotage) for sabotage, _ in stale}
-    words = options.words
-    chosen = [s for s in sabotages if id(s) not in dead and (not words or any(w in " ".join((s.file, *s.tests)) for w in words))]
-    if not chosen:
-        print(f"no file and no test of an entry contains {' or '.join(words)}")
-        return 1
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Break one line at a time and check that the test named for it fails.")
+    parser.add_argument("words", nargs="*", help="only entries whose file or test contains one of these")
+    parser.add_argument("--sample", type=int, help="draw this many entries")
+    parser.add_argument("--seed", type=int, default=random.randrange(10**6), help="of the sample; drawn anew by default")
+    parser.add_argument("--jobs", type=int, default=1, help="tests that run at a time")
+    options = parser.parse_args()
+    entries = load()
+    stale = [f"{entry}: {why}" for entry in entries if (why := entry.stale())]
+    chosen = [e for e in entries if not options.words or any(word in f"{e.file} {e.test}" for word in options.words)]
     if options.sample:
-        chosen = draw(chosen, options.sample, random.Random(options.seed))
-        print(f"{len(chosen)} of {len(sabotages)} entries, drawn with --seed {options.seed}")
-    if options.list:
-        print(*map(shown, chosen), sep="\n")
-        return 1 if stale else 0
-    began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="sabotage") as folder:
-        copies = [copy_repository(Path(folder) / str(i)) for i in range(options.jobs)]
-        if not options.green:
-            broken_already, remark = red(copies[0], list(dict.fromkeys(test for s in chosen for test in s.tests)), most_s=7200.0)
-            if broken_already or "passed" not in remark:
-                print(f"the tests are not green to begin with: {remark}")
-                return 1
-        results = try_all(chosen, copies, most_s=options.seconds)
-    counts = {result: results.count(result) for result in ("red", "SURVIVED", "skipped", "left")}
-    print(
-        f"{counts['red']} of {len(results)} noticed, {counts['SURVIVED']} survived, {len(stale)} stale, "
-        f"{counts['skipped']} without their data, {counts['left']} left for want of time; {time.monotonic() - began:.0f} s"
-    )
-    return 1 if stale or counts["SURVIVED"] else 0
+        chosen = random.Random(options.seed).sample(chosen, min(options.sample, len(chosen)))
+        print(f"{len(chosen)} of {len(entries)} sabotages, drawn with --seed {options.seed}")
+    if stale or not chosen:
+        print(*(stale or ["no entry contains these words"]), sep="\n")
+        return 1
+    survived = 0
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for entry, result in zip(chosen, pool.map(result_of, chosen)):
+            print(f"{result:11}  {entry}", flush=True)
+            survived += result in ("SURVIVED", "DID NOT RUN")
+    return 1 if survived else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

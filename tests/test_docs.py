@@ -1,4 +1,4 @@
-"""The pages lead somewhere: links, files and names that they mention exist. And they are readable: sentences are short."""
+"""Links, files, modules and names that the pages mention exist."""
 
 from __future__ import annotations
 
@@ -20,10 +20,6 @@ FILE = re.compile(r"(?:python )?((?:\w[\w.-]*/)+[\w.-]+\.(?:py|md)|test_\w+\.py)
 OURS = re.compile(r"\b((?:benchmarks|docs|examples|femsense|meshes|scripts|tests)/[\w./-]+\.(?:py|md))\b")
 DOTTED = re.compile(r"femsense(?:\.\w+)+")
 NAME = re.compile(r"[A-Za-z_]\w*")
-NOT_PROSE = re.compile(r"^(?:    |\s*\||#).*$", re.MULTILINE)
-ENDS = re.compile(r"[.!?:;]+(?:\s|$)|\n\n|^\s*(?:[-*]|\d+\.) ", re.MULTILINE)
-MANY, TOO_MANY = 20, 40
-"""Words that half of the sentences of a page have at most, and all of them."""
 MEANT_BY_USERS = {"magnet.py"}
 """Files that an example of a page speaks of."""
 
@@ -49,12 +45,6 @@ def named_in_tables(text: str) -> list[tuple[str, str]]:
     """Return (file, name) of table rows that give a file of the package and names in it."""
     rows = (QUOTED.findall(line) for line in text.splitlines() if line.startswith("|"))
     return [(row[0], name) for row in rows if row and row[0].endswith(".py") for name in row[1:] if NAME.fullmatch(name)]
-
-
-def sentences_of(text: str) -> list[str]:
-    """Return the sentences of a page without code, tables and headings."""
-    prose = QUOTED.sub("code", NOT_PROSE.sub("\n", FENCED.sub("\n\n", text)))
-    return [" ".join(part.split()) for part in ENDS.split(prose) if part and part.split()]
 
 
 def exists(file: str, page: Path) -> bool:
@@ -128,15 +118,6 @@ def test_extras_that_a_text_names_exist(page: Path) -> None:
     assert extras_of(page.read_text(encoding="utf-8")) <= set(declared)
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in PAGES if p.name != "files.md"], ids=lambda p: p.stem
-)  # that one is made of the schema's own words
-def test_sentences_are_short(page: Path) -> None:
-    words = [(len(sentence.split()), sentence) for sentence in sentences_of(page.read_text(encoding="utf-8"))]
-    assert not [sentence for count, sentence in words if count > TOO_MANY]
-    assert sorted(count for count, _ in words)[len(words) // 2] <= MANY
-
-
 def test_the_architecture_shows_every_room() -> None:
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     rooms = [folder.name for folder in (ROOT / "femsense").iterdir() if (folder / "__init__.py").exists()]
@@ -161,11 +142,3 @@ def test_what_does_not_exist_is_found() -> None:
         "these",
     }
     assert "no_such" not in top_level_names(ROOT / "femsense/core/pose.py")
-
-
-def test_sentences_are_counted_without_code_tables_and_headings() -> None:
-    text = (
-        "# A heading\n\nIt is 3.5 mm: `a.b c`\nlong. Really?\n\n| a | table. Not |\n\n- one; two\n- three\n\n    x = y. "
-        "z\n\n```\ncode. x\n```\n"
-    )
-    assert sentences_of(text) == ["It is 3.5 mm", "code long", "Really", "one", "two", "three"]

@@ -64,6 +64,7 @@ COMMANDS: dict[str, Callable[..., Answer]] = {
     "simulate": data.simulate,
     "calibrate": sensing.calibrate,
     "estimate": sensing.estimate,
+    "live": sensing.live,
     "improve": loop.improve,
     "export": results.export,
     "reach": sensing.reach,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import femsense
-from femsense.app.input_checks import warn_of_clouds
+from femsense.app.input_checks import warn_of_pictures
 from femsense.calib.files import read_calibration
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside
@@ -67,7 +67,7 @@ def estimate_into(
 
     check_run_folder(folder)
     body, frames = load_robot(robot), load_recording(recording)
-    warn_of_clouds(body, frames)
+    warn_of_pictures(body, frames)
     given = None if calibration is None else read_calibration(calibration)
     inputs = run_inputs(body, frames, given, at=at, options=options)
     if not again and finished(folder, inputs):

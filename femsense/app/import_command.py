@@ -10,31 +10,21 @@ from typing import Any
 
 import femsense
 from femsense.core.errors import InputError
+from femsense.core.text import plain_name
+from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
-from femsense.io.importers.actuation import read_actuation_log
-from femsense.io.importers.csv_tables import header_of
+from femsense.io.importers.formats import FORMATS, format_of
 from femsense.io.importers.frames import UNITS, Options
-from femsense.io.importers.guess import guess_format, open_sources, split_name
-from femsense.io.importers.mapping import INPUT, kind_of_target, mappable
+from femsense.io.importers.guess import open_sources, split_name
+from femsense.io.importers.tables.actuation import read_actuation_log
+from femsense.io.importers.tables.csv_tables import header_of
+from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
 MANY_FRAMES = 1000
 """Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
-USELESS = {
-    "realsense": ("--rate", "--up", "--unit"),
-    "ros": ("--rate",),
-    "kinect": ("--clock", "--rate", "--up", "--unit", "--topic"),
-    "c3d": ("--clock", "--rate"),
-    "optitrack": ("--clock",),
-    "vicon": ("--clock",),
-    "csv": ("--clock", "--topic"),
-    "tum": ("--clock", "--rate", "--up", "--unit", "--topic"),
-    "redwood": ("--clock", "--up", "--unit", "--topic"),
-    "clouds": ("--clock", "--topic"),
-}
-"""Options that have no effect on a format; what else has none is said by its importer."""
 ENOUGH_FRAMES = 300
 """… and where a robot moves slowly, so many say as much."""
 
@@ -108,6 +98,7 @@ def import_into(
     Raises:
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
+    options = _spelt(options)
     _check_options(options, inputs, zero)
     check_target(folder, folder=True)
     final = followed(folder)
@@ -130,8 +121,14 @@ def import_into(
         replace=again,
         progress=progress,
     )
-    notes = [*source.notes, *_thinning(found, options), *_free(found, options), *_in_vain(found["format"], options)]
-    return {**found, "notes": notes, **_accepted(final, found)}
+    notes = [
+        *source.notes,
+        *(() if log is None else log.notes),
+        *_thinning(found, options),
+        *_free(found, options),
+        *_in_vain(found["format"], options),
+    ]
+    return {**found, "notes": notes}
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
@@ -180,7 +177,16 @@ def _in_vain(name: str, options: Options) -> tuple[str, ...]:
         "--unit": options.unit is not None,
         "--topic": bool(options.topics),
     }
-    return tuple(f"{key} has no effect: {name} has no use for it" for key in USELESS.get(name, ()) if said[key])
+    unused = FORMATS[name].unused if name in FORMATS else ()
+    return tuple(f"{key} has no effect: {name} has no use for it" for key in unused if said[key])
+
+
+def _spelt(options: Options) -> Options:
+    """Return the options with names in their composed form and the unit as it is usually written."""
+    unit = None if options.unit is None else length_unit(options.unit)
+    columns = {plain_name(old): plain_name(new) for old, new in options.columns.items()}
+    topics = tuple(map(plain_name, options.topics))
+    return replace(options, columns=columns, topics=topics, unit=options.unit if unit is None else unit.name)
 
 
 def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:
@@ -208,8 +214,8 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
     """
     of_log = mappable(header_of(log)[0])
     files = [path for _, path in map(split_name, paths)]
-    tables = [file for file in files if file.is_file() and guess_format(file) == "csv"]
-    shared = {name for file in tables for name in mappable(header_of(file)[0])}
+    known = [(file, format_of(file)) for file in files if file.is_file()]
+    shared = {name for file, one in known if one is not None and one.columns for name in mappable(list(one.columns(file)))}
     columns = {
         old: new for old, new in options.columns.items() if old not in of_log or (old in shared and kind_of_target(new) != INPUT)
     }
@@ -279,16 +285,3 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
         found=str(kept.get("identity", {}).get("source", ["?"])[0]),
         expected="a new place, or --again to replace it",
     )
-
-
-def _accepted(final: Path, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Say whether the other commands take the recording as it is."""
-    from femsense.io.recording_folder import load_recording
-
-    try:
-        load_recording(final)
-    except InputError as problem:
-        if not found.get("unlabelled_markers"):
-            raise
-        return {"not_ready": " ".join(str(problem).split())}
-    return {}

@@ -6,70 +6,19 @@ import warnings
 
 import numpy as np
 
-from femsense.core.errors import FemsenseError
-from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.calib.from_images import find_tags
+from femsense.core.arrays import FloatArray
+from femsense.io.clouds.cloud_checks import CLOUDS_READ, cloud_doubts, cloud_problems, doubts_of_cloud_poses, some_clouds
+from femsense.io.clouds.images import read_color
+from femsense.io.robot_tables import DICTIONARIES
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.pointcloud.cloud import PointCloud
-
-CLOUDS_READ = 3
-"""So many clouds of a recording are looked at."""
-FAR_CLOUD = 10.0
-"""Clouds that are farther away than this [m] in the median are more likely in centimetres or millimetres:
-depth cameras see less far."""
-OTHER_UNIT = 5.0
-"""Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
 
 
-def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[int, int, PointCloud]]:
-    """Return frame, view and cloud of some frames that have one and whose file can be read."""
-    r = recording
-    having = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
-    chosen = [having[i] for i in np.unique(np.linspace(0, len(having) - 1, most).astype(int))] if having else []
-    found = []
-    for k, v in chosen:
-        try:
-            cloud = read_frame_cloud(r, k, view=v)
-        except FemsenseError:
-            continue
-        found += [(k, v, cloud)] if cloud is not None else []
-    return found
-
-
-def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[str]:
-    """Return what is wrong with the extents of a recording's clouds, against its markers and the robot."""
-    clouds = some_clouds(recording)
-    where = f"{recording.folder / 'clouds' if recording.folder else 'clouds'}"
-    if not clouds:
-        return []
-    full = [(k, v, cloud) for k, v, cloud in clouds if len(cloud)]
-    if not full:
-        return [f"{where}: the clouds of {len(clouds)} frames that were read have no points"]
-    distance = float(np.median([np.median(np.linalg.norm(cloud.points, axis=1)) for _, _, cloud in full]))
-    seen = [_marker_distance(recording, k, v) for k, v, _ in full]
-    markers = float(np.median([d for d in seen if d is not None])) if any(d is not None for d in seen) else None
-    if markers is not None and not 1 / OTHER_UNIT < distance / markers < OTHER_UNIT:
-        return [
-            f"{where}: clouds {distance:.4g} m away, markers {markers:.4g} m: {_likely(distance / markers)}; clouds are in metres"
-        ]
-    if distance > FAR_CLOUD:
-        return [
-            (
-                f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds "
-                f"are in metres"
-            )
-        ]
-    extent = max(float(np.ptp(cloud.points, axis=0).max()) for _, _, cloud in full)
-    if robot is not None:
-        size = float(np.ptp(robot.body.mesh.nodes, axis=0).max())
-        if extent < 0.1 * size:
-            return [f"{where}: the clouds are {1e3 * extent:.4g} mm across, the robot {1e3 * size:.4g} mm: are they in metres?"]
-    return []
-
-
-def warn_of_clouds(robot: Robot, recording: Recording) -> None:
-    """Warn of clouds that cannot be the robot's as they are, and of colours that are missing."""
-    for text in cloud_problems(recording, robot=robot):
+def warn_of_pictures(robot: Robot, recording: Recording) -> None:
+    """Warn of clouds that cannot be the robot's as they are, of colours that are missing, and of tags of another dictionary."""
+    warn_of_tags(robot, recording)
+    for text in [*cloud_problems(recording, robot=robot), *cloud_doubts(recording), *doubts_of_cloud_poses(robot, recording)]:
         warnings.warn(text, stacklevel=3)
     clouds = some_clouds(recording)
     if robot.color_rgb is not None and clouds and all(cloud.colors is None for _, _, cloud in clouds):
@@ -78,20 +27,34 @@ def warn_of_clouds(robot: Robot, recording: Recording) -> None:
         warnings.warn(f"{where}: {text}, and contacts found by clouds are doubtful", stacklevel=3)
 
 
+def warn_of_tags(robot: Robot, recording: Recording) -> None:
+    """Warn where none of the robot's tags is in the colour images that are looked at, with the dictionary that has them there."""
+    numbers = {look.aruco_id for look in robot.marker_looks} - {None}
+    images = _some_colors(recording) if numbers else []
+    if not images or any(numbers & _tags(image, robot.aruco_dictionary) for image in images):
+        return
+    listed = ", ".join(str(number) for number in sorted(number for number in numbers if number is not None))
+    text = f"none of the tags {listed} of {robot.aruco_dictionary} is in the {len(images)} colour images that were looked at"
+    best = max(DICTIONARIES, key=lambda name: sum(len(numbers & _tags(image, name)) for image in images))
+    found = set().union(*(numbers & _tags(image, best) for image in images))
+    other = f"; tags of {best} with {len(found)} of these numbers are: appearance.aruco_dictionary?" if found else ""
+    warnings.warn(f"{recording.folder or 'the recording'}: {text}{other}", stacklevel=3)
+
+
+def _some_colors(recording: Recording) -> list[FloatArray]:
+    """Return some colour images, shape (H, W, 3) in 0 … 1."""
+    files = [file for files in recording.color_files for file in files if file is not None]
+    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, CLOUDS_READ).astype(int))] if files else []
+    return [read_color(file) for file in chosen]
+
+
+def _tags(image: FloatArray, dictionary: str) -> set[int | None]:
+    return {number for number, _ in find_tags(image, dictionary)}
+
+
 def warn_of_markers(robot: Robot, recording: Recording) -> None:
     """Warn of markers of the robot that are seen in no frame."""
     seen = {recording.marker_names[i] for i in recording.marker_index if i >= 0} - {""}
     unseen = [name for name in robot.marker_names if name not in seen]
     if seen and unseen:
         warnings.warn(f"markers of the robot that are seen in no frame: {', '.join(unseen)}", stacklevel=3)
-
-
-def _marker_distance(recording: Recording, k: int, view: int) -> float | None:
-    mine = (recording.marker_frame == k) & (recording.marker_view == view)
-    return float(np.median(np.linalg.norm(recording.marker_xyz[mine], axis=1))) if mine.any() else None
-
-
-def _likely(ratio: float) -> str:
-    names = {1e3: "are they in millimetres?", 1e2: "are they in centimetres?", 39.37: "are they in inches?"}
-    nearest = min(names, key=lambda factor: abs(np.log(ratio / factor)))
-    return names[nearest] if abs(np.log(ratio / nearest)) < 0.8 else "are they in another unit?"

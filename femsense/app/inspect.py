@@ -28,7 +28,8 @@ from femsense.core.errors import FemsenseError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import check_no_pipe, plain
-from femsense.io.importers.ros_bag import content_ending
+from femsense.io.importers.formats import CAPTURE_ENDINGS
+from femsense.io.importers.ros.bag import content_ending
 from femsense.io.mesh_files import SURFACE_ENDINGS
 from femsense.io.meshes.reading import file_format
 from femsense.io.meshing.cad import CAD_READ
@@ -56,7 +57,6 @@ MESH_ENDINGS = (
     ".med",
     ".vol",
 )
-CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".mkv", ".gz")
 
 
 def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:
@@ -93,13 +93,13 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
 
 def _compare(target: Path, report: Report, robot: str | Path) -> None:
     """Compare a recording with a robot. Raises InputError where it does not fit."""
-    from femsense.app.input_checks import warn_of_clouds, warn_of_markers
+    from femsense.app.input_checks import warn_of_markers, warn_of_pictures
 
     if report["kind"] != "recording":
         raise InputError("--robot is about recordings", where=target, found=report["kind"], expected="a recording")
     loaded, body = load_recording(target), load_robot(robot)
     check_against(body, loaded)
-    warn_of_clouds(body, loaded)
+    warn_of_pictures(body, loaded)
     warn_of_markers(body, loaded)
     report["robot"] = body.name
     report["force_resolution"] = _resolution(body, loaded)
@@ -251,6 +251,8 @@ def _kind_of_file(file: Path) -> tuple[str, Inspector]:
         ".jpeg": ("image", inspect_jpeg),
         ".png": ("image", inspect_image),
         ".csv": ("table", inspect_table),
+        ".tsv": ("table", inspect_table),
+        ".txt": ("table", inspect_table),
     }
     return others.get(ending, ("unknown", inspect_unknown))
 

@@ -34,8 +34,22 @@ def check_pose(T: npt.ArrayLike, name: str) -> FloatArray:
             where=name,
             found=f"|R Rᵀ − I| = {off:.2g}, det R = {np.linalg.det(pose[:3, :3]):.3g}, last row {pose[3].tolist()}",
             expected="a rotation (det +1), and a last row 0 0 0 1",
+            hint=_pose_hint(pose),
         )
     return pose
+
+
+def _pose_hint(pose: FloatArray) -> str | None:
+    """Return the usual reason why a matrix (4, 4) is no rigid transform; None where it is another."""
+    R = pose[:3, :3]
+    scale = float(np.cbrt(abs(np.linalg.det(R))))
+    if not pose[:3, 3].any() and pose[3, :3].any():
+        return "it is transposed: the translation stands in the last column"
+    if scale > 0.0 and np.allclose(R @ R.T, scale**2 * np.eye(3), atol=1e-3 * scale**2):
+        if np.linalg.det(R) < 0:
+            return "an axis is mirrored: left-handed coordinates, as Unity has them?"
+        return f"the rotation is scaled by {scale:.4g}: the unit belongs to the translation alone"
+    return None
 
 
 def invert_pose(T_a_b: FloatArray) -> FloatArray:

@@ -1,9 +1,22 @@
-"""Words in messages: what was meant, cut to a width, and where in a document."""
+"""Words in messages and names in files: what was meant, cut to a width, where in a document, and one spelling for a name."""
 
 from __future__ import annotations
 
 import difflib
+import re
+import unicodedata
 from collections.abc import Iterable, Sequence
+
+_INVISIBLE = "\0\ufeff\u200b\u200c\u200d\u2060"
+"""NUL pads the names of C3D files; the others have no width and come along when text is copied."""
+
+
+def plain_name(text: str) -> str:
+    """Return a name in its composed form (Unicode NFC), one blank for each run of blanks, without padding at its ends.
+
+    macOS and some exports write é as two characters; both spellings are one name.
+    """
+    return re.sub(r"[^\S\t\r\n]+", " ", unicodedata.normalize("NFC", text)).strip().strip(_INVISIBLE + " \t\r\n")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from pathlib import Path
@@ -82,7 +83,11 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
 
     where = where or str(path)
     try:
-        surface: Any = trimesh.load_mesh(str(path), process=False)  # else triangles that are not finite would leave holes
+        source = _with_points(path, where)
+        kind = path.suffix.lower().removeprefix(".") if source is not None else None
+        surface: Any = trimesh.load_mesh(
+            source or str(path), file_type=kind, process=False
+        )  # not finite triangles would leave holes
         points, triangles = np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
     except Exception as error:
         raise InputError(
@@ -96,6 +101,27 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
         raise _no_triangles(path, where)
     check_finite(points, where)
     return merged(points, triangles)
+
+
+NUMBERS = re.compile(rb"[-+]?\d*,?\d+(?:[eE][-+]?\d+)?")
+
+
+def _with_points(path: Path, where: str) -> io.BytesIO | None:
+    """Return a text file whose coordinates have decimal commas with points in their place, with a warning; None for any other file."""
+    data = path.read_bytes()
+    if b"\0" in data[:1024] or not re.search(rb"\d,\d", data[:65536]):
+        return None
+    changed, first = [], 0
+    for number, line in enumerate(data.splitlines(), start=1):
+        words = [word for word in line.split() if word[:1] in b"+-,.0123456789"]
+        named = line.lower().startswith((b"solid", b"endsolid", b"#", b"g ", b"o ", b"comment"))
+        commas = not named and len(words) > 1 and any(b"," in w for w in words) and all(NUMBERS.fullmatch(w) for w in words)
+        first = first or (number if commas else 0)
+        changed.append(re.sub(rb"(?<=\d),(?=\d)|(?<![\w,.]),(?=\d)", b".", line) if commas else line)
+    if not first:
+        return None
+    warnings.warn(f"{where}: decimal commas from line {first} on are read as points", stacklevel=4)
+    return io.BytesIO(b"\n".join(changed) + b"\n")
 
 
 def _no_triangles(path: Path, where: str) -> InputError:

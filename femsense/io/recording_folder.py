@@ -12,6 +12,7 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
+from femsense.core.units import PER_METRE
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
@@ -28,7 +29,6 @@ from femsense.io.recording_tables import (
 )
 from femsense.io.recording_toml import (
     LENS_KEYS,
-    PER_METRE,
     RecordingTable,
     recording_document,
     table_problems,

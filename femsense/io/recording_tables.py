@@ -16,6 +16,7 @@ from femsense.io.files import write_csv
 from femsense.io.lost_markers import is_a_place
 from femsense.io.recording_columns import columns
 from femsense.io.tables import Table, read_csv
+from femsense.model.plausibility import RANGES
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Drives, LoadRows, MarkerRows, RestMarkers, Timeline, UnnamedRows
 
@@ -47,12 +48,17 @@ def read_frames(path: Path, actuation: str, actuation_zero: str) -> tuple[Timeli
     inputs = table.numbers(cables)
     if actuation == "displacement" and inputs.size and np.abs(inputs).max() > TOO_LONG:
         row, column = np.argwhere(np.abs(inputs) > TOO_LONG)[0]
+        worst = float(np.abs(inputs).max())
+        likely = 1e-3 * worst <= RANGES.displacement_m
         raise InputError(
-            "a cable displacement of this size looks like millimetres",
+            "a cable displacement of this size looks like millimetres"
+            if likely
+            else "a cable displacement of this size is no length",
             where=table.place(row, cables[column]),
             found=f"{inputs[row, column]:g} m",
             expected="metres",
-            hint="divide the column by 1000",
+            hint=("divide the column by 1000; or " if likely else "")
+            + f"ticks, degrees or steps of a motor? femsense import --map NAME={cables[column]}*FACTOR says metres in one of them",
         )
     timeline = Timeline(
         time_s,

@@ -13,14 +13,14 @@ from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
 from femsense.core.text import key_path
+from femsense.core.units import PER_METRE
 from femsense.io.mesh_files import read_surface
-from femsense.io.tables import Schema, schema_problems
+from femsense.io.tables import LengthUnit, Schema, beside, schema_problems
 from femsense.model.camera import Camera, CameraNoise
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
 
 FORMAT = "femsense-recording-1"
-PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 LENS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 # The tables of recording.toml
@@ -70,9 +70,7 @@ class ToolTable(Schema):
     mesh: Annotated[str, Field(min_length=1)] | None = Field(
         None, description="a closed surface beside recording.toml, with unit"
     )
-    unit: Literal["m", "cm", "mm"] | None = Field(
-        None, description='unit = "m", "cm" or "mm": of the coordinates in the mesh file'
-    )
+    unit: LengthUnit | None = Field(None, description='unit = "m", "cm" or "mm": of the coordinates in the mesh file')
 
     @model_validator(mode="after")
     def _is_one_shape(self) -> ToolTable:
@@ -232,15 +230,15 @@ def _camera(name: str, table: CameraTable) -> Camera | None:
 
 def tools_of(table: RecordingTable, path: Path) -> tuple[Tool, ...]:
     """Return the tools, their meshes read. Raises InputError where a mesh is missing, broken or open."""
-    return tuple(_tool(tool, f"{path}: tools[{i}].mesh", path.parent) for i, tool in enumerate(table.tools))
+    return tuple(_tool(tool, f"{path}: tools[{i}].mesh", path) for i, tool in enumerate(table.tools))
 
 
-def _tool(table: ToolTable, where: str, folder: Path) -> Tool:
+def _tool(table: ToolTable, where: str, path: Path) -> Tool:
     if table.radius_m is not None:
         return Tool(table.name, "ball", table.radius_m)
     if table.cylinder is not None:
         return Tool(table.name, "cylinder", table.cylinder.radius_m, table.cylinder.length_m)
-    file, unit = folder / str(table.mesh), str(table.unit)
+    file, unit = beside(path, str(table.mesh)), str(table.unit)
     points, triangles = read_surface(file, where=where)
     mesh = freeze(points / PER_METRE[unit])
     return Tool(table.name, "mesh", points=mesh, triangles=freeze(triangles, np.int64), mesh_file=file.absolute(), mesh_unit=unit)

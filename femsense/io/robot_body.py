@@ -14,6 +14,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, transform_points
+from femsense.core.units import PER_METRE
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.body_parts import Cable, Chamber
 from femsense.fem.cavities import check_chambers, find_chamber
@@ -21,12 +22,21 @@ from femsense.fem.mesh import TetMesh, embed_points, to_linear, to_quadratic
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.mesh_files import read_tets
 from femsense.io.regions import regional
-from femsense.io.robot_tables import CableTable, ChamberTable, FixedTable, MarkerTable, MeshTable, RobotTable, at_key
+from femsense.io.robot_tables import (
+    CableTable,
+    ChamberTable,
+    FixedTable,
+    MarkerTable,
+    MeshTable,
+    RobotTable,
+    at_key,
+    plain_dictionary,
+)
+from femsense.io.tables import beside
+from femsense.model.body_doubts import doubts_of_body
+from femsense.model.plausibility import warn_of
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
-"""Dividing by these rounds once: 35 mm become the same number as 0.035."""
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
 """A body that is smaller or larger across than this [m] has another unit than declared."""
 FAR_CABLE = 0.25
@@ -44,7 +54,7 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
     declared = read_declared_mesh(table.mesh, path)
     mesh = with_element(declared, table.mesh.element)
     clamped = clamped_nodes(mesh, table.fixed, path)
-    file, material = path.parent / table.mesh.file, table.material
+    file, material = beside(path, table.mesh.file), table.material
     moduli, ratios = regional(mesh, table.regions, file, path, material.young_modulus_pa, material.poisson_ratio)
     body = make_body(
         mesh,
@@ -64,6 +74,7 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
             hint='straight edges: element = "tet4", or a linear mesh',
         )
     _check_units(table, path)
+    warn_of((f"{path}: {doubt}" for doubt in doubts_of_body(body)), stacklevel=4)
     points = _marker_points(mesh, table.markers, path)
     color = table.appearance.color_rgb
     return Robot(
@@ -79,13 +90,13 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
         document=copy.deepcopy(document),
         folder=path.parent.absolute(),
         marker_looks=_marker_looks(table.markers),
-        aruco_dictionary=table.appearance.aruco_dictionary,
+        aruco_dictionary=plain_dictionary(table.appearance.aruco_dictionary),
     )
 
 
 def read_declared_mesh(table: MeshTable, path: Path) -> TetMesh:
     """Return the mesh of the file in metres, in the robot frame, checked. Raises InputError."""
-    file = path.parent / table.file
+    file = beside(path, table.file)
     where = f"{path}: mesh.file {table.file}"
     raw = read_tets(file, where=where)
     nodes = raw.nodes / PER_METRE[table.unit]
@@ -135,8 +146,8 @@ def mesh_diagonal(nodes: FloatArray) -> float:
 
 def likely_unit(size: float) -> str | None:
     """Return the unit that makes a body of this size, in the unit of its file, most like a robot; None where none does."""
-    fits = [name for name, scale in UNITS.items() if SMALLEST_BODY <= size * scale <= LARGEST_BODY]
-    return min(fits, key=lambda name: abs(np.log(size * UNITS[name] / 0.2)), default=None)
+    fits = [name for name, count in PER_METRE.items() if SMALLEST_BODY <= size / count <= LARGEST_BODY]
+    return min(fits, key=lambda name: abs(np.log(size / PER_METRE[name] / 0.2)), default=None)
 
 
 def _empty_box(mesh: TetMesh, low: FloatArray, high: FloatArray, where: str) -> InputError:
@@ -164,14 +175,14 @@ def _check_size(nodes: FloatArray, unit: str, path: Path) -> None:
     size = float(np.ptp(nodes, axis=0).max())
     if SMALLEST_BODY <= size <= LARGEST_BODY:
         return
-    raw = size / UNITS[unit]
+    raw = size * PER_METRE[unit]
     best = likely_unit(raw)
     raise InputError(
         "the body has an unlikely size",
         where=at_key(path, "mesh", "unit"),
         found=f"{size:.3g} m across with unit = {unit!r}",
         expected="between 1 mm and 20 m",
-        hint=f"unit = {best!r} gives {raw * UNITS[best]:.3g} m" if best else "scale the mesh file",
+        hint=f"unit = {best!r} gives {raw / PER_METRE[best]:.3g} m" if best else "scale the mesh file",
     )
 
 

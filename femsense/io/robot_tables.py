@@ -14,7 +14,7 @@ from femsense.core.pose import check_pose
 from femsense.core.text import did_you_mean, key_path, short
 from femsense.io.materials import POISSON_RATIO, silicone
 from femsense.io.regions import RegionTable
-from femsense.io.tables import Schema, schema_problems
+from femsense.io.tables import LengthUnit, Schema, schema_problems
 from femsense.model.effects import EFFECT_NAMES
 
 FORMAT = "femsense-robot-1"
@@ -29,7 +29,7 @@ POINT = "three numbers in metres [x, y, z]"
 
 class MeshTable(Schema):
     file: Annotated[str, Field(min_length=1, description="the mesh file beside robot.toml")]
-    unit: Literal["m", "cm", "mm"] = Field(description='unit = "m", "cm" or "mm": the unit of the coordinates in the mesh file')
+    unit: LengthUnit = Field(description='unit = "m", "cm" or "mm": the unit of the coordinates in the mesh file')
     element: Literal["tet4", "tet10"] = Field(description='element = "tet4" or "tet10"')
     T_robot_mesh: Matrix | None = Field(None, description="4 rows of 4 numbers: a rotation and a translation in metres")
 
@@ -176,12 +176,39 @@ def table_problems(table: RobotTable, path: Path) -> list[InputError]:
         problems += _cable_problems(cable, i, path)
     for i, entry in enumerate(table.effects):
         problems += _effect_problems(entry, i, path)
+    problems += _dictionary_problems(table.appearance.aruco_dictionary, path)
     if table.mesh.T_robot_mesh is not None:
         try:
             check_pose(table.mesh.T_robot_mesh, at_key(path, "mesh", "T_robot_mesh"))
         except InputError as problem:
             problems.append(problem)
     return problems
+
+
+DICTIONARIES = (
+    *(f"{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "ARUCO_ORIGINAL",
+    "ARUCO_MIP_36h12",
+    "APRILTAG_16h5",
+    "APRILTAG_25h9",
+    "APRILTAG_36h10",
+    "APRILTAG_36h11",
+)
+"""Dictionaries of tags, as OpenCV names them without DICT_."""
+
+
+def plain_dictionary(name: str) -> str:
+    """Return the name of a dictionary of tags without OpenCV's DICT_, its letters as OpenCV has them."""
+    bare = name.strip().upper().removeprefix("DICT_")
+    return next((known for known in DICTIONARIES if known.upper() == bare), name)
+
+
+def _dictionary_problems(name: str, path: Path) -> list[InputError]:
+    if plain_dictionary(name) in DICTIONARIES:
+        return []
+    where = at_key(path, "appearance", "aruco_dictionary")
+    hint = did_you_mean(name, DICTIONARIES)
+    return [InputError("unknown dictionary of tags", where=where, found=repr(name), expected=" | ".join(DICTIONARIES), hint=hint)]
 
 
 def _double_names(kind: str, names: Sequence[str], path: Path) -> list[InputError]:

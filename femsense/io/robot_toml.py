@@ -23,7 +23,7 @@ from femsense.io.files import plain, write_beside, write_toml
 from femsense.io.mesh_files import mesh_companions, write_mesh
 from femsense.io.robot_body import build_robot, nodes_within
 from femsense.io.robot_tables import FORMAT, RobotTable, at_key, robot_problems, table_problems
-from femsense.io.tables import read_toml, validated
+from femsense.io.tables import beside, read_toml, validated
 from femsense.model.robot import MarkerLook, Robot, plain_actuation
 
 # Loading
@@ -51,7 +51,7 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
     if not effects:
         return robot
     robot = _with_effects(robot, [dict(entry) for entry in table.effects], path)
-    return robot if table.correction is None else replace(robot, correction=read_correction(path.parent / table.correction.file))
+    return robot if table.correction is None else replace(robot, correction=read_correction(beside(path, table.correction.file)))
 
 
 def find_robot(path_or_name: str | Path) -> Path:
@@ -145,7 +145,7 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
         if "file" in entry:
             entry["file"] = _copy_effect(entry, robot, target)
     if robot.document is not None and robot.folder is not None:
-        document["mesh"]["file"] = _copy_mesh(robot.folder / document["mesh"]["file"], target)
+        document["mesh"]["file"] = _copy_mesh(beside(robot.folder / "robot.toml", document["mesh"]["file"]), target)
     else:
         write_mesh(robot.body.mesh, target / document["mesh"]["file"])
     write_toml(target / "robot.toml", document)

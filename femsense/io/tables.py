@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import tomllib
 import types
 import typing
+import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.core.text import did_you_mean, key_path, short
+from femsense.core.text import did_you_mean, key_path, plain_name, short
+from femsense.core.units import PER_METRE, length_unit
+
+
+def _usual_unit(value: object) -> object:
+    """Return a unit of length as it is usually written (MM and Millimeters are mm); anything else as it is."""
+    unit = length_unit(value, allowed=PER_METRE) if isinstance(value, str) else None
+    return value if unit is None else unit.name
+
+
+LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
+"""A unit of lengths in files, in any spelling."""
 
 
 class Schema(BaseModel):
@@ -26,7 +39,7 @@ class Schema(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-SchemaType = TypeVar("SchemaType", bound=Schema)
+T = TypeVar("T")
 
 
 # TOML
@@ -34,18 +47,74 @@ SchemaType = TypeVar("SchemaType", bound=Schema)
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the document of a TOML file. Raises InputError with line and column."""
+    text = read_text(path)
     try:
-        return tomllib.loads(read_text(path))
+        document: dict[str, Any] = _composed("", tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
+        hint = "text needs quotes; a [table] goes on until the next one"
+        if "\\" in str(error) or "escape" in str(error).lower() or "hex" in str(error).lower():
+            hint = "a backslash begins an escape: write paths with / or in single quotes"
+        if re.search("[“”„‘’]", text):
+            hint = "typographic quotes are no quotes in TOML: write straight ones"
+        raise InputError("not valid TOML", where=path, found=str(error), hint=hint) from None
+    return document
+
+
+FILE_KEYS = ("file", "mesh")
+"""Keys whose texts are paths: names of files stay as they are written."""
+
+
+def _composed(key: str, value: Any) -> Any:
+    """Return a document with its texts in Unicode's composed form (NFC), but for paths."""
+    if isinstance(value, dict):
+        return {unicodedata.normalize("NFC", name): _composed(name, item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_composed(key, item) for item in value]
+    return unicodedata.normalize("NFC", value) if isinstance(value, str) and key not in FILE_KEYS else value
+
+
+def beside(path: Path, name: str) -> Path:
+    """Return the file that a document at `path` names, relative to its folder; é in either spelling finds it.
+
+    Raises:
+        InputError: the name holds a tab or a line feed, or the backslashes of another system, and there is no such file.
+    """
+    file = path.parent / name
+    if file.exists():
+        return file
+    odd = sorted(
+        {
+            {"\t": "\\t", "\n": "\\n", "\r": "\\r", "\f": "\\f", "\b": "\\b"}.get(c, "a control character")
+            for c in name
+            if ord(c) < 32
+        }
+    )
+    if odd:
         raise InputError(
-            "not valid TOML", where=path, found=str(error), hint="text needs quotes; a [table] goes on until the next one"
-        ) from None
+            "a path with control characters",
+            where=path,
+            found=repr(name),
+            expected="the name of a file",
+            hint=f"{' and '.join(odd)} in double quotes is no part of a path: write / for the backslash, or single quotes",
+        )
+    if "\\" in name:
+        raise InputError(
+            "a path with backslashes, which name no folders on this system",
+            where=path,
+            found=name,
+            expected=name.replace("\\", "/"),
+            hint="write / between folders: every system reads that",
+        )
+    same = plain_name(file.name)
+    around = file.parent.iterdir() if file.parent.is_dir() else ()
+    return next((other for other in around if plain_name(other.name) == same), file)
 
 
 def read_text(path: Path) -> str:
     """Return a text file's content without a byte order mark. Raises InputError."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        data = path.read_bytes()
+        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError as error:
         if kind := _known_binary(path):
             raise InputError("not a text file", where=path, found=kind, expected="a text file in UTF-8") from None
@@ -75,25 +144,25 @@ def _known_binary(path: Path) -> str | None:
     return found or ("bytes that are no text" if b"\0" in head else None)
 
 
-def validated(schema: type[SchemaType], document: dict[str, Any], path: Path) -> SchemaType:
-    """Return the checked document. Raises the first InputError of `schema_problems`."""
+def validated(schema: type[T], document: Any, path: Path) -> T:
+    """Return the checked document of a schema or dataclass. Raises the first InputError of `schema_problems`."""
     problems = schema_problems(schema, document, path)
     if problems:
         raise problems[0]
-    return schema.model_validate(document)
+    return TypeAdapter(schema).validate_python(document)
 
 
-def schema_problems(schema: type[Schema], document: dict[str, Any], path: Path) -> list[InputError]:
+def schema_problems(schema: type[Any], document: Any, path: Path) -> list[InputError]:
     """Return what is wrong with a document, unknown keys first (a misspelt key also shows as a missing one)."""
     try:
-        schema.model_validate(document)
+        TypeAdapter(schema).validate_python(document)
     except ValidationError as error:
         found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
         return [_problem(schema, item, path) for item in found]
     return []
 
 
-def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
+def _problem(schema: type[Any], item: Any, path: Path) -> InputError:
     """Translate one finding of pydantic."""
     location = tuple(item["loc"])
     where = f"{path}: {key_path(location)}" if location else str(path)
@@ -119,12 +188,12 @@ def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
     return InputError(what, where=where, found=short(item["input"]), expected=expected)
 
 
-def _keys_at(schema: type[Schema], location: Sequence[int | str]) -> Iterable[str]:
+def _keys_at(schema: type[Any], location: Sequence[int | str]) -> Iterable[str]:
     inner = _annotation_at(schema, location)
     return inner.model_fields if isinstance(inner, type) and issubclass(inner, BaseModel) else ()
 
 
-def _description_at(schema: type[Schema], location: Sequence[int | str]) -> str | None:
+def _description_at(schema: type[Any], location: Sequence[int | str]) -> str | None:
     """Return what the schema says of the innermost described key of a place."""
     description: str | None = None
     for i, part in enumerate(location):
@@ -184,9 +253,19 @@ class Table:
         return Table(self.path, self.columns, tuple(self.cells[i] for i in kept), tuple(self.lines[i] for i in kept))
 
     def text(self, column: str) -> tuple[str, ...]:
-        """Return a column as text without blanks at the ends."""
+        """Return a column as text in its composed form, without blanks and other padding at the ends.
+
+        Raises:
+            InputError: control characters within a cell.
+        """
         index = self.columns.index(column)
-        return tuple(row[index].strip() for row in self.cells)
+        cells = tuple(plain_name(row[index]) for row in self.cells)
+        bad = next((i for i, cell in enumerate(cells) if not cell.isprintable()), None)
+        if bad is not None:
+            raise InputError(
+                "control characters in a cell", where=self.place(bad, column), found=repr(cells[bad]), expected="plain text"
+            )
+        return cells
 
     def numbers(self, columns: Sequence[str], *, empty_is_nan: bool = False) -> FloatArray:
         """Return columns as finite numbers, shape (rows, columns). Raises InputError with line and column."""
@@ -251,7 +330,7 @@ def read_csv(path: Path, *, required: Sequence[str], optional: Sequence[str] = (
     rows = [(reader.line_num, tuple(row)) for row in reader if any(cell.strip() for cell in row)]
     if not rows:
         raise InputError("the file is empty", where=path, expected=f"a header: {','.join(required)}")
-    columns = tuple(cell.strip() for cell in rows[0][1])
+    columns = tuple(plain_name(cell) for cell in rows[0][1])
     _check_header(path, columns, required, optional, prefixes)
     for line, row in rows[1:]:
         if len(row) != len(columns):

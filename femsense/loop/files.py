@@ -14,6 +14,8 @@ from femsense.io.own_files import LOOP
 from femsense.io.provenance import recording_input, robot_input, versions
 from femsense.io.result_folder import check_folder, read_document, results_folder
 from femsense.io.robot_toml import robot_document, save_robot
+from femsense.io.tables import validated
+from femsense.loop.result.loop_result import SavedLoop
 
 if TYPE_CHECKING:
     from femsense.loop.result.loop_result import LoopResult
@@ -85,3 +87,8 @@ def read_loop(path: str | Path) -> dict[str, Any]:
     """Return the content of loop.json (or of the one in a folder). Raises InputError."""
     file = Path(path).expanduser()
     return read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)
+
+
+def saved_loop(document: Mapping[str, Any], file: str | Path = "loop.json") -> SavedLoop:
+    """Return the content of loop.json as its types. Raises InputError, with the key and what was found, where it is broken."""
+    return validated(SavedLoop, document, Path(file))

@@ -9,18 +9,15 @@ import numpy as np
 
 from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
-from femsense.core.text import did_you_mean
+from femsense.core.text import did_you_mean, plain_name
 from femsense.fem.mesh import embed_points
 from femsense.model.marker_units import check_marker_distances
+from femsense.model.plausibility import doubts_of_recording, place_of, warn_of
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.recording_parts import RestMarkers
 from femsense.model.robot import Robot
 from femsense.model.stale_markers import without_far_markers, without_stale_markers, without_twins
 
-SLOW = 5.0
-"""Frames that are farther apart than this [s] are more likely counted in milliseconds: cameras take 5 to 90 a second."""
-LONG_PULL = 0.5
-"""A cable that moves farther than this [m] is more likely given in millimetres or centimetres."""
 FAR_LOAD = 0.25
 """A known load farther from the body than this times the mesh's diagonal is an error."""
 
@@ -36,42 +33,20 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
         DataError: markers in another unit.
     """
     diagonal = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
-    measured = without_far_markers(without_stale_markers(without_twins(recording)), diagonal)
+    measured = without_far_markers(without_stale_markers(without_twins(_composed(recording))), diagonal)
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, measured)))
     check_marker_distances(robot, fitted)
     _check_loads(robot, fitted)
     _check_displacements(robot, fitted)
     _warn_of_inputs(robot, fitted)
-    warn_of_values(fitted)
+    warn_of(doubts_of_recording(fitted, robot))
     return fitted
 
 
-def warn_of_values(recording: Recording) -> None:
-    """Warn of times, displacements and signs that can be computed with but are hardly meant."""
-    r, where = recording, place_of(recording, "frames.csv", "inputs")
-    steps = np.diff(r.time_s)
-    if len(steps) and np.median(steps) > SLOW:
-        column = "the column time_s" if r.folder else "time_s"
-        text = f"one frame every {np.median(steps):.4g} s by {column}; is it in milliseconds?"
-        warnings.warn(f"{place_of(r, 'frames.csv', 'time_s')}: {text}", stacklevel=3)
-    if r.actuation != "displacement":
-        return
-    for name, pulled in zip(r.cable_names, r.inputs.T):
-        longest = float(np.abs(pulled).max(initial=0.0))
-        if longest > LONG_PULL:
-            text = f"cable {name!r} moves by up to {longest:.4g} m; are displacements in millimetres?"
-            warnings.warn(f"{where}: {text}", stacklevel=3)
-        back, forth = int((pulled < 0).sum()), int((pulled > 0).sum())
-        if r.actuation_zero == "absolute" and back > forth:
-            text = (
-                f"cable {name!r} is slack in {len(pulled) - forth} of {len(pulled)} frames, its displacement below zero in {back}"
-            )
-            warnings.warn(f"{where}: {text}; is the sign right? > 0 shortens", stacklevel=3)
-
-
-def place_of(recording: Recording, file: str, argument: str) -> str:
-    """Return where a part of a recording stands: in a file of its folder, or, made of arrays, in an argument of `from_arrays`."""
-    return str(recording.folder / file) if recording.folder else f"Recording.from_arrays, {argument}"
+def _composed(recording: Recording) -> Recording:
+    """Return the recording with its names in their composed form: é is one name, however it is spelt."""
+    names = {key: tuple(map(plain_name, getattr(recording, key))) for key in ("marker_names", "cable_names", "chamber_names")}
+    return replace(recording, **names)  # type: ignore[arg-type]
 
 
 def in_frames(recording: Recording) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.pointcloud.objects import euclidean_clusters
 from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
@@ -27,6 +27,8 @@ FITS = 4.0
 """Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
 SIMPLER = 1.15
 """A shape with more parameters has to leave so much less to be taken."""
+LEAST_SCATTER = 0.1
+"""Variance of the scatter of an object's points about its shape, relative to the noise that is stated, at least."""
 ROUGH_STD = 0.006
 """How far the closest visible points are off where no shape fits [m] (METHODS section 3)."""
 LARGEST = 0.1
@@ -129,6 +131,7 @@ def find_shapes(
     local_m: float,
     fit: Fit | None = None,
     edge: FloatArray | None = None,
+    halo: BoolArray | None = None,
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -140,25 +143,44 @@ def find_shapes(
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
         fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
         edge: how far off the surface a camera may have put points of its edge [m], shape (o,): what lies within that is no object.
+        halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
     """
     fit = fit or fit_shape
     result: list[Shape] = []
     left = _groups(points, std)
     while left:
         group, left = left[0], left[1:]
-        own = near[group]
-        close = group[own <= own.min() + local_m]
-        if len(close) < 3 or (edge is not None and is_edge(own, edge[group])):
+        gap = near[group]
+        close = group[gap <= gap.min() + local_m]
+        if (
+            len(close) < 3
+            or (edge is not None and is_edge(gap, edge[group]))
+            or (halo is not None and halo[group].mean() > 1.0 - OUTLIERS)
+        ):
             continue
-        shape = fit(points[close], std[close], origins[close])
+        own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
+        shape = _completed(fit, points[close], std[close], origins[close], own)
         # the other end of a rod that passes behind, the table in pieces
         more = [g for g in left if shape.holds(points[g], std[g])]
         if more:
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])
-            shape = fit(points[close], std[close], origins[close])
+            own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
+            shape = _completed(fit, points[close], std[close], origins[close], own)
         result.append(shape if edge is None else replace(shape, edge_m=float(np.median(edge[close]))))
     return result
+
+
+def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArray, own: BoolArray) -> Shape:
+    """Return the shape of an object from its own points, not from what a camera adds around the silhouette of a body.
+
+    Stereo matching widens a silhouette by one to three pixels, with the colour of what is behind it and a depth in between: next to a finger that
+    touches, these points hang together with its own.
+    """
+    if own.sum() < FEWEST:
+        return _raw(points, std)
+    shape = fit(points[own], std[own], origins[own])
+    return shape if shape.kind != "points" else _raw(points, std)
 
 
 def is_edge(gap: FloatArray, edge: FloatArray | float) -> bool:
@@ -180,8 +202,8 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
         return _raw(points, std)
     least = min(cost for cost, _ in good)
     order = ("plate", "sphere", "cylinder")
-    fitting = [shape for cost, shape in good if cost <= SIMPLER * least + 0.02]
-    return min(fitting, key=lambda shape: order.index(shape.kind))
+    fitting = [(cost, shape) for cost, shape in good if cost <= SIMPLER * least + 0.02]
+    return _as_well_as_it_fits(*min(fitting, key=lambda fit: order.index(fit[1].kind)))
 
 
 def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m: float) -> tuple[float, Shape | None]:
@@ -193,7 +215,12 @@ def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m:
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     thin = slice(None, None, max(1, len(points) // MOST_POINTS))
     cost, shape = _sphere(points[thin], std[thin], ray[thin], radius_m)
-    return cost, shape if cost < FITS else None
+    return cost, _as_well_as_it_fits(cost, shape) if shape is not None and cost < FITS else None
+
+
+def _as_well_as_it_fits(cost: float, shape: Shape) -> Shape:
+    """Return a shape whose surface is known as well as its own points scatter, `cost` times the variance of the noise that is stated."""
+    return replace(shape, std_m=min(float(np.sqrt(max(cost, LEAST_SCATTER))) * shape.std_m, ROUGH_STD))
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------

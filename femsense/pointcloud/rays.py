@@ -8,6 +8,8 @@ import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 
+ALTERNATIONS = 3
+"""Projections between a ray and the surface that it passes."""
 GRAZING = 0.25
 """Rays that meet the surface at a smaller |cos| say little and err at silhouettes:
 one pixel beside it they miss (METHODS section 3)."""
@@ -86,6 +88,19 @@ class Surface:
         gap = np.linalg.norm(points - hits.place(self.positions), axis=1)
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
         return hits.pick((gap <= reach) & looking)
+
+    def beside_rays(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+        """Return how far the rays through points (k, 3) pass the surface near them [m], shape (k,); 0 where they meet it.
+
+        The closest point of the surface is projected onto the ray, and again from there (alternating projections).
+        """
+        ray = points - origins
+        ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
+        at = points
+        for _ in range(ALTERNATIONS):
+            closest = self._scene.compute_closest_points(_tensor(at))["points"].numpy().astype(np.float64)
+            at = origins + np.einsum("kc,kc->k", closest - origins, ray)[:, None] * ray
+        return np.where(self._scene.compute_occupancy(_tensor(at)).numpy() > 0.5, 0.0, self.gap(at))
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""

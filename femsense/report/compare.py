@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.io.tables import validated
 from femsense.report import words
 from femsense.report.documents import read_document, read_json
-from femsense.report.page import Chapter, Html, image, section, table, together
+from femsense.report.drawing import image
+from femsense.report.page import Chapter, render
 from femsense.report.run.document import Demo, DemoRun, KnownLoad, RunFacts
 from femsense.sensing.run_files import RUN_FORMAT
 
@@ -30,74 +32,48 @@ def comparison_chapter(root: Path, runs: Sequence[Path], title: str) -> Chapter 
     Raises:
         InputError: a file is broken.
     """
-    demo = _demo(root / "demo.json")
-    table_of_runs = _runs(root, runs) if len(runs) > 1 else None
-    body = together(section("Against the truth", _truth(demo), _picture(root) if demo else None), section("Runs", table_of_runs))
+    file = root / "demo.json"
+    demo = validated(Demo, read_json(file, "what femsense demo wrote"), file) if file.is_file() else None
+    rows = [] if demo is None else list(zip(MEASURES, _errors(demo.declared), _errors(demo.improved)))
+    compared = [_run(root, file) for file in runs] if len(runs) > 1 else []
+    body = render("comparison.html", demo=demo, truth=rows, picture=_picture(root), runs=compared)
     return Chapter(title, body) if body else None
 
 
-def _demo(file: Path) -> Demo | None:
-    return validated(Demo, read_json(file, "what femsense demo wrote"), file) if file.is_file() else None
+MEASURES = (
+    "Error of force, median",
+    "Error of force, median, of its size",
+    "Error of place, median",
+    "True contacts in frames found",
+    "Contacts in frames that are none",
+)
 
 
-def _truth(demo: Demo | None) -> Html | None:
-    if demo is None:
-        return None
-    both = (demo.declared, demo.improved)
-    rows = [
-        ["Error of force, median", *(words.joined(words.number(r.force_error_n), "N") for r in both)],
-        ["Error of force, median, of its size", *(words.percent(r.force_error_share, 1) for r in both)],
-        ["Error of place, median", *(words.length(r.place_error_m) for r in both)],
-        ["True contacts in frames found", *(_found(r) for r in both)],
-        ["Contacts in frames that are none", *(_count(r.contacts_false) for r in both)],
+def _errors(run: DemoRun) -> list[str]:
+    """Return the errors of a run of the demo against the truth, in the order of MEASURES."""
+    none, found = words.NOTHING, run.contacts_found
+    return [
+        words.joined(words.number(run.force_error_n), "N"),
+        words.percent(run.force_error_share, 1),
+        words.length(run.place_error_m),
+        none if run.contacts_true is None else f"{none if found is None else found} of {run.contacts_true}",
+        none if run.contacts_false is None else str(run.contacts_false),
     ]
-    shown = [row for row in rows if set(row[1:]) != {words.NOTHING}]
-    return table(
-        ("Measure", "Declared robot", "Improved robot"),
-        shown,
-        caption="The recording comes with the true contact forces.",
-        numeric=(1, 2),
-    )
 
 
-def _found(run: DemoRun) -> str:
-    return words.NOTHING if run.contacts_true is None else f"{_count(run.contacts_found)} of {run.contacts_true}"
-
-
-def _count(value: int | None) -> str:
-    return words.NOTHING if value is None else str(value)
-
-
-def _picture(root: Path) -> Html | None:
+def _picture(root: Path) -> Markup:
     file = root / "picture.png"
     if not file.is_file() or file.stat().st_size > PICTURE:
-        return None
+        return Markup()
     alt = "The robot with its contact forces, true and sensed, the forces over the frames, and the residual before and after."
     return image(file.read_bytes(), "png", alt=alt, wide=True)
 
 
-def _runs(root: Path, runs: Sequence[Path]) -> Html | None:
-    rows = []
-    for file in runs:
-        facts = read_document(file, RunFacts, RUN_FORMAT)
-        name = file.parent.relative_to(root).as_posix()
-        rows.append(
-            [
-                name if name != "." else "this folder",
-                facts.robot,
-                f"{facts.frames_ok} of {facts.frames}",
-                str(facts.contacts),
-                load_error(facts.known_loads),
-                words.joined(words.number(facts.timing.ms_per_frame_median), "ms"),
-            ]
-        )
-    headers = ("Run", "Robot", "Frames", "Contacts", "Error at known loads", "Time a frame")
-    return table(
-        headers,
-        rows,
-        caption="The runs of this folder; the error at known loads is the median of its size.",
-        numeric=(2, 3, 4, 5),
-    )
+def _run(root: Path, file: Path) -> tuple[str, RunFacts, str]:
+    """Return the name of a run, its facts and its error at known loads."""
+    facts = read_document(file, RunFacts, RUN_FORMAT)
+    name = file.parent.relative_to(root).as_posix()
+    return name if name != "." else "this folder", facts, load_error(facts.known_loads)
 
 
 def load_error(loads: Sequence[KnownLoad]) -> str:

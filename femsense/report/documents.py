@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Any, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict
 
 from femsense.core.errors import InputError
 from femsense.core.text import short
 from femsense.io.tables import Schema, read_text, validated
 
 Number = float | None
-Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class Document(Schema):
@@ -27,17 +25,6 @@ class Document(Schema):
 
 
 DocumentType = TypeVar("DocumentType", bound=Document)
-
-
-class Table(Document):
-    """Columns of equal length."""
-
-    @model_validator(mode="after")
-    def _even(self) -> Self:
-        counts = {len(column) for name in type(self).model_fields if isinstance(column := getattr(self, name), list)}
-        if len(counts) > 1:
-            raise ValueError("the columns differ in length")
-        return self
 
 
 class Input(Document):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.mesh import TetMesh, surface_triangles
-from femsense.report.page import Html, image
 
 BEFORE, AFTER = "#c8641b", "#1f6f5c"
 INK, SOFT, LINE, PALE = "#1f252c", "#5b6673", "#dfe3e8", "#9aa4af"
@@ -282,18 +283,28 @@ def _draw_way(
     axes.annotate("", xy=(x, 0.0), xycoords=tip, xytext=(x, 0.0), textcoords=tail, arrowprops=arrow, annotation_clip=False)
 
 
-def draw_bars(names: Sequence[str], values_mm: Sequence[float], unit: str, *, color: str = AFTER) -> Any:
-    """Return a figure of horizontal bars, the first on top."""
+def marker_bars(rms_m: Mapping[str, float | None], title: str, *, most: int, axis: str) -> Markup | None:
+    """Return the residuals of markers [m] as bars, the `most` largest of them, the largest on top; None where none is known."""
+    sizes = sorted(((1e3 * v, name) for name, v in rms_m.items() if v is not None and math.isfinite(v)), reverse=True)
+    if not sizes:
+        return None
+    shown = sizes[:most]
+    more = f" The {len(shown)} largest of {len(sizes)}." if len(sizes) > len(shown) else ""
+    figure = _draw_bars([name for _, name in shown], [size for size, _ in shown], axis)
+    return as_image(figure, alt=f"{title}: the largest {shown[0][0]:.2f} mm at {shown[0][1]}.", caption=f"{title}.{more}")
+
+
+def _draw_bars(names: Sequence[str], values_mm: Sequence[float], axis: str) -> Any:
     figure, axes = new_axes(height=max(1.5, 0.55 + 0.26 * len(names)))
     places = np.arange(len(names))
-    axes.barh(places, values_mm, height=0.62, color=color)
+    axes.barh(places, values_mm, height=0.62, color=AFTER)
     for place, value in zip(places, values_mm):
         axes.text(value, place, f" {value:.2f}", va="center", fontsize=SIZE - 1, color=INK)
     axes.set_yticks(places, [clipped(name) for name in names])
     axes.invert_yaxis()
     axes.margins(x=0.14)
     axes.grid(False, axis="y")
-    name_axes(axes, unit, "")
+    name_axes(axes, axis, "")
     return figure
 
 
@@ -303,12 +314,28 @@ def clipped(name: str, width: int = 22) -> str:
     return text.replace("$", r"\$")
 
 
-def as_image(figure: Any, *, alt: str, caption: object = "", wide: bool = False) -> Html:
-    """Return a figure as part of the page."""
+def as_image(figure: Any, *, alt: str, caption: str = "", wide: bool = False) -> Markup:
+    """Return a figure of matplotlib as part of a page; see `image`."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", dpi=170, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = stream.getvalue()
     return image(_stable(svg[svg.index("<svg") :]).encode(), "svg+xml", alt=alt, caption=caption, wide=wide)
+
+
+def image(data: bytes, kind: str, *, alt: str, caption: str = "", wide: bool = False) -> Markup:
+    """Return a picture inside the page.
+
+    Arguments:
+        data: the picture.
+        kind: "svg+xml" or "png".
+        alt: what it shows, for those who do not see it.
+        caption: stands below it.
+        wide: over the whole width of the page.
+    """
+    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    below = Markup("<figcaption>{}</figcaption>\n").format(caption) if caption else ""
+    class_ = Markup(' class="wide"') if wide else ""
+    return Markup('<figure{}><img src="{}" alt="{}">{}</figure>').format(class_, source, alt, below)
 
 
 def _stable(svg: str) -> str:

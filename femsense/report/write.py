@@ -12,7 +12,7 @@ from femsense.report.calibration import calibration_chapter
 from femsense.report.compare import comparison_chapter
 from femsense.report.found import Found, find_results
 from femsense.report.loop.chapter import loop_chapter
-from femsense.report.page import Chapter, page
+from femsense.report.page import Chapter, render
 from femsense.report.run.chapter import run_chapter
 
 CHAPTERS: dict[str, Callable[[Path, str], Chapter]] = {
@@ -62,7 +62,7 @@ def report_html(folder: str | Path) -> str:
     )
     chapters[loops:loops] = [compared] if compared else []
     subject = next((chapter.subject for chapter in chapters if chapter.subject), "") or root.resolve().name
-    return page(subject, "femsense report", chapters)
+    return f"{render('page.html', title=subject, chapters=chapters)}\n"
 
 
 def _title(item: Found, root: Path, found: Sequence[Found]) -> str:

@@ -226,7 +226,7 @@ def limit_of(sensor: Sensor, fit: Fit) -> float:
 
 def trusted(frame: SensedFrame) -> bool:
     """Return whether a frame may be the start of the next one: also where the force of one object beside sure ones is not known."""
-    return frame.report.status == OK or frame.report.status.startswith(UNKNOWN)
+    return frame.report.status == OK or frame.report.status.startswith((UNKNOWN, "contact, size not determined"))
 
 
 def _std_along(fit: Fit, i: int) -> float:

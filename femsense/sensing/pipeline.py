@@ -25,6 +25,8 @@ from femsense.model.drive import has_history
 from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
+from femsense.sensing import estimate_frame
+from femsense.sensing.contact_free import learn
 from femsense.sensing.false_alarms import with_gains_of_free_frames
 from femsense.sensing.judge import (
     OK,
@@ -39,7 +41,7 @@ from femsense.sensing.judge import (
 from femsense.sensing.moved_camera import camera_status
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
-from femsense.sensing.prepare import prepare, scan_of
+from femsense.sensing.prepare import first_sensor, prepare, scan_of
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.search import explain
 from femsense.sensing.separation import segmented
@@ -98,13 +100,7 @@ def estimate(
             stacklevel=2,
         )
     warn_of_linear_elements(robot.body, where=robot.name)
-    prepared = prepare(robot, recording, calibration, at=at, options=options)
-    sensor = prepared.sensor
-    published = sensor.options.method == "paper"
-    sense = sense_as_published if published else sense_frame
-    if not published and not len(sensor.places):
-        sensor = with_gains_of_free_frames(prepared)
-    del prepared  # its rows
+    sense, sensor = _senser(robot, recording, calibration, at, options or SensingOptions())
     count = len(recording.time_s)
     with Checkpoint(keep) as checkpoint:
         done = checkpoint.kept(Done) or Done()
@@ -127,6 +123,19 @@ def estimate(
         recording_folder=recording.folder,
         known_loads=_compare_loads(recording, sensor.places, contacts, sensor.size),
     )
+
+
+def _senser(
+    robot: Robot, recording: Recording, calibration: Calibration, at: npt.ArrayLike | None, options: SensingOptions
+) -> tuple[Callable[[Sensor, int, SensedFrame | None], SensedFrame], Sensor]:
+    """Return what estimates one frame by the method that is asked for, and what stays the same over the frames."""
+    if options.method == "evidence":
+        model = learn(first_sensor(robot, recording, calibration, at=at, options=options))
+        return lambda _, k, previous: estimate_frame.sense(model, k, previous), model.sensor
+    prepared = prepare(robot, recording, calibration, at=at, options=options)
+    if options.method == "paper":
+        return sense_as_published, prepared.sensor
+    return sense_frame, prepared.sensor if len(prepared.sensor.places) else with_gains_of_free_frames(prepared)
 
 
 def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedFrame:
@@ -205,7 +214,7 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
         done.contacts.extend(_named(done, frame.contacts))
         done.states.append(frame.state.positions)
         named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
-        done.last = replace(frame, contacts=named) if trusted(frame) else _under_inputs(frame)
+        done.last = replace(frame, contacts=named) if frame.trusted and trusted(frame) else _under_inputs(frame)
     except (FemsenseError, np.linalg.LinAlgError) as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)

@@ -8,9 +8,10 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from femsense.calib.scan import Scan
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
@@ -34,6 +35,8 @@ CONE = float(np.sqrt(10.0 / 3.0))
 """Radius of a cone of pressure over its root mean square radius."""
 AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
+SOME = 300
+"""Rays that tell the angle between neighbours."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
 FLOOR_STD = 0.0007
@@ -65,13 +68,15 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
     low, high = state.positions.min(axis=0) - reach, state.positions.max(axis=0) + reach
     close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     gap = np.full(len(points), np.inf)
-    gap[close] = Surface(state.positions, sensor.surface.triangles).signed_gap(points[close], within=reach)
+    body = Surface(state.positions, sensor.surface.triangles)
+    gap[close] = body.signed_gap(points[close], within=reach)
     near = np.flatnonzero(gap < reach)
     if len(near) < 3:
         return []
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
     std = depth_std(sensor, np.linalg.norm(points - origins, axis=1), view)
+    edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
@@ -81,14 +86,38 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else fit_shape,
-        edge=_edge_of(sensor, points - origins, view) + 3.0 * std,
+        edge=edge + 3.0 * std,
+        halo=halo,
     )
 
 
-def _edge_of(sensor: Sensor, rays: FloatArray, view: IntArray) -> FloatArray:
-    """Return how far beside the body a camera may show points of its edge [m], shape (o,); 0 where it is not known how large pixels are."""
-    pixel = np.array([0.0 if camera is None else 1.0 / camera.fx for camera in sensor.recording.cameras])
-    return np.asarray(BLEEDING * pixel[view] * np.linalg.norm(rays, axis=1))
+def _edge_of(
+    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, gap: FloatArray, origins: FloatArray, view: IntArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return how far beside the body a camera may show points of its edge [m], shape (o,), and which points are a stereo camera's halo, shape (o,).
+
+    A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely.
+    """
+    cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
+    pixel = np.array([_pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
+    depth = np.linalg.norm(points - origins, axis=1)
+    edge = np.asarray(BLEEDING * pixel[view] * depth)
+    matched = np.array([noise.kind == "stereo" for noise in noises])[view]
+    beside = body.beside_rays(points, origins)
+    return edge, np.asarray(matched & ((gap < edge) | ((beside > 0.0) & (beside < edge))))
+
+
+def _pixel_of(scan: Scan, view: int) -> float:
+    """Return the angle between neighbouring rays of a camera [rad], from the robot's points; 0 where there are too few.
+
+    A cloud that was thinned has a larger one, and a wider halo in metres.
+    """
+    seen = scan.camera_points[scan.view == view]
+    if len(seen) < FEWEST:
+        return 0.0
+    rays = seen[:, :2] / seen[:, 2:]
+    some = rays[:: max(1, len(rays) // SOME)]
+    return float(np.median(np.asarray(cKDTree(rays).query(some, k=2)[0])[:, 1]))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
@@ -169,7 +198,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         radius=curvature,
         spread=CONE * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
     )
-    return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])))
+    return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])), shape=shape)
 
 
 def _face_towards(shape: Shape, place: FloatArray, normals: FloatArray, faces: IntArray) -> int:

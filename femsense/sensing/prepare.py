@@ -93,15 +93,15 @@ class Prepared:
         return replace(self.sensor, knowledge=_taught(self.first, taught))
 
 
-def prepare(
+def first_sensor(
     robot: Robot,
     recording: Recording,
     calibration: Calibration,
     *,
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
-) -> Prepared:
-    """Return a sensor with the free frames that taught it. Arguments and errors as for `make_sensor`."""
+) -> Sensor:
+    """Return a sensor before any free frame is seen. Arguments and errors as for `make_sensor`."""
     options = options or SensingOptions()
     recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
     robot = robot.in_recording(recording.label)
@@ -125,7 +125,7 @@ def prepare(
         facing_of(robot.body.mesh.nodes[surface.triangles]),
         size,
         min(options.modulus_std, MODULUS_STD) if pulls_are_modelled else options.modulus_std,
-        _pose_covariance(recording, calibration),
+        pose_covariance(recording, calibration),
         drives=len(robot.body.cables) + len(robot.body.chambers) if pulls_are_modelled else 0,
     )
     sensor = Sensor(
@@ -144,6 +144,21 @@ def prepare(
         correction_std,
     )
     sensor = replace(sensor, scenery=_scenery(sensor))
+    return sensor
+
+
+def prepare(
+    robot: Robot,
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    at: npt.ArrayLike | None = None,
+    options: SensingOptions | None = None,
+) -> Prepared:
+    """Return a sensor with the free frames that taught it. Arguments and errors as for `make_sensor`."""
+    sensor = first_sensor(robot, recording, calibration, at=at, options=options)
+    recording, knowledge = sensor.recording, sensor.knowledge
+    pulls_are_modelled = recording.has_clouds and recording.actuation == "displacement"
     free = _free_frames(sensor)
     learned = _taught(knowledge, free.values())
     if free and (pulls_are_modelled or _declared(calibration).any()):
@@ -155,7 +170,7 @@ def prepare(
     return Prepared(replace(sensor, knowledge=learned, background=background), knowledge, free)
 
 
-def _pose_covariance(recording: Recording, calibration: Calibration) -> FloatArray:
+def pose_covariance(recording: Recording, calibration: Calibration) -> FloatArray:
     """Return how well poses are known before a free frame is seen, shape (6 v, 6 v): beside clouds, those that nobody fitted as declared ones are.
 
     By markers alone it is the pose under the robot's own law: the same law explains the frames that are sensed.

@@ -50,16 +50,16 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: S
                 force_n=size,
                 std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
                 source=touch.source,
-                track=_place_of(sensor, touch) if touch.source == "given" else -1,
+                track=place_of(sensor, touch) if touch.source == "given" else -1,
                 position_std_m=freeze(np.hypot(place_std(touch, fit.place_covariance[i]), shifted[i])),
                 radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
         )
-    return tuple(_tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
+    return tuple(tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
 
 
-def _place_of(sensor: Sensor, touch: Touch) -> int:
+def place_of(sensor: Sensor, touch: Touch) -> int:
     """Return which of the given places a touch is at."""
     return int(np.linalg.norm(sensor.places - touch.place, axis=1).argmin())
 
@@ -114,7 +114,7 @@ def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[C
     return result
 
 
-def _tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach: float) -> list[ContactForce]:
+def tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach: float) -> list[ContactForce]:
     """Return contacts with the tracks of the nearest ones of the frame before, each taken once."""
     pairs = sorted(
         (float(np.linalg.norm(c.position_m - b.position_m)), i, j) for i, c in enumerate(contacts) for j, b in enumerate(before)

@@ -22,6 +22,7 @@ from femsense.model.drive import DrivenRobot
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.local_planes import LocalPlanes
+from femsense.pointcloud.primitives import Shape
 from femsense.sensing import run_arrays
 
 MEDIAN = 1.0 - 1.483 ** (-2.0 / 3.0)
@@ -33,7 +34,8 @@ class SensingOptions:
     """What the data cannot say."""
 
     method: str = "rays"
-    """"rays": every point a measurement; "paper": feature points, Algorithms 2 and 3, normals only, one linear step."""
+    """"rays": every point a measurement; "evidence": the same under one objective (docs/estimator.md); "paper": feature points, Algorithms 2 and 3,
+    normals only, one linear step."""
     friction: float | None = 1.0
     """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
     push: bool = False  # what acts at a given place keeps to its cone, too
@@ -189,6 +191,9 @@ class Touch:
     line: FloatArray = field(default_factory=lambda: np.zeros(3))
     """Unit vector at rest along which alone it is known no better than that, as along a rod; zero: all ways alike."""
     across_m: float = 0.0  # how well it is known across the line [m]
+    pulls: bool = False  # whether a weight hangs there, as on a thread: along gravity, not about the normal
+    undetermined: bool = False  # an object in touch whose force the data do not determine
+    shape: Shape | None = None  # the rigid object that touches there, where one is seen or declared
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -252,6 +257,10 @@ class SensedFrame:
     """Whether each force was more than noise."""
     response: Response | None = None  # near the state
     free_response: Response | None = None  # near the state under the inputs alone
+    tau: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Prior scale of each force [N], shape (m,); of the objective alone."""
+    trusted: bool = True
+    """Whether the next frame may start from this one."""
 
 
 @dataclass(eq=False, slots=True)

@@ -17,8 +17,8 @@ from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.robot_toml import load_robot, robot_names
+from femsense.loop.files import saved_loop
 from femsense.model.robot import Robot
-from femsense.report.loop.document import Effect, Loop
 from femsense.report.loop.text import effect_text, loop_text
 from femsense.report.text import columns, run_text
 from femsense.sensing.types import Run
@@ -93,13 +93,13 @@ def test_texts_name_what_matters(run: Run) -> None:
     text = run_text(run)
     assert "2 of 3" in text and "2 in 2 frames" in text and "0.500 N declared, 0.490 N sensed (-2.0 %)" in text
     assert "no result, frame 0" in text and "1.000 ± 0.100 N in frame 1" in text
-    text = loop_text(Loop.model_validate(LOOP))
+    text = loop_text(saved_loop(LOOP))
     assert (
         text.startswith("verdict: effects (the cables rub)")
         and "2.000 → 0.300 mm" in text
         and "next experiment: pull slower" in text
     )
-    text = effect_text(Effect.model_validate(LOOP["effects"][0]))
+    text = effect_text(saved_loop(LOOP).effects[0])
     assert "0.1234 ± 0.01\n" in text and "top 1 ± 0.5 N" in text and "2.500 → 0.400 mm" in text
 
 
@@ -110,7 +110,7 @@ def test_known_loads_are_listed_up_to_six(run: Run) -> None:
 
 
 def said(document: dict[str, Any]) -> str:
-    return loop_text(Loop.model_validate(document))
+    return loop_text(saved_loop(document))
 
 
 def test_what_would_have_been_seen_and_what_is_left_are_said_in_a_line() -> None:

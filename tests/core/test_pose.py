@@ -74,3 +74,16 @@ def test_what_is_no_pose(T: object, text: str) -> None:
     with pytest.raises(InputError) as error:
         check_pose(T, "T_robot_camera")  # type: ignore[arg-type]
     assert text in str(error.value) and "T_robot_camera" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (random_pose(3).T, "transposed"),
+        (random_pose(3) @ np.diag([1.0, 1.0, -1.0, 1.0]), "mirrored"),
+        (random_pose(3) @ np.diag([1e3, 1e3, 1e3, 1.0]), "scaled by 1000"),
+    ],
+)
+def test_why_a_matrix_is_no_rigid_transform_is_said(matrix: np.ndarray, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        check_pose(matrix, "T")

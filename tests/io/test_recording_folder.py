@@ -21,8 +21,9 @@ from femsense.io.files import folder_hash
 from femsense.io.recording_folder import load_recording, save_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.camera import Camera, CameraNoise
+from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.model.recording import Recording, make_recording, marker_grid, select_frames, with_marker_table
-from femsense.model.recording_checks import check_against, warn_of_values
+from femsense.model.recording_checks import check_against
 from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline, Tool, Views
 
 TOML = RECORDING_FILES["recording.toml"]
@@ -614,7 +615,7 @@ def test_values_that_are_hardly_meant(tmp_path: Path, frames: str, actuation: st
     toml = TOML.replace("tension", actuation)
     r = load_recording(write_small_recording(tmp_path, recording_toml=toml, frames_csv=FRAMES + frames, markers_csv=None))
     with pytest.warns(UserWarning, match=text):
-        warn_of_values(r)
+        warn_of(doubts_of_recording(r))
 
 
 def test_a_cable_is_not_shortened_by_more_than_its_length(tmp_path: Path, robot: Any) -> None:

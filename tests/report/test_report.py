@@ -18,16 +18,14 @@ from matplotlib.text import Text
 from femsense.app import commands
 from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot
-from femsense.loop.files import LOOP_FORMAT
+from femsense.loop.files import read_loop, saved_loop
 from femsense.report import words, write_report
 from femsense.report.compare import load_error
-from femsense.report.documents import read_document
 from femsense.report.drawing import VIEWS, Key, best_view, body_height, frame_body, new_axes, new_panels, nice, skin
 from femsense.report.loop.chapter import recovered
-from femsense.report.loop.document import Loop
+from femsense.report.loop.effects import is_beyond, smallest_words
 from femsense.report.loop.residual_at_rest import draw_mean_residual, mean_residual
 from femsense.report.loop.residual_in_frames import draw_frame_residuals, frame_residuals
-from femsense.report.loop.smallest_effects import is_beyond, smallest_words
 from femsense.report.run.document import KnownLoad
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
@@ -971,7 +969,7 @@ def test_a_path_that_is_no_folder_and_a_file_that_is_one(tmp_path: Path) -> None
         ({"noise_m": "little"}, "noise_m"),
         ({"residuals__before_m__0": [1.0, 2.0]}, "residuals.before_m[0]"),
         ({"residuals__marker": ["tip"]}, "residuals"),
-        ({"confounded__0__pair": ["gravity"]}, "confounded[0].pair"),
+        ({"confounded__0__pair": ["gravity"]}, "confounded[0].pair[1]"),
         ({"evidence": 5}, "evidence"),
         ({"evidence__frames__sweep": ["one"]}, "evidence.frames"),
         ({"evidence__forces__loads__0__frame": "nine"}, "evidence.forces.loads[0].frame"),
@@ -1158,11 +1156,11 @@ def test_keys_below_a_body_stand_apart(high: tuple[float, float], cameras: int, 
 
 def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path) -> None:
     folder = write_loop_folder(tmp_path)
-    loop, robot = read_document(folder / "loop.json", Loop, LOOP_FORMAT), load_robot(folder, effects=False)
+    loop, robot = saved_loop(read_loop(folder)), load_robot(folder, effects=False)
     rest = skin(robot.body.mesh.nodes, robot.body.mesh.tets)
-    assert loop.evidence is not None
-    cameras = loop.evidence.pictures.camera_axes()
-    mean, frames = mean_residual(loop, robot, rest), frame_residuals(loop.evidence.pictures, rest)
+    assert loop.evidence is not None and loop.residuals is not None
+    cameras = loop.evidence.pictures.camera_axes
+    mean, frames = mean_residual(loop, loop.residuals.known(), robot, rest), frame_residuals(loop.evidence.pictures, rest)
     assert mean is not None and frames is not None
     bodies = [*(draw_mean_residual(mean, title, cameras) for title in mean.means), draw_frame_residuals(frames, cameras)]
     assert [len(figure.axes) for figure in bodies] == [1, 1, 6]

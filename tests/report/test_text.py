@@ -13,7 +13,7 @@ from results import NAN, make_calibration
 from small_run import make_run
 
 from femsense.io.robot_toml import load_robot
-from femsense.report.loop.document import Loop
+from femsense.loop.files import saved_loop
 from femsense.report.loop.text import loop_text
 from femsense.report.text import calibration_text, known_part, run_text
 from femsense.report.write import write_report
@@ -38,14 +38,14 @@ def test_inputs_that_are_absolute_have_nothing_at_the_start() -> None:
 
 def test_a_loop_says_how_large_the_error_of_the_model_is() -> None:
     parts = {"held_out_m": 0.0121, "noise_source": "marker_noise_m of recording.toml"}
-    text = loop_text(Loop.model_validate({"verdict": "unexplained", "model_error": parts}))
+    text = loop_text(saved_loop({"verdict": "unexplained", "model_error": parts}))
     assert "12.100 mm held out, beyond noise and discretisation; noise: marker_noise_m of recording.toml" in text
-    assert "error of the model" not in loop_text(Loop(verdict="none"))
+    assert "error of the model" not in loop_text(saved_loop({"verdict": "none"}))
 
 
 def test_what_was_fitted_along_and_is_handed_back_is_said_with_its_values() -> None:
     along = {"cable_offset": {"offset_n": {"value": {"m1": 0.21}, "std": {"m1": 0.08}, "unit": "N"}}}
-    text = loop_text(Loop.model_validate({"verdict": "effects", "fitted_along": along}))
+    text = loop_text(saved_loop({"verdict": "effects", "fitted_along": along}))
     title, values = text.split("cable_offset (fitted along, part of the improved robot, not named)")
     assert "verdict: effects" in title and "0.21" in values and "0.08" in values
 

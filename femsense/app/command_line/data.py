@@ -8,88 +8,46 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, required
+from femsense.app.command_line.parameters import Json, RobotPath, argument, filled, option, required
 
 
 def import_(
     source: Annotated[
         list[str],
-        typer.Argument(
-            metavar="SOURCE…",
-            help="A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras.",
-            show_default=False,
-        ),
+        argument("SOURCE…", "A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras."),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RECORDING", help="The folder to write.", show_default=False)],
-    format: Annotated[
-        str | None,
-        typer.Option("--format", metavar="NAME", help="If the guess is wrong; see docs/importing.md.", show_default=False),
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        typer.Option("--topic", metavar="NAME", help="What to take, where there is a choice.", show_default=False),
-    ] = None,
+    output: Annotated[Path, option("-o --output", "RECORDING", "The folder to write.")],
+    format: Annotated[str | None, option("--format", "NAME", "If the guess is wrong; see docs/importing.md.")] = None,
+    topic: Annotated[list[str] | None, option("--topic", "NAME", "What to take, where there is a choice.")] = None,
     map_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--map", metavar="NAME=TARGET", help="Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.", show_default=False
-        ),
+        list[str] | None, option("--map", "NAME=TARGET", "Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.")
     ] = None,
-    unit: Annotated[str | None, typer.Option("--unit", metavar="m|cm|mm|in|ft", help="Of lengths.", show_default=False)] = None,
-    up: Annotated[
-        str | None, typer.Option("--up", metavar="x|y|z", help="The vertical axis; it is turned to z.", show_default=False)
-    ] = None,
-    clock: Annotated[str, typer.Option("--clock", metavar="auto|header|record", help="Which time stamps of a bag.")] = "auto",
-    rate: Annotated[
-        float | None, typer.Option("--rate", metavar="HZ", help="Where the source has no times.", show_default=False)
-    ] = None,
-    base: Annotated[
-        str | None,
-        typer.Option("--base", metavar="FRAME", help="Frame of a bag's transforms that is the robot's.", show_default=False),
-    ] = None,
-    shift: Annotated[
-        list[str] | None,
-        typer.Option("--shift", metavar="CAMERA=S", help="Seconds to add to a camera's times.", show_default=False),
-    ] = None,
+    unit: Annotated[str | None, option("--unit", "m|cm|mm|in|ft", "Of lengths.")] = None,
+    up: Annotated[str | None, option("--up", "x|y|z", "The vertical axis; it is turned to z.")] = None,
+    clock: Annotated[str, option("--clock", "auto|header|record", "Which time stamps of a bag.")] = "auto",
+    rate: Annotated[float | None, option("--rate", "HZ", "Where the source has no times.")] = None,
+    base: Annotated[str | None, option("--base", "FRAME", "Frame of a bag's transforms that is the robot's.")] = None,
+    shift: Annotated[list[str] | None, option("--shift", "CAMERA=S", "Seconds to add to a camera's times.")] = None,
     depth_unit: Annotated[
-        float | None,
-        typer.Option(
-            "--depth-unit", metavar="M", help="Metres in one unit of depth images, if it is another.", show_default=False
-        ),
+        float | None, option("--depth-unit", "M", "Metres in one unit of depth images, if it is another.")
     ] = None,
-    every: Annotated[int, typer.Option("--every", metavar="N", min=1, help="Take one of so many frames.")] = 1,
+    every: Annotated[int, option("--every", "N", "Take one of so many frames.", min=1)] = 1,
     free: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--free", metavar="FROM:TO", help="Seconds after the first frame; nothing touches the robot.", show_default=False
-        ),
+        list[str] | None, option("--free", "FROM:TO", "Seconds after the first frame; nothing touches the robot.")
     ] = None,
-    inputs: Annotated[
-        str | None,
-        typer.Option("--inputs", metavar="tension|displacement", help="What the cables' values are.", show_default=False),
-    ] = None,
-    zero: Annotated[
-        str | None, typer.Option("--zero", metavar="absolute|unknown", help="What they count from.", show_default=False)
-    ] = None,
-    actuation: Annotated[
-        Path | None,
-        typer.Option("--actuation", metavar="FILE", help="A CSV file with the inputs over time.", show_default=False),
-    ] = None,
-    offset: Annotated[
-        float | None,
-        typer.Option("--offset", metavar="S", help="The frames' time minus that file's; else from motion.", show_default=False),
-    ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Import even where RECORDING holds an import.")] = False,
+    inputs: Annotated[str | None, option("--inputs", "tension|displacement", "What the cables' values are.")] = None,
+    zero: Annotated[str | None, option("--zero", "absolute|unknown", "What they count from.")] = None,
+    actuation: Annotated[Path | None, option("--actuation", "FILE", "A CSV file with the inputs over time.")] = None,
+    offset: Annotated[float | None, option("--offset", "S", "The frames' time minus that file's; else from motion.")] = None,
+    again: Annotated[bool, option("--again", help="Import even where RECORDING holds an import.")] = False,
     json: Json = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
     from femsense.app.import_command import columns_named, free_named, import_into, import_text, shifts_named
     from femsense.io.importers.frames import Options
 
-    shifts, spans = shifts_named(shift or []), free_named(free or [])
-    options = Options(
-        format, tuple(topic or ()), columns_named(map_ or []), unit, depth_unit, up, clock, rate, base, shifts, every, spans
-    )
+    said = {"columns": columns_named(map_ or []), "shifts": shifts_named(shift or []), "free": free_named(free or [])}
+    options = filled(Options, locals(), topics=tuple(topic or ()), **said)
     with progress_bar("import") as progress:
         document = import_into(
             output,
@@ -109,55 +67,22 @@ def import_(
 
 def mesh(
     surface: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SURFACE",
-            help="Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).",
-            show_default=False,
-        ),
+        Path, argument("SURFACE", "Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).")
     ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="ROBOT",
-            help="The robot's folder; its robot.toml is kept where there is one.",
-            show_default=False,
-        ),
-    ],
+    output: Annotated[Path, option("-o --output", "ROBOT", "The robot's folder; its robot.toml is kept where there is one.")],
     unit: Annotated[
-        str | None,
-        typer.Option(
-            "--unit",
-            metavar="m|cm|mm",
-            help="Unit of the surface file; required but for STEP, which says it.",
-            show_default=False,
-        ),
+        str | None, option("--unit", "m|cm|mm", "Unit of the surface file; required but for STEP, which says it.")
     ] = None,
-    size: Annotated[float | None, typer.Option("--size", metavar="MM", help="Wanted edge length.", show_default=False)] = None,
-    most: Annotated[
-        int | None,
-        typer.Option(
-            "--max-tets",
-            metavar="N",
-            min=6,
-            help="Not more tetrahedra than this (2000; more for thin walls).",
-            show_default=False,
-        ),
+    size_mm: Annotated[float | None, option("--size", "MM", "Wanted edge length.")] = None,
+    most_tets: Annotated[
+        int | None, option("--max-tets", "N", "Not more tetrahedra than this (2000; more for thin walls).", min=6)
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option("--tolerance", metavar="MM", help="How far the mesh may leave the surface.", show_default=False),
-    ] = None,
-    element: Annotated[str, typer.Option("--element", metavar="tet4|tet10", help="For a new robot.toml.")] = "tet10",
-    close_holes: Annotated[bool, typer.Option("--close-holes", help="Close large holes too, by flat caps.")] = False,
-    fill_cavities: Annotated[bool, typer.Option("--fill-cavities", help="Take inner shells as solid, not as chambers.")] = False,
-    part: Annotated[
-        int | None,
-        typer.Option("--part", metavar="N", min=1, help="Which of several bodies; 1 is the largest.", show_default=False),
-    ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Fill even where ROBOT holds this mesh already.")] = False,
+    tolerance_mm: Annotated[float | None, option("--tolerance", "MM", "How far the mesh may leave the surface.")] = None,
+    element: Annotated[str, option("--element", "tet4|tet10", "For a new robot.toml.")] = "tet10",
+    close_holes: Annotated[bool, option("--close-holes", help="Close large holes too, by flat caps.")] = False,
+    fill_cavities: Annotated[bool, option("--fill-cavities", help="Take inner shells as solid, not as chambers.")] = False,
+    part: Annotated[int | None, option("--part", "N", "Which of several bodies; 1 is the largest.", min=1)] = None,
+    again: Annotated[bool, option("--again", help="Fill even where ROBOT holds this mesh already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Fill a surface with tetrahedra; start a robot."""
@@ -165,8 +90,8 @@ def mesh(
     from femsense.io.meshing.robot_from_surface import mesh_into, mesh_text
 
     if surface.suffix.lower() == ".toml":
-        return _line_mesh(surface, output, size=size, most=most, again=again)
-    options = MeshOptions(unit, size, most, tolerance, element, close_holes, fill_cavities, part)
+        return _line_mesh(surface, output, size=size_mm, most=most_tets, again=again)
+    options = filled(MeshOptions, locals())
     with progress_bar("mesh") as progress:
         document = mesh_into(output, surface, options, say=say, again=again, progress=progress)
     text = f"{mesh_text(document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
@@ -185,21 +110,12 @@ def _line_mesh(source: Path, output: Path, *, size: float | None, most: int | No
 def simulate(
     context: typer.Context,
     robot: RobotPath,
-    script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],
+    script: Annotated[Path, argument("SCRIPT", "What the virtual rig does (TOML).")],
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RECORDING",
-            help="The recording to write; with --plan a folder for the map of forces.",
-            show_default=False,
-        ),
+        Path | None, option("-o --output", "RECORDING", "The recording to write; with --plan a folder for the map of forces.")
     ] = None,
-    plan: Annotated[bool, typer.Option("--plan", help="Say what this experiment could show; record nothing.")] = False,
-    noise: Annotated[
-        float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")
-    ] = 0.2,
+    plan: Annotated[bool, option("--plan", help="Say what this experiment could show; record nothing.")] = False,
+    noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""

@@ -5,42 +5,32 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from femsense.app.command_line.answer import Answer, progress_bar
-from femsense.app.command_line.parameters import Json
+from femsense.app.command_line.parameters import Json, argument, filled, option
 
 
 def learn(
     files: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="SENSORS.csv MARKERS.csv …",
-            help="time_s and a column for each sensor; frame,marker,x_m,y_m,z_m. Two files a recording.",
-            show_default=False,
+        argument(
+            "SENSORS.csv MARKERS.csv …",
+            "time_s and a column for each sensor; frame,marker,x_m,y_m,z_m. Two files a recording.",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL", help="The ONNX file.", show_default=False)],
+    output: Annotated[Path, option("-o --output", "MODEL", "The ONNX file.")],
     test: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option(metavar="SENSORS MARKERS", help="State the error on another recording, too.", show_default=False),
+        tuple[Path, Path] | None, option("--test", "SENSORS MARKERS", "State the error on another recording, too.")
     ] = None,
     adapt: Annotated[
-        Path | None,
-        typer.Option(metavar="MODEL", help="Correct this model by a few labelled frames of another day.", show_default=False),
+        Path | None, option("--adapt", "MODEL", "Correct this model by a few labelled frames of another day.")
     ] = None,
-    end_to_end: Annotated[bool, typer.Option("--end-to-end", help="A second network from readings to bones.")] = False,
-    bones: Annotated[int, typer.Option(help="How many bones.")] = 8,
-    plane: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Normal of the plane in which the body bends.", show_default=False)
-    ] = None,
+    end_to_end: Annotated[bool, option("--end-to-end", help="A second network from readings to bones.")] = False,
+    bones: Annotated[int, option("--bones", help="How many bones.")] = 8,
+    plane: Annotated[str | None, option("--plane", "X,Y,Z", "Normal of the plane in which the body bends.")] = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            "-c", "--calibration", metavar="FILE", help="Take a camera's markers into the robot's frame.", show_default=False
-        ),
+        Path | None, option("-c --calibration", "FILE", "Take a camera's markers into the robot's frame.")
     ] = None,
-    robot_frame: Annotated[bool, typer.Option("--robot-frame", help="The markers are in the robot's frame already.")] = False,
+    robot_frame: Annotated[bool, option("--robot-frame", help="The markers are in the robot's frame already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
@@ -48,7 +38,7 @@ def learn(
 
     with progress_bar("learn") as progress:
         document, text = learn_into(
-            LearnFiles(pairs_of(files), test, adapt, calibration, robot_frame),
+            filled(LearnFiles, locals(), pairs=pairs_of(files), in_robot_frame=robot_frame),
             output,
             end_to_end=end_to_end,
             bones=bones,

@@ -8,88 +8,59 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RobotPath, required, split_names
+from femsense.app.command_line.parameters import Json, RobotPath, argument, filled, option, required, split_names
 from femsense.core.errors import InputError
 
 
 def improve(
     context: typer.Context,
     robot: RobotPath,
-    recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="RECORDING", help="What the effects are found on.", show_default=False)
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="The folder to write; with --plan a script (TOML).", show_default=False
-        ),
-    ] = None,
-    validation: Annotated[
-        list[Path] | None,
-        typer.Option("--validation", metavar="RECORDING …", help="What they are tested on.", show_default=False),
-    ] = None,
+    recordings: Annotated[list[Path] | None, argument("RECORDING", "What the effects are found on.")] = None,
+    output: Annotated[Path | None, option("-o --output", "OUT", "The folder to write; with --plan a script (TOML).")] = None,
+    validation: Annotated[list[Path] | None, option("--validation", "RECORDING …", "What they are tested on.")] = None,
     reference: Annotated[
         list[Path] | None,
-        typer.Option(
+        option(
             "--reference",
-            metavar="RECORDING …",
-            help="The same inputs without what is asked for (a weight, say): what the model misses there is taken off.",
-            show_default=False,
+            "RECORDING …",
+            "The same inputs without what is asked for (a weight, say): what the model misses there is taken off.",
         ),
     ] = None,
-    effects: Annotated[
-        list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)
-    ] = None,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)
-    ] = None,
+    effects: Annotated[list[str] | None, option("--effects", "NAME,…", "Try these effects only.")] = None,
+    without: Annotated[list[str] | None, option("--without", "NAME,…", "Do not try these effects.")] = None,
     user_effect: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False
-        ),
+        list[Path] | None, option("--user-effect", "FILE", "Try an effect of your own (docs/effects/own.md).")
     ] = None,
     measured: Annotated[
         str,
-        typer.Option(
+        option(
             "--from",
-            metavar="auto|markers|clouds|both",
-            help="What is used of a recording; auto: its markers, or its clouds where it has none.",
+            "auto|markers|clouds|both",
+            "What is used of a recording; auto: its markers, or its clouds where it has none.",
         ),
     ] = "auto",
     correct: Annotated[
-        bool,
-        typer.Option("--correct", help="Also learn an empirical correction of what is left, judged on held-out data: no cause."),
+        bool, option("--correct", help="Also learn an empirical correction of what is left, judged on held-out data: no cause.")
     ] = False,
-    again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers", metavar="N", min=1, help="Threads that work; by default one a core, four at most.", show_default=False
-        ),
+        int | None, option("--workers", "N", "Threads that work; by default one a core, four at most.", min=1)
     ] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
+        bool, option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
     ] = False,
-    given: Annotated[
-        Path | None,
-        typer.Option("--given", metavar="RECORDING", help="With --plan: what is recorded already.", show_default=False),
-    ] = None,
-    noise: Annotated[
-        float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")
-    ] = 0.2,
-    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1, help="With --plan: not more new frames than this.")] = 60,
-    actuation: Annotated[
-        str, typer.Option("--actuation", metavar="tension|displacement", help="With --plan: what drives the cables.")
-    ] = "tension",
+    given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: what is recorded already.")] = None,
+    noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
+    frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
+    actuation: Annotated[str, option("--actuation", "tension|displacement", "With --plan: what drives the cables.")] = "tension",
     json: Json = False,
 ) -> Answer:
     """Find what the model lacks and write the better robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.io.recording_folder import load_recording
+    from femsense.loop.files import saved_loop
     from femsense.loop.improve import ImproveOptions
-    from femsense.report.loop.document import Loop
     from femsense.report.loop.text import loop_text
 
     set_workers(workers)
@@ -108,6 +79,8 @@ def improve(
             )
     recordings = required(context, recordings, "'RECORDING...'", "argument")
     output = required(context, output, "'-o' / '--output'", "option")
+    references = [load_recording(path) for path in reference or []]
+    options = filled(ImproveOptions, locals(), user_effects=user_effect or [])
     with progress_bar("improve") as progress:
         document = improve_into(
             output,
@@ -116,18 +89,11 @@ def improve(
             validation=validation or [],
             effects=split_names(effects),
             without=split_names(without),
-            options=ImproveOptions(
-                user_effects=user_effect or [],
-                measured=measured,
-                correct=correct,
-                references=[load_recording(path) for path in reference or []],
-            ),
+            options=options,
             again=again,
             say=say,
             progress=progress,
         )
     page = loop_page(output, say=say)
-    text = f"{loop_text(Loop.model_validate(document))}\n\nwritten: {output}" + (
-        f"\nlook at it: {page}" if page is not None else ""
-    )
+    text = f"{loop_text(saved_loop(document))}\n\nwritten: {output}" + (f"\nlook at it: {page}" if page is not None else "")
     return Answer({"folder": str(output), **document}, text)

@@ -3,27 +3,59 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from typer.exceptions import TyperException
 
 from femsense.core.errors import InputError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    OptionsType = TypeVar("OptionsType", bound=DataclassInstance)
 T = TypeVar("T")
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
-RobotPath = Annotated[
-    str,
-    typer.Argument(
-        metavar="ROBOT", help="A folder with robot.toml, or the name of a robot that comes along.", show_default=False
-    ),
-]
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="A folder with recording.toml.", show_default=False)]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="A folder that femsense estimate wrote.", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else there.")]
+
+
+def option(flags: str, metavar: str | None = None, help: str = "", **limits: Any) -> Any:
+    """Return an option of a command, for `Annotated`: its flags with blanks between, what it takes, and what it does."""
+    return typer.Option(*flags.split(), metavar=metavar, help=help, **limits)
+
+
+def argument(metavar: str, help: str) -> Any:
+    """Return an argument of a command, for `Annotated`."""
+    return typer.Argument(metavar=metavar, help=help, show_default=False)
+
+
+def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -> OptionsType:
+    """Return options of the library made from the parameters of a command that have the names of its fields.
+
+    Arguments:
+        type_: a dataclass.
+        values: the parameters by name; those that are no fields are not used.
+        others: fields whose values are not those of a parameter.
+    """
+    return type_(**{field.name: values[field.name] for field in fields(type_) if field.name in values} | others)
+
+
+RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
+RecordingPath = Annotated[Path, argument("RECORDING", "A folder with recording.toml.")]
+RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
+Json = Annotated[bool, option("--json", help="One JSON object on standard output, nothing else there.")]
+
+
+def run_of(folder: Path) -> Path:
+    """Return the folder of a run: that of a session where one is given, made where a killed session left it unfinished."""
+    if not (folder / "session.json").is_file():
+        return folder
+    from femsense.live.recorder import session_run
+
+    return session_run(folder)
 
 
 def repeat_options(words: list[str]) -> list[str]:

@@ -6,10 +6,8 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from femsense.app.command_line.answer import Answer, say
-from femsense.app.command_line.parameters import Json, RunPath
+from femsense.app.command_line.parameters import Json, RunPath, argument, filled, option, run_of
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,33 +16,18 @@ if TYPE_CHECKING:
 
 def export(
     run: RunPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write: .glb or .usdz.")] = Path(
-        "robot.glb"
-    ),
-    mcap: Annotated[
-        Path | None,
-        typer.Option("--mcap", metavar="FILE", help="Write messages of ROS 2 for Foxglove instead.", show_default=False),
-    ] = None,
-    rerun: Annotated[
-        Path | None,
-        typer.Option("--rerun", metavar="FILE", help="Write a recording for the Rerun viewer instead.", show_default=False),
-    ] = None,
-    bones: Annotated[
-        int | None,
-        typer.Option("--bones", min=1, max=255, help="How many bones; chosen by itself if not given.", show_default=False),
-    ] = None,
-    skin: Annotated[
-        Path | None,
-        typer.Option("--skin", metavar="FILE", help="A surface of your own: STL, OBJ, PLY or glTF.", show_default=False),
-    ] = None,
-    skin_unit: Annotated[
-        str | None, typer.Option("--skin-unit", metavar="m|cm|mm", help="Of its coordinates.", show_default=False)
-    ] = None,
-    vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
-    arrows: Annotated[bool, typer.Option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,
+    output: Annotated[Path, option("-o --output", "FILE", "The file to write: .glb or .usdz.")] = Path("robot.glb"),
+    mcap: Annotated[Path | None, option("--mcap", "FILE", "Write messages of ROS 2 for Foxglove instead.")] = None,
+    rerun: Annotated[Path | None, option("--rerun", "FILE", "Write a recording for the Rerun viewer instead.")] = None,
+    bones: Annotated[int | None, option("--bones", help="How many bones; chosen by itself if not given.", min=1, max=255)] = None,
+    skin: Annotated[Path | None, option("--skin", "FILE", "A surface of your own: STL, OBJ, PLY or glTF.")] = None,
+    skin_unit: Annotated[str | None, option("--skin-unit", "m|cm|mm", "Of its coordinates.")] = None,
+    vertices: Annotated[int, option("--vertices", help="Of --skin at most; more are decimated.", min=100)] = 100_000,
+    arrows: Annotated[bool, option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF, USDZ)."""
+    run = run_of(run)
     if mcap is not None:
         from dataclasses import asdict
 
@@ -78,30 +61,24 @@ def export(
 
 
 def view(
-    run: Annotated[
-        Path | None, typer.Argument(metavar="RUN", help="A folder that femsense estimate wrote.", show_default=False)
-    ] = None,
-    stream: Annotated[
-        str | None,
-        typer.Option("--stream", metavar="URL", help="Show what streams there instead: http:// or mqtt://.", show_default=False),
-    ] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = True,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Write the page for a web server instead.", show_default=False),
-    ] = None,
-    password_file: Annotated[
-        Path | None, typer.Option("--password-file", metavar="FILE", help="Of the stream.", show_default=False)
-    ] = None,
-    authority: Annotated[
-        Path | None, typer.Option("--authority", metavar="PEM", help="Of the stream's certificate.", show_default=False)
-    ] = None,
+    run: Annotated[Path | None, argument("RUN", "A folder that femsense estimate wrote.")] = None,
+    stream: Annotated[str | None, option("--stream", "URL", "Show what streams there instead: http:// or mqtt://.")] = None,
+    live: Annotated[Path | None, option("--live", "SESSION", "Show the session that is recorded there now.")] = None,
+    port: Annotated[int, option("--port", help="0 takes a free one.", min=0, max=65535)] = 0,
+    browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,
+    output: Annotated[Path | None, option("-o --output", "DIR", "Write the page for a web server instead.")] = None,
+    password_file: Annotated[Path | None, option("--password-file", "FILE", "Of the stream.")] = None,
+    authority: Annotated[Path | None, option("--authority", "PEM", "Of the stream's certificate.")] = None,
     json: Json = False,
 ) -> Answer:
     """Show a run or a stream on a page for browsers and headsets."""
     from femsense.app.stream_options import is_encrypted, need_one, need_with
 
+    if live is not None:
+        from femsense.app.live_command import page_of_session
+
+        need_one([] if run is None and stream is None else [live], str(live))
+        stream = page_of_session(live)
     need_with("--output", output is not None, "RUN", stream is None)
     need_with("--password-file", password_file is not None, "--stream", stream is not None)
     need_with("--authority", authority is not None, "--stream https:// or mqtts://", is_encrypted(stream))
@@ -114,7 +91,8 @@ def view(
 
         return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
     if run is None:
-        raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
+        raise InputError("nothing to show", where="femsense view", expected="RUN, --stream URL or --live SESSION")
+    run = run_of(run)
     say(f"reading {run}")
     from femsense.xr.run_contents import has_current_glb
     from femsense.xr.view import serve, write_static_page
@@ -135,51 +113,35 @@ def view(
 
 
 def stream(
-    runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Runs to play.", show_default=False)] = None,
+    runs: Annotated[list[Path] | None, argument("RUN", "Runs to play.")] = None,
     sensors: Annotated[
-        str | None,
-        typer.Option(
-            "--sensors", metavar="SOURCE", help="CSV file, udp://, mqtt://, serial: – alone, or with --drag.", show_default=False
-        ),
+        str | None, option("--sensors", "SOURCE", "CSV file, udp://, mqtt://, serial: – alone, or with --drag.")
     ] = None,
-    model: Annotated[
-        Path | None, typer.Option("--model", metavar="MODEL", help="Of femsense learn, for --sensors.", show_default=False)
-    ] = None,
-    drag: Annotated[bool, typer.Option("--drag", help="Let viewers drag the robot of the first run.")] = False,
-    commands: Annotated[bool, typer.Option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
-    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page and its WebSocket; 0: a free one.")] = 8010,
-    mqtt: Annotated[
-        str | None,
-        typer.Option("--mqtt", metavar="HOST[:PORT]", help="Send to this broker; mqtts:// encrypts.", show_default=False),
-    ] = None,
-    broker: Annotated[bool, typer.Option("--broker", help="Serve a broker for this machine.")] = False,
+    model: Annotated[Path | None, option("--model", "MODEL", "Of femsense learn, for --sensors.")] = None,
+    drag: Annotated[bool, option("--drag", help="Let viewers drag the robot of the first run.")] = False,
+    commands: Annotated[bool, option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
+    host: Annotated[str, option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
+    port: Annotated[int, option("--port", help="Of the page and its WebSocket; 0: a free one.", min=0, max=65535)] = 8010,
+    mqtt: Annotated[str | None, option("--mqtt", "HOST[:PORT]", "Send to this broker; mqtts:// encrypts.")] = None,
+    broker: Annotated[bool, option("--broker", help="Serve a broker for this machine.")] = False,
     broker_port: Annotated[
-        int | None,
-        typer.Option(
-            "--broker-port", min=0, max=65535, help="Of --broker; 1883 if not given, 0: a free one.", show_default=False
-        ),
+        int | None, option("--broker-port", help="Of --broker; 1883 if not given, 0: a free one.", min=0, max=65535)
     ] = None,
-    json_mirror: Annotated[bool, typer.Option("--json-mirror", help="Send pose_json too, for Unity's JsonUtility.")] = False,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000.0, help="Most poses a second.")] = 60.0,
-    once: Annotated[bool, typer.Option("--once", help="Play once and end.")] = False,
-    password_file: Annotated[
-        Path | None, typer.Option("--password-file", metavar="FILE", help="Or variable FEMSENSE_PASSWORD.", show_default=False)
-    ] = None,
-    certificate: Annotated[
-        Path | None, typer.Option("--certificate", metavar="PEM", help="Encrypt with this.", show_default=False)
-    ] = None,
-    key: Annotated[Path | None, typer.Option("--key", metavar="PEM", help="Of the certificate.", show_default=False)] = None,
-    authority: Annotated[
-        Path | None, typer.Option("--authority", metavar="PEM", help="Of the broker's certificate.", show_default=False)
-    ] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = False,
+    json_mirror: Annotated[bool, option("--json-mirror", help="Send pose_json too, for Unity's JsonUtility.")] = False,
+    rate_hz: Annotated[float, option("--rate", help="Most poses a second.", min=0.1, max=1000.0)] = 60.0,
+    once: Annotated[bool, option("--once", help="Play once and end.")] = False,
+    password_file: Annotated[Path | None, option("--password-file", "FILE", "Or variable FEMSENSE_PASSWORD.")] = None,
+    certificate: Annotated[Path | None, option("--certificate", "PEM", "Encrypt with this.")] = None,
+    key: Annotated[Path | None, option("--key", "PEM", "Of the certificate.")] = None,
+    authority: Annotated[Path | None, option("--authority", "PEM", "Of the broker's certificate.")] = None,
+    browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = False,
     json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
     from femsense.app.stream_options import is_encrypted, need_model, need_stream, need_with
 
-    need_stream(runs or [], sensors, drag=drag)
+    runs = [run_of(run) for run in runs or []]
+    need_stream(runs, sensors, drag=drag)
     need_model(sensors, model)
     need_with("--commands", commands, "--drag", drag)
     need_with("--drag", drag, "RUN", bool(runs))
@@ -190,18 +152,8 @@ def stream(
         say(f"reading {what}")
     from femsense.app.stream_command import StreamOptions, let_drag, measure_by_sensors, stream_runs, stream_sensors
 
-    options = StreamOptions(
-        host=host,
-        port=port,
-        mqtt=mqtt,
-        broker_port=(1883 if broker_port is None else broker_port) if broker else None,
-        json_mirror=json_mirror,
-        password_file=password_file,
-        certificate=certificate,
-        key=key,
-        authority=authority,
-        rate_hz=rate,
-    )
+    served = (1883 if broker_port is None else broker_port) if broker else None
+    options = filled(StreamOptions, locals(), broker_port=served)
     if sensors is not None and model is not None and not runs:
         return _live(stream_sensors(sensors, model, options, say=say), browser)
     live = stream_runs(runs or [], options, loop=not once, say=say)
@@ -234,11 +186,11 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of results.", show_default=False)],
+    folder: Annotated[Path, argument("DIR", "A folder of results.")],
     json: Json = False,
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    page = write_report(folder)
+    page = write_report(run_of(folder))
     return Answer({"report": str(page)}, f"written: {page}")

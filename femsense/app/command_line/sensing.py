@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, places
+from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, filled, option, places
 
 USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
 
@@ -19,17 +19,19 @@ class SensingMethod(StrEnum):
 
     rays = "rays"
     paper = "paper"
+    evidence = "evidence"
 
 
 def calibrate(
     robot: RobotPath,
     recording: RecordingPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("calibration.json"),
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
+    output: Annotated[Path, option("-o --output", "FILE", "The file to write.")] = Path("calibration.json"),
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
     from femsense.app.force_resolution import force_resolution
+    from femsense.app.input_checks import warn_of_pictures
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.calib.files import calibration_document, write_calibration
     from femsense.io.files import check_target
@@ -40,6 +42,7 @@ def calibrate(
 
     check_target(output, folder=False, kind=CALIBRATION)
     body, frames = load_robot(robot), load_recording(recording)
+    warn_of_pictures(body, frames)
     calibration = calibrate_recording(body, frames, correct=correct)
     if not calibration.settled:
         text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"
@@ -53,38 +56,22 @@ def calibrate(
 def estimate(
     robot: RobotPath,
     recording: RecordingPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="The folder to write.", show_default=False)],
+    output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            "-c",
-            "--calibration",
-            metavar="FILE",
-            help="Of femsense calibrate; made first where it is not given.",
-            show_default=False,
-        ),
+        Path | None, option("-c --calibration", "FILE", "Of femsense calibrate; made first where it is not given.")
     ] = None,
-    at: Annotated[
-        list[str] | None,
-        typer.Option("--at", metavar="X,Y,Z …", help="Where forces act, in metres on the body at rest.", show_default=False),
-    ] = None,
+    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Where forces act, in metres on the body at rest.")] = None,
     method: Annotated[
         SensingMethod,
-        typer.Option(
-            "--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."
-        ),
+        option("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
     ] = SensingMethod.rays,
-    friction: Annotated[
-        float, typer.Option("--friction", metavar="MU", help="The cone about the normal in which contact forces lie.")
-    ] = 1.0,
+    friction: Annotated[float, option("--friction", "MU", "The cone about the normal in which contact forces lie.")] = 1.0,
     push: Annotated[
-        bool, typer.Option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
+        bool, option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
     ] = False,
-    smooth: Annotated[
-        float, typer.Option("--smooth", metavar="SECONDS", help="Average forces over so long; they lag by as much.")
-    ] = 0.0,
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
-    again: Annotated[bool, typer.Option("--again", help="Compute even where RUN holds this result already.")] = False,
+    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
+    again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
@@ -97,9 +84,9 @@ def estimate(
 
     if push and not at:
         raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
-    options = SensingOptions(method=method.value, friction=friction, push=push, smooth_s=smooth, correct=correct)
-    if smooth > 0:
-        say(f"forces are averaged over {smooth:g} s and lag by as much")
+    options = filled(SensingOptions, locals(), method=method.value)
+    if smooth_s > 0:
+        say(f"forces are averaged over {smooth_s:g} s and lag by as much")
     with progress_bar("estimate") as progress:
         run = estimate_into(
             output,
@@ -119,27 +106,105 @@ def estimate(
     )
 
 
-def reach(
+class Inputs(StrEnum):
+    """What inputs are that come live."""
+
+    tension = "tension"
+    displacement = "displacement"
+
+
+class Zero(StrEnum):
+    """Whether the zero of live inputs is known."""
+
+    absolute = "absolute"
+    unknown = "unknown"
+
+
+def live(
     robot: RobotPath,
-    target: Annotated[
-        list[str],
+    camera: Annotated[
+        str,
         typer.Option(
-            "--target", metavar="MARKER=X,Y,Z …", help="Where a marker is wanted, in metres, robot frame.", show_default=False
+            "--camera",
+            metavar="SOURCE",
+            help="realsense[:SERIAL], orbbec[:SERIAL], oak[:ID], mcap:FILE, foxglove:ws://…, a folder that grows, or a recording.",
+            show_default=False,
         ),
     ],
-    control: Annotated[str, typer.Option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
-    force: Annotated[
-        list[str] | None,
-        typer.Option("--force", metavar="X,Y,Z=FX,FY,FZ …", help="Known contact forces.", show_default=False),
+    actuation: Annotated[
+        str | None,
+        typer.Option(
+            "--actuation",
+            metavar="SOURCE",
+            help="mqtt://HOST/TOPIC, udp://HOST:PORT, ws://…, serial:PORT, a CSV file that grows, or fixed:NAME=VALUE,…",
+            show_default=False,
+        ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option("-c", "--calibration", metavar="FILE", help="Commands count from its initial inputs.", show_default=False),
+        typer.Option("-c", "--calibration", metavar="FILE", help="Made on the fly where it is not given.", show_default=False),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="A JSON file to write.", show_default=False)
+        Path | None, typer.Option("-o", "--output", metavar="SESSION", help="Record into this folder.", show_default=False)
     ] = None,
-    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
+    fast: Annotated[
+        bool, typer.Option("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
+    ] = False,
+    delay: Annotated[float, typer.Option("--delay", metavar="SECONDS", min=0.0, help="From an input to its effect.")] = 0.0,
+    inputs: Annotated[
+        Inputs, typer.Option("--inputs", help="What the inputs of cables are; a recording says it itself.")
+    ] = Inputs.tension,
+    zero: Annotated[Zero, typer.Option("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute,
+    contact_free: Annotated[
+        int, typer.Option("--contact-free", metavar="N", min=0, help="Contact-free frames first, with -c and after a zero.")
+    ] = 8,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0.0, help="End after this time.", show_default=False)] = None,
+    page: Annotated[bool, typer.Option("--page/--no-page", help="Serve the page.")] = True,
+    host: Annotated[str, typer.Option("--host", help="Of the page; beyond this machine a password is needed.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0 takes a free one.")] = 0,
+    mqtt: Annotated[
+        str | None, typer.Option("--mqtt", metavar="URL", help="Send to this broker too.", show_default=False)
+    ] = None,
+    broker: Annotated[
+        int | None,
+        typer.Option("--broker", metavar="PORT", help="Serve a broker of our own; 0: a free port.", show_default=False),
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option("--mcap", metavar="FILE", help="Write the messages to this file too.", show_default=False)
+    ] = None,
+    password_file: Annotated[
+        Path | None, typer.Option("--password-file", metavar="FILE", help="Of page and brokers.", show_default=False)
+    ] = None,
+    json: Json = False,
+) -> Answer:
+    """Calibrate and sense while it happens, from a camera."""
+    from femsense.app.live_command import LiveOptions, OutletOptions, sense_live, summary_text
+    from femsense.live.actuation import ActuationLimits
+    from femsense.live.feed import FeedOptions
+    from femsense.live.link import LinkState
+    from femsense.live.session import SessionOptions
+
+    options = LiveOptions(
+        actuation,
+        ActuationLimits(delay_s=delay),
+        FeedOptions(as_fast_as_possible=fast),
+        SessionOptions(calibration, output, inputs.value, zero.value, contact_free),
+        OutletOptions(page, host, port, mqtt, broker, password_file, mcap),
+        seconds,
+    )
+    document = sense_live(robot, camera, options, say=say)
+    lost = document["link"] == LinkState.GAVE_UP.value
+    return Answer(document, summary_text(document), exit_status=1 if lost else 0)
+
+
+def reach(
+    robot: RobotPath,
+    target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],
+    control: Annotated[str, option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
+    force: Annotated[list[str] | None, option("--force", "X,Y,Z=FX,FY,FZ …", "Known contact forces.")] = None,
+    calibration: Annotated[Path | None, option("-c --calibration", "FILE", "Commands count from its initial inputs.")] = None,
+    output: Annotated[Path | None, option("-o --output", "FILE", "A JSON file to write.")] = None,
+    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the inputs that bring points of the body to places."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json
+from femsense.app.command_line.parameters import Json, argument, option
 
 
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the results go.")] = Path("femsense-demo"),
+    output: Annotated[Path, option("-o --output", "DIR", "Where the results go.")] = Path("femsense-demo"),
     json: Json = False,
 ) -> Answer:
     """Run the whole chain on a recording that comes along."""
@@ -24,13 +22,9 @@ def demo(
 
 
 def inspect(
-    path: Annotated[str, typer.Argument(metavar="PATH", help="A file, a folder, or the name of a robot.", show_default=False)],
-    accuracy: Annotated[
-        bool, typer.Option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")
-    ] = False,
-    robot: Annotated[
-        str | None, typer.Option("--robot", metavar="ROBOT", help="Compare a recording with this robot.", show_default=False)
-    ] = None,
+    path: Annotated[str, argument("PATH", "A file, a folder, or the name of a robot.")],
+    accuracy: Annotated[bool, option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")] = False,
+    robot: Annotated[str | None, option("--robot", "ROBOT", "Compare a recording with this robot.")] = None,
     json: Json = False,
 ) -> Answer:
     """Say what a file or folder is and what is wrong with it."""
@@ -50,8 +44,10 @@ def inspect(
 
 
 def doctor(json: Json = False) -> Answer:
-    """Check the installation."""
+    """Check the installation, and list the cameras."""
     from femsense.app.doctor import diagnose, doctor_text
+    from femsense.app.doctor_cameras import camera_checks
 
     document = diagnose()
+    document["checks"] += camera_checks()
     return Answer(document, doctor_text(document), exit_status=0 if document["ok"] else 2)

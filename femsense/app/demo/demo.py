@@ -14,7 +14,7 @@ from femsense.io.files import check_target, write_json
 from femsense.io.own_files import DEMO, check_files
 from femsense.io.provenance import versions
 from femsense.io.robot_toml import robot_names
-from femsense.report.loop.document import Effect
+from femsense.loop.files import saved_loop
 from femsense.report.loop.text import effect_text
 from femsense.report.text import columns, run_document
 
@@ -128,7 +128,7 @@ def demo_text(document: Mapping[str, Any]) -> str:
         rows.append([title, *(_figure((loop.get(when) or {}).get(key), 1e3, "mm") for when in ("before", "after"))])
     rows.append(["time a frame", *(_figure(run["ms_per_frame"], 1.0, "ms") for run in (a, b))])
     lines = [columns(rows, indent=0), "", f"what the declared model lacks (verdict: {loop['verdict']}):"]
-    found = [effect_text(Effect.model_validate(effect)) for effect in loop.get("effects") or []]
+    found = [effect_text(effect) for effect in saved_loop({"effects": loop.get("effects") or []}).effects]
     lines += [f"  {line}" for text in found for line in text.splitlines()] or ["  nothing that these data show"]
     true = [[effect["name"], _entry(effect)] for effect in document["truth"]["effects"]]
     lines += ["", "what it lacks in truth:", columns(true)] if true else []

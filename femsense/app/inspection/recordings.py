@@ -10,17 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.app.input_checks import cloud_problems
 from femsense.app.inspection.reports import Report, attempt
 from femsense.core.arrays import FloatArray
+from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
 from femsense.io.clouds.images import read_color, read_png
 from femsense.io.recording_folder import load_recording
 from femsense.io.recording_tables import TOO_FAR
 from femsense.io.recording_toml import recording_problems
 from femsense.io.tables import read_toml
+from femsense.model.plausibility import doubts_of_cloud_places, doubts_of_recording, warn_of
 from femsense.model.recording import Recording
-from femsense.model.recording_checks import warn_of_values
 
 CLOUDS_READ = 8
 """So many clouds of a recording are read whole; of the others only the name and the size are checked."""
@@ -37,19 +37,22 @@ def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
             return
     loaded = load_recording(folder)
     report.update(_recording_report(loaded))
-    warn_of_values(loaded)
+    warn_of(doubts_of_recording(loaded))
     if not loaded.has_clouds and not loaded.has_markers and not len(loaded.unnamed_frame):
         problems.append(f"{folder}: neither markers nor clouds: nothing was measured")
     _check_clouds(loaded, report, problems)
     problems += cloud_problems(loaded)
+    warn_of(cloud_doubts(loaded))
     _warn_of_unmatched(loaded, folder)
 
 
 def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
     """Report points and colours of a cloud."""
-    from femsense.io.clouds.cloud_files import read_cloud
+    from femsense.io.clouds.cloud_files import read_cloud, viewpoint_doubt
 
     cloud = read_cloud(file)
+    doubt = viewpoint_doubt(file)
+    warn_of([*([doubt] if doubt else []), *doubts_of_cloud_places(cloud.points, str(file))])
     report.update({"points": len(cloud), "colors": cloud.colors is not None})
     if not len(cloud):
         problems.append(f"{file}: the cloud has no points")

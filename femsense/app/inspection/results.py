@@ -112,7 +112,7 @@ def inspect_table(file: Path, report: Report, problems: list[str]) -> None:
     """Report a table by its columns, or as a capture."""
     from femsense.io.importers.guess import guess_format
 
-    if guess_format(file) in ("optitrack", "vicon"):
+    if guess_format(file) != "csv":
         report["kind"] = "capture"
         inspect_capture(file, report, problems)
         return

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.clouds.pcd import read_pcd_fields
-from femsense.io.clouds.ply import read_ply_vertices
+from femsense.io.clouds.pcd import pcd_viewpoint, read_pcd_fields
+from femsense.io.clouds.ply import ply_viewpoint, read_ply_vertices
 from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.pointcloud.cloud import PointCloud
 
@@ -35,6 +35,24 @@ def read_cloud(path: str | Path) -> PointCloud:
     readers = {".pcd": read_pcd_fields, ".ply": read_ply_vertices, ".xyz": read_xyz_columns}
     fields = readers[file.suffix.lower()](file)
     return _cloud_of_fields(fields, file)
+
+
+def viewpoint_doubt(path: str | Path) -> str | None:
+    """Return what is wrong with a PCD or PLY file that says that its sensor did not stand at the origin of its points; else None.
+
+    The points are read as they stand: programs disagree about whether that pose is already applied.
+    """
+    file = Path(path)
+    readers = {".pcd": pcd_viewpoint, ".ply": ply_viewpoint}
+    T = readers[file.suffix.lower()](file) if file.suffix.lower() in readers else None
+    if T is None:
+        return None
+    place = ", ".join(f"{value:.4g}" for value in T[:3, 3])
+    return (
+        f"{file}: its header says that the sensor stood at {place} and {'turned' if not np.allclose(T[:3, :3], np.eye(3)) else 'upright'} "
+        "(VIEWPOINT); it is not applied: the points count as of the camera's frame (origin in the camera, z forward). If they are in "
+        "another frame, transform them by its inverse first"
+    )
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:

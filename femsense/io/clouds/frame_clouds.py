@@ -13,6 +13,7 @@ import numpy as np
 from femsense.core.arrays import IntArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import check_image_size, read_color, read_png
+from femsense.io.tables import beside
 from femsense.model.camera import Camera
 from femsense.model.recording import Recording
 
@@ -82,9 +83,10 @@ def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tupl
     """Return the cloud (or depth) files and the colour files of each frame and view."""
     clouds, colors = [], []
     for name in views:
-        found, depth, color = (numbered_files(folder / kind / name, endings) for kind, endings in FOLDERS.items())
+        places = {kind: beside(folder / kind / "frames", name) for kind in FOLDERS}
+        found, depth, color = (numbered_files(places[kind], endings) for kind, endings in FOLDERS.items())
         for kind, endings in FOLDERS.items():
-            _warn_of_unread(folder / kind / name, endings)
+            _warn_of_unread(places[kind], endings)
         clouds.append([found.get(n) or depth.get(n) for n in numbers.tolist()])
         colors.append([color.get(n) if n not in found and n in depth else None for n in numbers.tolist()])
     return tuple(zip(*clouds)), tuple(zip(*colors))

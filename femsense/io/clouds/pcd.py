@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.pose import make_pose
 
 Column = npt.NDArray[np.generic]
 
@@ -37,8 +40,10 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     if not file.is_file():
         raise InputError("no such file", where=file, expected="a PCD file")
     lines, body = _split(file.read_bytes(), file)
+    _check_points(lines, file)
     header = _header(lines, file)
     if header.data == "ascii":
+        body = body.replace(b",", b".")  # decimal commas: nothing else of PCD has commas
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines() if line.strip())
     _check_size(body, header, file)
     stream = io.BufferedReader(io.BytesIO(header.compose_header().encode() + body))
@@ -49,6 +54,39 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     if len(rows) != header.points:
         raise _short(file, f"{len(rows)} rows", f"{header.points} rows of {sum(header.count)} numbers")
     return {name: _column(rows, name, header) for name in header.fields if not name.startswith(PADDING)}
+
+
+def pcd_viewpoint(path: str | Path) -> FloatArray | None:
+    """Return where the header says that the sensor stood, T_cloud_sensor, shape (4, 4), translation in the file's unit;
+    None where it is the origin of the cloud. Raises InputError."""
+    from scipy.spatial.transform import Rotation
+
+    file = Path(path)
+    with file.open("rb") as stream:
+        words = _split(stream.read(MOST_OF_A_LINE), file)[0].get("VIEWPOINT", [])
+    try:
+        x, y, z, qw, qx, qy, qz = (float(word) for word in words)
+        T = make_pose(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), [x, y, z])
+    except ValueError:  # not seven numbers, or a quaternion of zeros: it says nothing
+        return None
+    return None if np.allclose(T, np.eye(4), atol=1e-9) else T
+
+
+def _check_points(words: dict[str, list[str]], file: Path) -> None:
+    """Refuse a header whose WIDTH × HEIGHT are not its POINTS. Raises InputError."""
+    sides, points = [*words.get("WIDTH", []), *words.get("HEIGHT", [])], words.get("POINTS", [])
+    if (
+        len(sides) == 2
+        and len(points) == 1
+        and "".join([*sides, *points]).isdigit()
+        and int(sides[0]) * int(sides[1]) != int(points[0])
+    ):
+        raise InputError(
+            "a PCD header that contradicts itself",
+            where=file,
+            found=f"WIDTH {sides[0]}, HEIGHT {sides[1]}, POINTS {points[0]}",
+            expected="WIDTH × HEIGHT = POINTS",
+        )
 
 
 PADDING = "#$%&~~"
@@ -103,6 +141,9 @@ def _check_size(body: bytes, header: Any, file: Path) -> None:
     size = header.points * header.build_dtype().itemsize
     if header.data == "binary" and len(body) < size:
         raise _short(file, f"{len(body)} bytes of data", f"{size} bytes")
+    if header.data == "binary" and body[size:].strip(b"\0\r\n "):
+        text = f"{len(body) - size} bytes more than the header announces are not read: is POINTS right?"
+        warnings.warn(f"{file}: {text}", stacklevel=5)
     if header.data == "binary_compressed":
         packed, unpacked = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
         if unpacked != size or len(body) < 8 + packed:

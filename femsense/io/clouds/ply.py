@@ -6,13 +6,17 @@ whatever was in memory.
 
 from __future__ import annotations
 
+import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.pose import make_pose
 
 Column = npt.NDArray[np.generic]
 
@@ -71,10 +75,33 @@ def read_ply_vertices(path: str | Path) -> dict[str, Column]:
             "lists in or before the vertices", where=file, found="property list", expected="vertices of plain numbers first"
         )
     vertex = elements[index]
+    _warn_of_more(storage, elements, body, file)
     if storage == "ascii":
         return _read_ascii(body, sum(element.count for element in elements[:index]), vertex, file)
     order = _ORDERS[storage]
     return _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in elements[:index]), vertex, order, file)
+
+
+def ply_viewpoint(path: str | Path) -> FloatArray | None:
+    """Return where an element `camera`, as PCL writes it, says that the sensor stood: T_cloud_sensor, shape (4, 4), in the file's unit;
+    None where there is none or it is the origin. Raises InputError."""
+    file = Path(path)
+    storage, elements, body = _parse(file.read_bytes(), file)
+    index = next((i for i, element in enumerate(elements) if element.name == "camera" and element.count), None)
+    if index is None or not all(element.regular for element in elements[: index + 1]):
+        return None
+    camera, before = elements[index], elements[:index]
+    if storage == "ascii":
+        row = _read_ascii(body, sum(element.count for element in before), camera, file)
+    else:
+        order = _ORDERS[storage]
+        row = _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in before), camera, order, file)
+    keys = [f"{axis}_axis{part}" for part in "xyz" for axis in "xyz"]
+    if not {"view_px", "view_py", "view_pz", *keys} <= set(row):
+        return None
+    R = np.array([float(row[key][0]) for key in keys]).reshape(3, 3)
+    T = make_pose(R, [float(row[f"view_p{axis}"][0]) for axis in "xyz"])
+    return None if np.allclose(T, np.eye(4), atol=1e-9) else T
 
 
 def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
@@ -107,6 +134,20 @@ def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
     return storage, elements, data[line_end + 1 :]
 
 
+def _warn_of_more(storage: str, elements: list[_Element], body: bytes, file: Path) -> None:
+    """Warn of a file that holds more than its header announces."""
+    if not all(element.regular for element in elements):
+        return
+    if storage == "ascii":
+        more = sum(bool(line.strip()) for line in body.splitlines()) - sum(element.count for element in elements)
+        unit = "lines"
+    else:
+        more = len(body) - sum(e.count * e.row_type(_ORDERS[storage]).itemsize for e in elements)
+        more, unit = (0 if not body[len(body) - more :].strip() else more, "bytes")
+    if more > 0:
+        warnings.warn(f"{file}: {more} {unit} more than the header announces are not read: is its count right?", stacklevel=5)
+
+
 def _with_property(element: _Element, name: str, kind: str) -> _Element:
     return _Element(element.name, element.count, (*element.properties, (name, kind)))
 
@@ -126,7 +167,9 @@ def _read_binary(body: bytes, start: int, vertex: _Element, order: str, file: Pa
 
 
 def _read_ascii(body: bytes, skip: int, vertex: _Element, file: Path) -> dict[str, Column]:
-    lines = [line.split() for line in body.decode("ascii", "replace").splitlines() if line.strip()]
+    text = body.decode("ascii", "replace")
+    text = text.replace(",", ".") if re.search(r"\d,\d", text) else text  # decimal commas: nothing else of PLY has commas
+    lines = [line.split() for line in text.splitlines() if line.strip()]
     rows = lines[skip : skip + vertex.count]
     width = len(vertex.properties)
     if len(rows) < vertex.count or any(len(row) != width for row in rows):

@@ -34,7 +34,9 @@ def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
     comma = "." if _has_decimal_commas(told[-1][1] if told else "") else " "
     rows = [(i, line.replace(",", comma).replace(";", " ").split()) for i, line in told]
     if rows and (len(rows[0][1]) == 1 or not _is_number(rows[0][1][0])):
-        rows = rows[1:]
+        first, rows = rows[0][1], rows[1:]
+        if len(first) == 1 and _is_number(first[0]) and float(first[0]) != len(rows):
+            raise InputError("a broken or shortened file", where=file, found=f"{len(rows)} points", expected=f"{first[0]} points")
     if not rows:
         return {name: np.zeros(0) for name in "xyz"}
     table = _table(rows, file)

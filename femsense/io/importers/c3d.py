@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.text import plain_name
 from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
-from femsense.io.importers.mapping import MARKER
+from femsense.io.importers.tables.mapping import MARKER
 
 BLOCK = 512
 MOST = 65535
@@ -28,6 +29,8 @@ INTEL, DEC, MIPS = 84, 85, 86
 
 NAMELESS = "*"
 """Labels of tracks that nobody named begin so (Vicon Nexus)."""
+OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
+"""Parameters of POINT that name tracks which are no places: results of a model of the body."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,6 +52,10 @@ class Header:
     unit: str | None
     up: str | None
     """The vertical axis as the file says it, such as "+Y"."""
+    outputs: frozenset[str] = frozenset()
+    """Labels that are no places (angles, forces …)."""
+    disagreements: tuple[str, ...] = ()
+    """Where header and parameters say different things."""
 
 
 def open_c3d(path: Path, options: Options) -> Source:
@@ -71,12 +78,19 @@ def open_c3d(path: Path, options: Options) -> Source:
             expected=f"{header.frames} frames",
         )
     chosen = _chosen_labels(header, options, path)
-    extent = _extent(path, header, whole)
+    if not chosen:
+        raise InputError(
+            "no markers", where=path, found=f"results of a model only: {', '.join(header.labels)}", expected="tracks of markers"
+        )
+    extent = _extent(path, header, whole, [k for k, _ in chosen])
     scale = unit_of(options, header.unit, path, extent)
     if header.points > 1:
         check_size(scale * extent, path)
     notes = [f"the file is cut off: {whole} of {header.frames} frames"] if whole < header.frames else []
     notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
+    notes += header.disagreements
+    left_out = [name for name in header.labels if name in header.outputs]
+    notes += [f"results of a model, which are no places, are left out: {', '.join(left_out)}"] if left_out else []
     return Source(
         "c3d",
         path,
@@ -91,6 +105,22 @@ def open_c3d(path: Path, options: Options) -> Source:
         notes=notes,
         names=dict.fromkeys([*_without_subjects(header.labels), *header.labels], MARKER),
     )
+
+
+def list_c3d(path: Path) -> dict[str, Any]:
+    """Return what a C3D file says that it holds. Raises InputError."""
+    header = read_c3d_header(path)
+    source = open_c3d(path, Options(unit=None if header.unit else "mm"))
+    points = [name for name in header.labels if name not in header.outputs]
+    return {
+        "frames": header.frames,
+        "rate_hz": header.rate,
+        "points": points,
+        "no_places": sorted(header.outputs & set(header.labels)) or None,
+        "unit": header.unit,
+        "up_in_file": header.up,
+        "notes": list(source.notes) or None,
+    }
 
 
 def read_c3d_header(path: Path) -> Header:
@@ -115,6 +145,7 @@ def read_c3d_header(path: Path) -> Header:
     rate = values.real(head[20:24])
     labels = _labels(parameters, points)
     frames = _frame_count(parameters, last - first + 1)
+    outputs = _outputs(parameters)
     return Header(
         points,
         int(words[2]),
@@ -126,7 +157,41 @@ def read_c3d_header(path: Path) -> Header:
         labels,
         _text(parameters.get(("POINT", "UNITS"))),
         _up(parameters),
+        outputs,
+        _disagreements(parameters, points, rate, last - first + 1),
     )
+
+
+def _outputs(parameters: Parameters) -> frozenset[str]:
+    """Return the labels that POINT:ANGLES, FORCES … and the further groups of POINT:TYPE_GROUPS name."""
+    kinds = _texts(parameters, "TYPE_GROUPS")
+    groups = {*OUTPUTS, *(kind.upper() for kind in kinds if "MARKER" not in kind.upper() and "LABEL" not in kind.upper())}
+    return frozenset(name for group in groups for name in _texts(parameters, group) if name)
+
+
+def _disagreements(parameters: Parameters, points: int, rate: float, frames: int) -> tuple[str, ...]:
+    """Return where the header and the parameters of a file say different things: the header counts what is stored."""
+    used = int(_scalar(parameters.get(("POINT", "USED")), points))
+    other_rate = _scalar(parameters.get(("POINT", "RATE")), rate)
+    labels, names = len([name for name in _texts(parameters, "LABELS") if name]), parameters.get(("POINT", "LABELS"))
+    found = [f"the header has {points} points, POINT:USED says {used}: the header's are read"] if used != points else []
+    if rate and other_rate and abs(other_rate / rate - 1.0) > 1e-3:
+        found.append(f"the header has {rate:g} frames a second, POINT:RATE {other_rate:g}: the second is taken")
+    if names is not None and labels < min(points, 255):
+        found.append(f"{points} points, but {labels} labels: the rest are called point{labels + 1} …")
+    stored = int(_scalar(parameters.get(("POINT", "FRAMES")), frames))
+    if 0 < stored < MOST and stored != frames and 0 < frames < MOST:
+        found.append(f"the header has {frames} frames, POINT:FRAMES says {stored}")
+    return tuple(found)
+
+
+def _texts(parameters: Parameters, name: str) -> list[str]:
+    """Return the texts of a parameter of POINT and of those that continue it (NAME2, NAME3 …)."""
+    found: list[str] = []
+    for key in (name, *(f"{name}{k}" for k in range(2, 10))):
+        value = parameters.get(("POINT", key), [])
+        found += [value] if isinstance(value, str) else [str(item) for item in value] if isinstance(value, list) else []
+    return found
 
 
 def _frames(
@@ -183,7 +248,11 @@ def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[i
     for wanted in options.topics:
         if wanted not in (*header.labels, *short):
             raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
-    both = enumerate(zip(header.labels, short))
+    both = (
+        (k, pair)
+        for k, pair in enumerate(zip(header.labels, short))
+        if pair[0] not in header.outputs or pair[0] in options.topics
+    )
     taken = [(k, pair) for k, pair in both if not options.topics or any(name in options.topics for name in pair)]
     wanted_names = options.columns
     renamed = [(k, wanted_names.get(a, wanted_names.get(b, b)).removeprefix("marker.")) for k, (a, b) in taken]
@@ -200,11 +269,11 @@ def _without_subjects(labels: Sequence[str]) -> list[str]:
     return [name if name and bare.count(name) == 1 else label for label, name in zip(labels, bare)]
 
 
-def _extent(path: Path, header: Header, whole: int) -> float:
+def _extent(path: Path, header: Header, whole: int, chosen: Sequence[int]) -> float:
     with path.open("rb") as stream:
         stream.seek(header.data_at)
         seen = [_points(stream.read(_frame_size(header)), header) for _ in range(min(whole, 10))]
-    values = np.concatenate([places[~missing] for places, missing in seen])
+    values = np.concatenate([places[chosen][~missing[chosen]] for places, missing in seen])
     return float(np.ptp(values, axis=0).max()) if len(values) else 0.0
 
 
@@ -275,19 +344,16 @@ def _value(data: bytes, values: _Numbers) -> Any:
 
 
 def _decoded(text: bytes) -> str:
-    """Return a text in UTF-8, also where its last letter is cut off by the width of its field; else in Latin-1."""
+    """Return a text in UTF-8, also where its last letter is cut off by the width of its field, else in Latin-1, without its padding."""
     try:
-        return text.decode("utf-8").strip()
+        return plain_name(text.decode("utf-8"))
     except UnicodeDecodeError as error:
         cut = error.reason == "unexpected end of data"
-        return (text[: error.start].decode("utf-8") if cut else text.decode("latin-1")).strip()
+        return plain_name(text[: error.start].decode("utf-8") if cut else text.decode("latin-1"))
 
 
 def _labels(parameters: Parameters, points: int) -> tuple[str, ...]:
-    found: list[str] = []
-    for name in ("LABELS", "LABELS2", "LABELS3", "LABELS4"):
-        value = parameters.get(("POINT", name), [])
-        found += [value] if isinstance(value, str) else list(value)
+    found = _texts(parameters, "LABELS")
     found = [name or f"point{k + 1}" for k, name in enumerate(found[:points])]
     return tuple(found + [f"point{k + 1}" for k in range(len(found), points)])
 

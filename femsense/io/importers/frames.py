@@ -13,14 +13,15 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.units import length_unit
 from femsense.pointcloud.cloud import PointCloud
 
 SMALLEST, LARGEST = 2e-3, 100.0
 """Scenes of motion capture are between these sizes [m]: ten times less than a finger's markers span, ten times a large hall."""
 FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres in one unit."""
+UNITS = ("m", "cm", "mm", "in", "ft")
+"""Units of length that `--unit` takes, in any spelling that `core.units` knows."""
 MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
 DepthImage = npt.NDArray[np.uint16]
 ColorImage = npt.NDArray[np.uint8]
@@ -92,7 +93,7 @@ class Source:
     """What was found in a file or a folder."""
 
     format: str
-    """A name of `guess.FORMATS`."""
+    """A name of `formats.FORMATS`."""
     path: Path
     frames: Callable[[], Iterator[Frame]]
     """Starts from the first frame at each call; a live source may go on for ever."""
@@ -128,7 +129,7 @@ class Options:
     """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02;
     may end in *FACTOR."""
     unit: str | None = None
-    """Of lengths, a key of UNITS."""
+    """Of lengths, one of UNITS."""
     depth_unit: float | None = None
     """Metres in one unit of whole-numbered depth images, where the source says another or none."""
     up: str | None = None
@@ -162,10 +163,9 @@ def unit_of(options: Options, declared: str | None, where: str | Path | None, ex
         InputError: nobody says the unit.
     """
     said = options.unit or declared
-    key = {"meters": "m", "metres": "m", "meter": "m", "millimeters": "mm", "millimetres": "mm", "centimeters": "cm"}
-    name = key.get(str(said).strip().lower(), str(said).strip().lower())
-    if said is not None and name in UNITS:
-        return UNITS[name]
+    unit = length_unit(said) if said is not None else None
+    if unit is not None:
+        return unit.size
     raise InputError(
         "the unit of length is not known" if said is None else "an unknown unit of length",
         where=where,
@@ -196,13 +196,12 @@ def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:
     far = float(np.median(given)) if given.size else 0.0
     if far <= FARTHEST:
         return
-    fitting = [name for name in ("cm", "mm") if UNITS[name] * far <= FARTHEST]
     raise InputError(
         "the scene is farther away than a depth camera sees: another unit than metres?",
         where=where,
         found=f"half of it beyond {far:.4g}",
         expected=f"metres, at most {FARTHEST:g}; or --unit " + "|".join(UNITS),
-        hint=f"in millimetres that would be {1e-3 * far:.4g} m" if "mm" in fitting else None,
+        hint=f"in millimetres that would be {1e-3 * far:.4g} m" if 1e-3 * far <= FARTHEST else None,
     )
 
 

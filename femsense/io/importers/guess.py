@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -12,42 +12,13 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
-from femsense.io.importers.c3d import open_c3d, read_c3d_header
-from femsense.io.importers.csv_tables import header_of
-from femsense.io.importers.folders import CLOUDS, PAIRS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.foreign import export_hint
+from femsense.io.importers.formats import FORMATS, Format, contents_of, format_of
 from femsense.io.importers.frames import Options, Source
-from femsense.io.importers.kinect import open_kinect
-from femsense.io.importers.mapping import check_names, check_taken, check_targets, resolved
-from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
-from femsense.io.importers.plain_csv import open_plain_csv
-from femsense.io.importers.ros import list_ros, open_ros
-from femsense.io.importers.ros_bag import ENDINGS
+from femsense.io.importers.images.folders import PAIRS, folder_kind
 from femsense.io.importers.several import camera_names, joined
+from femsense.io.importers.tables.mapping import check_names, check_taken, check_targets, resolved
 
-FORMATS: dict[str, Callable[[Path, Options], Source]] = {
-    "ros": open_ros,
-    "realsense": open_ros,
-    "kinect": open_kinect,
-    "c3d": open_c3d,
-    "optitrack": open_mocap_csv,
-    "vicon": open_mocap_csv,
-    "csv": open_plain_csv,
-    "tum": open_tum,
-    "redwood": open_redwood,
-    "clouds": open_clouds,
-}
-"""Names of `--format`. Each importer says what it finds as a `Source`, whose frames come one after the other."""
-WHOLE_DEPTHS = ("ros", "realsense", "tum", "redwood")
-"""Formats whose depth images count a unit that may be another."""
-SIGNATURES = (
-    (b"#ROSBAG V2.0", "ros"),
-    (b"\x89MCAP0\r\n", "ros"),
-    (b"SQLite format 3\x00", "ros"),
-    (b"Format Version,", "optitrack"),
-    (b"\x1aE\xdf\xa3", "kinect"),
-)
-"""How files begin; the ending comes second."""
 PACKED = (".zstd", ".zst", ".zip", ".7z", ".tar", ".tgz", ".bz2", ".xz")
 UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is read by its folder, which holds metadata.yaml"
 
@@ -79,27 +50,32 @@ def _opened(path: str | Path, said: Options) -> Source:
     if not source.exists():
         names = [item.name for item in source.parent.iterdir()] if source.parent.is_dir() else []
         raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
-    name = said.format or guess_format(source)
-    if said.base is not None and name not in ("ros", "realsense"):
+    one = _format(source, said)
+    if said.base is not None and not one.transforms:
         raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
-    if said.depth_unit is not None and name not in WHOLE_DEPTHS:
+    if said.depth_unit is not None and not one.whole_depths:
         raise InputError(
             "a unit of depth images is said of what has none, or one of its own",
             where=f"--depth-unit {said.depth_unit:g}",
-            found=name or source,
-            expected=", ".join(WHOLE_DEPTHS),
+            found=one.name,
+            expected=", ".join(name for name, other in FORMATS.items() if other.whole_depths),
         )
-    if name not in FORMATS:
-        found = f"{source.suffix or 'no ending'}" if name is None else name
-        packed = name is None and (source.suffix in PACKED or (source.is_dir() and any(source.glob("*.zstd"))))
-        raise InputError(
-            "not a format that femsense imports" if name is None else "no such format",
-            where=source,
-            found=found,
-            expected="--format " + "|".join(FORMATS),
-            hint=UNPACK if packed else export_hint(source) if name is None else did_you_mean(name, FORMATS),
-        )
-    return FORMATS[name](source, said)
+    return one.open(source, said)
+
+
+def _format(source: Path, said: Options) -> Format:
+    """Return the format that a person says, else the one that the source has. Raises InputError."""
+    one = FORMATS.get(said.format) if said.format else format_of(source)
+    if one is not None:
+        return one
+    packed = not said.format and (source.suffix in PACKED or (source.is_dir() and any(source.glob("*.zstd"))))
+    raise InputError(
+        "no such format" if said.format else "not a format that femsense imports",
+        where=source,
+        found=said.format or source.suffix or "no ending",
+        expected="--format " + "|".join(FORMATS),
+        hint=UNPACK if packed else did_you_mean(said.format, FORMATS) if said.format else export_hint(source),
+    )
 
 
 def open_sources(paths: Sequence[str | Path], options: Options | None = None) -> Source:
@@ -150,12 +126,14 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
 
 def _one_of(path: Path, options: Options) -> Source:
     """Return one of several captures, a camera of its own."""
-    if options.topics and path.exists() and (options.format or guess_format(path)) in ("ros", "realsense"):
-        held = {row["topic"] for row in list_ros(path)["topics"]}
+    one = _format(path, options) if path.exists() else None
+    if one is not None and one.topics is not None and options.topics:
+        held = set(one.topics(path))
         options = replace(options, topics=[topic for topic in options.topics if topic in held])
-    if path.is_file() and (options.format or guess_format(path)) == "csv":
-        held_here = resolved(options.columns, header_of(path)[0])
-        options = replace(options, columns={old: new for old, new in held_here.items() if old in header_of(path)[0]})
+    if one is not None and one.columns is not None:
+        names = list(one.columns(path))
+        mine = {old: new for old, new in resolved(options.columns, names).items() if old in names}
+        options = replace(options, columns=mine)
     source = _opened(path, options)
     if source.views:
         raise InputError(
@@ -173,22 +151,9 @@ def split_name(text: str | Path) -> tuple[str, Path]:
 
 
 def guess_format(path: Path) -> str | None:
-    """Return a key of FORMATS from the first bytes, the ending and the files of a folder; None where nothing fits."""
-    if path.is_dir():
-        if (path / "metadata.yaml").is_file() or any(item.suffix in (".db3", ".mcap") for item in path.iterdir()):
-            return "ros"
-        return folder_kind(path)
-    with path.open("rb") as stream:
-        head = stream.read(512)
-    by_content = next((name for begin, name in SIGNATURES if head.startswith(begin)), None)
-    ending = path.suffix.lower()
-    if by_content is not None or ending in ENDINGS:
-        return by_content or "ros"
-    if ending == ".c3d" or (len(head) == 512 and head[1] == 0x50 and head[0] == 2):
-        return "c3d"
-    if ending in (".csv", ".txt", ".tsv") or path.name.lower().endswith((".csv.gz", ".tsv.gz")):
-        return _csv_kind(path)
-    return "clouds" if ending in CLOUDS else None
+    """Return a name of FORMATS from the first bytes, the ending and the files of a folder; None where nothing fits."""
+    one = format_of(path)
+    return None if one is None else one.name
 
 
 def contents(path: Path) -> dict[str, Any]:
@@ -197,40 +162,4 @@ def contents(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it is broken, empty, or nothing that is known.
     """
-    name = guess_format(path)
-    if name is None:
-        raise InputError(
-            "not a format that femsense imports", where=path, found=path.suffix or "no ending", expected=", ".join(FORMATS)
-        )
-    if name == "ros":
-        return {"format": name, **list_ros(path)}
-    if name == "c3d":
-        header = read_c3d_header(path)
-        open_c3d(path, Options(unit=None if header.unit else "mm"))
-        table = {
-            "frames": header.frames,
-            "rate_hz": header.rate,
-            "points": list(header.labels),
-            "unit": header.unit,
-            "up_in_file": header.up,
-        }
-        return {"format": name, **table}
-    if name in ("optitrack", "vicon"):
-        export = read_export(path)
-        return {
-            "format": export.program,
-            "markers": [n or "(unnamed)" for n, _ in export.markers],
-            "unit": export.unit,
-            "rate_hz": export.rate,
-        }
-    if name == "csv":
-        names, headed = header_of(path)
-        return {"format": name, "columns": names if headed else len(names)}
-    source = FORMATS[name](path, Options(rate=1.0, unit="m"))
-    return {"format": name, "frames": source.count, **source.found}
-
-
-def _csv_kind(path: Path) -> str:
-    if not is_mocap_csv(path):
-        return "csv"
-    return read_export(path).program
+    return contents_of(_format(path, Options()), path)

@@ -7,25 +7,23 @@ import re
 import secrets
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
-from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_csv, write_json, write_toml
+from femsense.core.errors import FemsenseError, InputError
+from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
+from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
 from femsense.io.folder_lock import only_writer
-from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
-from femsense.io.importers.input_samples import spans
+from femsense.io.importers.images.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
-from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
-from femsense.io.importers.summary import summary
-from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
-from femsense.io.recording_toml import FORMAT
+from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
+from femsense.io.importers.tables.actuation import ActuationLog
+from femsense.io.recording_folder import load_recording
+from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
@@ -35,8 +33,6 @@ OWN_FILES = re.compile(
     "|".join(map(re.escape, (*TABLES, RECORD))) + r"|(clouds|depth|color)/([^/]+/)?\d{6,}\.(ply|png)",
 )
 """Names of the files that an import writes: with `--again` only these give way."""
-EXACT = 1e-6
-"""Times are as exact as this [s]."""
 Progress = Callable[..., None]
 
 
@@ -76,20 +72,94 @@ def write_recording(
         check_unchanged(followed(folder))
     if log is not None:
         if actuation and log.actuation not in (None, actuation):
-            raise _another_kind(log.path, actuation, str(log.actuation))
-        _actuation(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
+            raise another_kind(log.path, actuation, str(log.actuation))
+        actuation_of(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
-    with only_writer(final):
+    made = [parent for parent in final.parents if not parent.exists()]
+    try:
+        with only_writer(final):
+            return _write_and_name(source, part, final, identity, Wanted(actuation, zero, log, offset), replace, progress)
+    except FemsenseError:
+        for parent in made:
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+        raise
+
+
+def _write_and_name(
+    source: Source,
+    part: Path,
+    final: Path,
+    identity: Mapping[str, Any],
+    wanted: Wanted,
+    replace: bool,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """Write the unfinished folder and give it its name; what is refused leaves nothing, what is stopped is gone on with."""
+    try:
         _prepare(part, identity)
         with Journal(part, identity) as journal:
             counts = _write_frames(source, part, journal, progress)
-        found = _finish(source, part, journal, counts, actuation, zero, log, offset)
+        _check_counts(source, counts, len(journal.times()))
+        found = write_tables(source, part, journal, counts, wanted)
+        found |= _accepted(source.path, part, final, found)
         tables = {name: file_hash(part / name) for name in TABLES if (part / name).is_file()}
         write_json(part / RECORD, {"identity": identity, "found": found, "tables": tables})
         (part / JOURNAL).unlink()
         _give_name(part, final, replace)
+    except FemsenseError:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
     return found
+
+
+def _accepted(path: Path, part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, str]:
+    """Load what was written as the other commands will, and warn of what it can hardly hold.
+
+    Raises:
+        InputError: they would refuse it; the message names the source, and the place that the finished folder would have.
+    """
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            recording = load_recording(part)
+            warn_of([*doubts_of_recording(recording), *cloud_problems(recording), *cloud_doubts(recording)])
+    except InputError as problem:
+        if not found.get("unlabelled_markers"):
+            place = str(problem.where).replace(f"{part}/", "")
+            where = f"{path}, as {final.name}/{place}" if str(part) in str(problem.where) else problem.where
+            raise type(problem)(
+                problem.what, where=where, found=problem.found, expected=problem.expected, hint=problem.hint
+            ) from None
+        return {"not_ready": " ".join(str(problem).split())}
+    for item in caught:
+        warnings.warn(str(item.message).replace(str(part), str(final)), stacklevel=4)
+    return {}
+
+
+def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
+    """Warn of frames whose time does not go on, and of fewer or more frames than a file announces.
+
+    Raises:
+        InputError: most of the frames are out of order: that clock is none.
+    """
+    lost = counts["out_of_order"]
+    if lost:
+        first = f"the first is number {counts['first_back']} in the file"
+        hint = "stamps that were rounded stand still; a clock that was set back begins anew: export the times with all digits"
+        if lost > kept:
+            raise InputError(
+                "the time does not go on",
+                where=source.path,
+                found=f"{lost} of {lost + kept} frames are not later than the one before them, {first}",
+                expected="frames in order of time",
+                hint=hint,
+            )
+        text = f"{lost} of {lost + kept} frames are dropped, since the time stands still or goes back, {first}"
+        warnings.warn(f"{source.path}: {text}; {hint}", stacklevel=4)
+    if source.count is not None and abs(lost + kept - source.count) > max(1, source.count // 100):
+        warnings.warn(f"{source.path}: {source.count} frames are announced, {lost + kept} were read", stacklevel=4)
 
 
 def _give_name(part: Path, final: Path, replace: bool) -> None:
@@ -136,10 +206,11 @@ def _write_frames(source: Source, part: Path, journal: Journal, progress: Progre
     """Write what comes after the frames that the journal holds; return the count of frames that were left out."""
     done = journal.done or 0
     last = -np.inf if not done else float(journal.times()[-1])
-    number, counts = done, {"out_of_order": 0, "resumed": done}
+    number, counts = done, {"out_of_order": 0, "resumed": done, "first_back": 0}
     for frame in _after(source.frames(), done, counts):
         if not frame.time > last:
             counts["out_of_order"] += 1
+            counts["first_back"] = counts["first_back"] or number + counts["out_of_order"]
             continue
         journal.add(_write_frame(source, frame, part, number))
         last, number = frame.time, number + 1
@@ -210,172 +281,3 @@ def _center(picture: Images, lens: Lens | None, unit: float) -> list[float] | No
     x = (4 * column - lens.cx) / lens.fx * values
     y = (4 * row - lens.cy) / lens.fy * values
     return [float(x.mean()), float(y.mean()), float(values.mean())]
-
-
-# The tables
-
-
-def _finish(
-    source: Source,
-    part: Path,
-    journal: Journal,
-    counts: Mapping[str, int],
-    actuation: str | None,
-    zero: str | None,
-    log: ActuationLog | None,
-    offset: float | None,
-) -> dict[str, Any]:
-    times = journal.times()
-    if not len(times):
-        raise InputError(
-            "no frames", where=source.path, found=f"{source.format} without a frame", expected="frames in order of time"
-        )
-    applied, aligned = (None, {}) if log is None else align(log, journal, offset)
-    columns = list(dict.fromkeys([*_input_columns(journal), *(() if applied is None else applied.columns)]))
-    kind = _actuation(source, columns, actuation or (log.actuation if log is not None else None))
-    zero_kind = zero or ("unknown" if kind == "displacement" and columns else "absolute")
-    write_toml(part / "recording.toml", _document(source, kind, zero_kind, part))
-    values = _known_inputs(source, part, journal, columns, {} if applied is None else applied.at(times))
-    rows = _frame_rows(journal, times[0], values, source.free)
-    write_csv(part / "frames.csv", ["frame", "time_s", *columns, *(["free"] if source.free else [])], rows)
-    camera = ["camera"] if source.views else []
-    _write_rows(part / "markers.csv", ["frame", *camera, "marker", *PLACE_COLUMNS], _marker_rows(journal))
-    _write_rows(part / "loads.csv", ["frame", *PLACE_COLUMNS, *FORCE_COLUMNS], _load_rows(journal))
-    return {
-        **summary(source, journal, counts),
-        **({"frames_left_out": len(journal.left_out)} if journal.left_out else {}),
-        "actuation": kind if columns else None,
-        "actuation_zero": zero_kind if columns else None,
-        "inputs": columns,
-        **aligned,
-    }
-
-
-def _input_columns(journal: Journal) -> list[str]:
-    columns: dict[str, None] = {}
-    for entry in journal.entries():
-        columns.update(dict.fromkeys(entry.inputs))
-    return sorted(columns)
-
-
-def _known_inputs(
-    source: Source, part: Path, journal: Journal, columns: list[str], applied: Mapping[str, FloatArray]
-) -> FloatArray:
-    """Return the inputs of all frames, shape (frames, columns); those where one is not known are left out, with a warning.
-
-    Raises:
-        InputError: none are left.
-    """
-    times = journal.times()
-    values = np.full((len(times), len(columns)), np.nan)
-    loads = np.ones(len(times), dtype=bool)
-    for entry in journal.entries():
-        values[entry.number] = [entry.inputs.get(name, np.nan) for name in columns]
-        loads[entry.number] = np.isfinite(np.array(entry.loads)).all()
-    for name, column in applied.items():
-        values[:, columns.index(name)] = column
-    lost = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~loads)
-    if not len(lost):
-        return values
-    lacking = [name for name, column in zip(columns, values.T) if not np.isfinite(column).all()]
-    told = ", ".join([*lacking, *(() if loads.all() else ("known loads",))])
-    if len(lost) == len(times):
-        raise InputError(
-            "no frame whose inputs are known",
-            where=source.path,
-            found=f"none of {len(times)} frames, {times[0]:.3f} … {times[-1]:.3f} s, has a value of each of {told}",
-            expected="values before and after a frame, on the frames' clock",
-            hint="--clock header|record, or --actuation FILE with a row at each end of what is known to be constant",
-        )
-    warnings.warn(
-        f"{source.path}: {len(lost)} of {len(times)} frames are left out, since {told} "
-        f"{'are' if ',' in told else 'is'} not known then: {spans(lost.tolist(), times - times[0])}",
-        stacklevel=3,
-    )
-    journal.left_out = frozenset(lost.tolist())
-    for folder, ending in (("clouds", "ply"), ("depth", "png"), ("color", "png")):
-        for view in source.views or ("",):
-            for number in journal.left_out:
-                (part / folder / view / f"{number:06d}.{ending}").unlink(missing_ok=True)
-    return values
-
-
-def _actuation(source: Source, columns: list[str], said: str | None) -> str:
-    kind = said or source.actuation
-    cables = [name for name in columns if name.startswith("cable_")]
-    if cables and source.format == "csv" and source.actuation not in (None, kind):
-        raise _another_kind(source.path, str(said), str(source.actuation))
-    if kind is None and cables:
-        raise InputError(
-            "what the cables' values are is not known",
-            where=source.path,
-            found=", ".join(cables[:6]),
-            expected="--inputs tension (newtons) or --inputs displacement (metres, > 0 shortens)",
-            hint="--map NAME=cable_x*FACTOR converts other units",
-        )
-    return kind or "tension"
-
-
-def _another_kind(path: Path, said: str, by_unit: str) -> InputError:
-    return InputError(
-        "the units of the cables' columns say something else", where=f"{path}, --inputs {said}", found=by_unit, expected=said
-    )
-
-
-def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:
-    document: dict[str, Any] = {"format": FORMAT, "actuation": actuation, "actuation_zero": zero}
-    if source.views:
-        return document | {"cameras": {n: _lens(s, part / "depth" / n) | _pose(s) for n, s in source.views.items()}}
-    lens = _lens(source, part / "depth")
-    return document | _pose(source) | ({"camera": lens} if lens else {})
-
-
-def _pose(source: Source) -> dict[str, Any]:
-    return {} if source.T_robot_camera is None else {"T_robot_camera": source.T_robot_camera.tolist()}
-
-
-def _lens(source: Source, images: Path) -> dict[str, Any]:
-    """Return the table of a camera's lens; empty where it has no depth images."""
-    lens = source.lens
-    if lens is None or not images.is_dir():
-        return {}
-    table = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    count = 5 if not np.any(lens.distortion[5:] != 0.0) else 8
-    distortion = np.concatenate([lens.distortion, np.zeros(8)])[:count].tolist()
-    model = {"distortion_model": lens.model} if lens.model != "brown_conrady" else {}
-    return {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}
-
-
-def _frame_rows(
-    journal: Journal, start: float, values: FloatArray, free: Sequence[tuple[float, float]]
-) -> Iterator[Sequence[object]]:
-    for entry in journal.entries():
-        time = entry.time - start
-        told = [int(any(first - EXACT <= time <= last + EXACT for first, last in free))] if free else []
-        yield [entry.number, time, *values[entry.number].tolist(), *told]
-
-
-def _marker_rows(journal: Journal) -> Iterator[Sequence[object]]:
-    for entry in journal.entries():
-        for camera, seen in entry.seen.items():
-            begin = [entry.number, camera] if camera else [entry.number]
-            yield from ([*begin, name, *place] for name, place in seen.markers.items())
-            yield from ([*begin, "", *place] for place in seen.unlabelled)
-
-
-def _load_rows(journal: Journal) -> Iterator[Sequence[object]]:
-    for entry in journal.entries():
-        yield from ([entry.number, *load] for load in entry.loads)
-
-
-def _write_rows(path: Path, columns: list[str], rows: Iterator[Sequence[object]]) -> None:
-    """Write a table, if it has a row."""
-    first = list(islice(rows, 1))
-    if not first:
-        return
-
-    def all_rows() -> Iterator[Sequence[object]]:
-        yield from first
-        yield from rows
-
-    write_csv(path, columns, all_rows())

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.io.meshes import tetgen
 from femsense.io.meshes.abaqus import read_abaqus
 from femsense.io.meshes.content import MeshContent, joined
 from femsense.io.meshes.gmsh import read_gmsh
@@ -53,6 +55,7 @@ def read_content(path: Path, where: str) -> MeshContent:
             where=where,
             found=reason(error),
             expected="tetrahedra in a format that meshio reads (vtu, vtk, msh, …)",
+            hint="decimal commas? Write points" if _has_decimal_commas(path) else None,
         ) from None
     points = content.points
     if points.ndim != 2 or points.shape[1] != 3:
@@ -73,6 +76,8 @@ def _read(path: Path, where: str) -> MeshContent:
         return read_gmsh(path, where)
     if path.suffix.lower() == ".inp" and kind is None:
         return read_abaqus(path, where)
+    if path.suffix.lower() in tetgen.ENDINGS and kind is None:
+        return tetgen.read_tetgen(path, where)
     if kind == "pvtu":
         return joined(read_content(file, str(file)) for file in listed_files(path, where))
     own = read_own(path.read_bytes()) if kind == "vtu" else None
@@ -98,6 +103,13 @@ def _through_meshio(path: Path, kind: str | None) -> MeshContent:
         mesh = meshio.read(path, file_format=kind)
     cells = {name: np.asarray(data, dtype=np.int64) for name, data in mesh.cells_dict.items()}
     return MeshContent(np.asarray(mesh.points, dtype=np.float64), cells, dict(mesh.cell_data_dict))
+
+
+def _has_decimal_commas(path: Path) -> bool:
+    """Whether lines of a text file are numbers with commas in them."""
+    with path.open("rb") as stream:
+        head = stream.read(65536)
+    return b"\0" not in head and re.search(rb"(?m)^\s*[-+]?\d+,\d+(?:\s+[-+]?\d+,\d+)+\s*$", head) is not None
 
 
 def reason(error: BaseException) -> str:

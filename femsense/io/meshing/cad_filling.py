@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.units import PER_METRE
 from femsense.fem.mesh import oriented
 from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.mesh_files import radius_ratio
@@ -34,7 +35,6 @@ from femsense.io.meshing.filling import (
 )
 from femsense.io.meshing.surface import ClosedSurface
 from femsense.io.meshing.tetrahedra import compact
-from femsense.io.robot_body import PER_METRE
 
 OF_WALL = 1 / 6
 """The mesh leaves the faces by no more than this share of the mean thickness of the body's walls, 2 V / A."""

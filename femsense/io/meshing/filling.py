@@ -11,6 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
+from femsense.core.units import PER_METRE
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles
 from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.mesh_files import radius_ratio
@@ -18,7 +19,6 @@ from femsense.io.meshing.surface import ClosedSurface, repaired, shared_edges
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to
 from femsense.io.meshing.tetrahedra import FILL_SECONDS, Unfinished, tetrahedralise
 from femsense.io.meshing.thinning import thinned
-from femsense.io.robot_body import PER_METRE
 
 MOST_TETS = 2000
 """Wanted where nobody says how many …"""

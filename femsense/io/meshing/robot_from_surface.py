@@ -16,6 +16,7 @@ import numpy as np
 import femsense
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError, InputError
+from femsense.core.units import PER_METRE, length_unit
 from femsense.fem.cavities import cavity_seeds
 from femsense.fem.mesh import TetMesh
 from femsense.io.files import check_target, file_hash, followed, write_json, write_text
@@ -27,7 +28,7 @@ from femsense.io.meshing.filling import POOR, Filled, Mesher, MeshOptions, Progr
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import check_finite
 from femsense.io.meshing.tetrahedra import tetrahedralise
-from femsense.io.robot_body import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit
+from femsense.io.robot_body import LARGEST_BODY, SMALLEST_BODY, likely_unit
 from femsense.io.robot_toml import load_robot
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
@@ -65,6 +66,8 @@ def mesh_into(
     """
     source, target = Path(surface).expanduser(), Path(folder).expanduser()
     _check_target(target)
+    said = length_unit(options.unit, allowed=PER_METRE) if options.unit else None
+    options = options if said is None else replace(options, unit=said.name)
     if source.suffix.lower() in CAD_READ and options.unit is None:
         options = replace(options, unit="mm")  # the file says its unit: it is read in this one
     points, triangles = read_any_surface(source, unit=options.unit or "mm")
@@ -274,8 +277,10 @@ def _with_mesh(text: str, toml: Path) -> tuple[str, str, str]:
             expected="a robot.toml, or a new folder",
             hint="femsense inspect says what is wrong with it",
         ) from None
-    if unit not in PER_METRE:
+    known = length_unit(unit, allowed=PER_METRE)
+    if known is None:
         raise InputError("unknown unit", where=f"{toml}: mesh.unit", found=unit, expected=" | ".join(PER_METRE))
+    unit = known.name
     if file.endswith(".vtu"):
         return text, file, unit
     named = re.compile(r"^(\s*file\s*=\s*)([\"'])" + re.escape(file) + r"\2", re.MULTILINE)

@@ -5,58 +5,58 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from femsense.loop.result.records import Correlation, Structure
-from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT
+import numpy as np
 
-Vector = tuple[float, ...]
-"""Three numbers."""
+from femsense.core.arrays import FloatArray
+from femsense.loop.result.records import Correlation, Structure
+from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, NAN, Columns, Number, Triple, Vector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FrameTable:
+class FrameTable(Columns):
     """One row for each frame of all trials, fitted ones first, as columns of equal length."""
 
-    recording: tuple[int, ...]
-    frame: tuple[int, ...]
-    time_s: Vector
-    sweep: tuple[str, ...]
-    held_out: tuple[bool, ...]
-    actuation: Vector
-    unloading: tuple[bool, ...]
-    load_n: Vector
-    before_rms_m: Vector
-    after_rms_m: Vector
-    score_before_m: Vector
+    recording: tuple[int, ...] = ()
+    frame: tuple[int, ...] = ()
+    time_s: Vector = ()
+    sweep: tuple[str, ...] = ()
+    held_out: tuple[bool, ...] = ()
+    actuation: Vector = ()
+    unloading: tuple[bool, ...] = ()
+    load_n: Vector = ()
+    before_rms_m: Vector = ()
+    after_rms_m: Vector = ()
+    score_before_m: Vector = ()
     """How strongly a frame shows the leading pattern [m]."""
-    score_after_m: Vector
+    score_after_m: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pattern:
     """The leading pattern of the residual before, and what its strength goes with."""
 
-    share: float
+    share: Number = NAN
     """Share of the mean square that it holds."""
-    pattern: Mapping[str, Vector]
+    pattern: Mapping[str, Vector] = field(default_factory=dict)
     """Marker → direction, (3,)."""
-    goes_with_before: tuple[Correlation, ...]
-    goes_with_after: tuple[Correlation, ...]
-    covariate: str | None
+    goes_with_before: tuple[Correlation, ...] = ()
+    goes_with_after: tuple[Correlation, ...] = ()
+    covariate: str | None = None
     """What it goes with the most."""
-    covariate_values: Vector
+    covariate_values: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tip:
+class Tip(Columns):
     """The way of the marker farthest from the clamp along its main direction of motion."""
 
-    marker: str
-    direction: Vector
-    recording: tuple[int, ...]
-    frame: tuple[int, ...]
-    measured_m: Vector
-    before_m: Vector
-    after_m: Vector
+    marker: str = ""
+    direction: Vector = ()
+    recording: tuple[int, ...] = ()
+    frame: tuple[int, ...] = ()
+    measured_m: Vector = ()
+    before_m: Vector = ()
+    after_m: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,10 +67,10 @@ class Snapshot:
     recording: int
     frame: int
     marker: tuple[str, ...]
-    measured_m: tuple[Vector, ...]
-    before_m: tuple[Vector, ...]
-    after_m: tuple[Vector, ...]
-    nodes_m: tuple[Vector, ...] | None
+    measured_m: tuple[Triple, ...]
+    before_m: tuple[Triple, ...]
+    after_m: tuple[Triple, ...]
+    nodes_m: tuple[Triple, ...] | None = None
     """Corners of the skin; None where they are many."""
 
 
@@ -78,17 +78,22 @@ class Snapshot:
 class CameraPlace:
     """Where a camera stands and which way it looks, robot frame."""
 
-    axis: Vector
-    position_m: Vector
+    axis: Triple
+    position_m: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pictures:
     """Some frames, with the skin's triangles (None where they are many) and the cameras."""
 
-    triangles: tuple[tuple[int, ...], ...] | None
-    frames: tuple[Snapshot, ...]
-    cameras: tuple[CameraPlace, ...]
+    triangles: tuple[tuple[int, ...], ...] | None = None
+    frames: tuple[Snapshot, ...] = ()
+    cameras: tuple[CameraPlace, ...] = ()
+
+    @property
+    def camera_axes(self) -> list[FloatArray]:
+        """Unit vectors along which cameras look, robot frame, shape (3,) each."""
+        return [axis for camera in self.cameras if np.isfinite(axis := np.asarray(camera.axis, float)).all()]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -96,18 +101,18 @@ class Estimate:
     """The linear estimate of a parameter, with its plausible range."""
 
     label: str
-    value: float | None
-    std: float | None
-    ends: tuple[float, float]
-    unit: str
+    value: float | None = None
+    std: float | None = None
+    ends: Vector = ()
+    unit: str = "1"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ranked:
     """An effect in the first screening."""
 
-    parameters: tuple[Estimate, ...]
-    first_share: float | None
+    parameters: tuple[Estimate, ...] = ()
+    first_share: float | None = None
     """How often it comes first when sweeps are drawn again; None: too few sweeps."""
 
 
@@ -115,8 +120,8 @@ class Ranked:
 class ConfoundingMap:
     """How much of each effect's field (row) is collinear with that of another one (column), calibration projected out."""
 
-    names: tuple[str, ...]
-    share: tuple[Vector, ...]
+    names: tuple[str, ...] = ()
+    share: tuple[Vector, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,10 +130,10 @@ class PoseShift:
 
     recording: int
     camera: int
-    turn_rad: Mapping[str, Vector]
-    shift_m: Mapping[str, Vector]
-    turn_std_rad: Mapping[str, Vector]
-    shift_std_m: Mapping[str, Vector]
+    turn_rad: Mapping[str, Triple] = field(default_factory=dict)
+    shift_m: Mapping[str, Triple] = field(default_factory=dict)
+    turn_std_rad: Mapping[str, Triple] = field(default_factory=dict)
+    shift_std_m: Mapping[str, Triple] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -137,8 +142,8 @@ class InputShift:
 
     recording: int
     cable: str
-    unit: str
-    values: Mapping[str, Vector]
+    unit: str = "1"
+    values: Mapping[str, Vector] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,47 +151,47 @@ class TermShift:
     """A value that calibration may move, by model: (value, standard deviation)."""
 
     label: str
-    unit: str
-    declared: float
-    values: Mapping[str, Vector]
+    unit: str = "1"
+    declared: Number = NAN
+    values: Mapping[str, Vector] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationShift:
     """What calibration says before, with all it may move, and beside the effects."""
 
-    poses: tuple[PoseShift, ...]
-    initial_inputs: tuple[InputShift, ...]
-    parameters: tuple[TermShift, ...]
+    poses: tuple[PoseShift, ...] = ()
+    initial_inputs: tuple[InputShift, ...] = ()
+    parameters: tuple[TermShift, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LackOfFit:
     """The F test of lack of fit against pure error."""
 
-    f: float
-    p_value: float
+    f: Number
+    p_value: Number
     df_lack: int
     df_pure: int
-    pure_error_m: float
+    pure_error_m: Number
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tested:
     """Tests of what a model leaves."""
 
-    structure: Structure
-    lack_of_fit: LackOfFit | None
+    structure: Structure = field(default_factory=Structure)
+    lack_of_fit: LackOfFit | None = None
     """None where too little is repeated."""
-    train_rms_m: float
+    train_rms_m: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tests:
     """Tests of what is left before and after."""
 
-    before: Tested
-    after: Tested
+    before: Tested = field(default_factory=Tested)
+    after: Tested = field(default_factory=Tested)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -196,8 +201,8 @@ class Size:
     label: str
     kind: str
     """"change", "factor", "softer_than", or "whole"."""
-    size: float | None
-    unit: str
+    size: float | None = None
+    unit: str = "1"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -206,12 +211,12 @@ class LoadRow:
 
     recording: int
     frame: int
-    held_out: bool
-    declared_n: float
-    before_n: float
-    before_std_n: float
-    after_n: float
-    after_std_n: float
+    held_out: bool = False
+    declared_n: Number = NAN
+    before_n: Number = NAN
+    before_std_n: Number = NAN
+    after_n: Number = NAN
+    after_std_n: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -220,19 +225,19 @@ class Softer:
 
     title: str
     frame: int
-    ratio: Vector
+    ratio: Vector = ()
     """Forces after / before at each point, for the same dent."""
-    phantom_before_n: float
+    phantom_before_n: Number = NAN
     """Force at the free end that the model would sense where nothing touches."""
-    phantom_after_n: float
+    phantom_after_n: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Compliance:
     """How much a sensed force changes from model to model."""
 
-    points_m: tuple[Vector, ...]
-    frames: tuple[Softer, ...]
+    points_m: tuple[Vector, ...] = ()
+    frames: tuple[Softer, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -247,32 +252,32 @@ class ForceImpact:
 class ForceField:
     """Forces on the surface that would explain the frame with the largest residual."""
 
-    recording: int
-    frame: int
-    points_m: tuple[Vector, ...]
-    forces_n: tuple[Vector, ...]
-    total_n: Vector
-    explained_share: float
+    recording: int = 0
+    frame: int | None = None
+    points_m: tuple[Triple, ...] = ()
+    forces_n: tuple[Triple, ...] = ()
+    total_n: Vector = ()
+    explained_share: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evidence:
     """What the figures and tables of the report need."""
 
-    frames: FrameTable
-    score: Pattern
-    pictures: Pictures
-    ranking: Mapping[str, Ranked]
-    confounding: ConfoundingMap
-    calibration: CalibrationShift
-    tests: Tests
-    power: Mapping[str, tuple[Size, ...]]
+    frames: FrameTable = field(default_factory=FrameTable)
+    score: Pattern = field(default_factory=Pattern)
+    pictures: Pictures = field(default_factory=Pictures)
+    ranking: Mapping[str, Ranked] = field(default_factory=dict)
+    confounding: ConfoundingMap = field(default_factory=ConfoundingMap)
+    calibration: CalibrationShift = field(default_factory=CalibrationShift)
+    tests: Tests = field(default_factory=Tests)
+    power: Mapping[str, tuple[Size, ...]] = field(default_factory=dict)
     """Effect → sizes of its parameters."""
-    excluded: tuple[Mapping[str, tuple[int, ...]], ...]
+    excluded: tuple[Mapping[str, tuple[int, ...]], ...] = ()
     """Reason → frames that are neither fitted nor held out, for each recording."""
-    repeats: int
+    repeats: int | None = None
     """Stays that repeat an earlier one."""
-    forces: ForceImpact
+    forces: ForceImpact = field(default_factory=ForceImpact)
     tip: Tip | None = field(default=None, metadata=AS_EMPTY)
     """None: clouds do not tell where a point of the surface went."""
     equivalent_forces: ForceField | None = field(default=None, metadata=AS_EMPTY)

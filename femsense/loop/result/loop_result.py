@@ -16,6 +16,7 @@ from femsense.loop.result.records import (
     Detectable,
     Errors,
     Left,
+    LoopInputs,
     ModelError,
     NamedEffect,
     Residuals,
@@ -23,7 +24,7 @@ from femsense.loop.result.records import (
     Untestable,
     Value,
 )
-from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, table_of
+from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, NAN, Number, table_of
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
@@ -33,40 +34,34 @@ FOUND, NONE, UNEXPLAINED = "effects", "none", "unexplained"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LoopResult:
-    """The verdict, the effects with their errors before and after, and what the data cannot say."""
+class Loop:
+    """What loop.json holds: the verdict, the effects with their errors before and after, and what the data cannot say."""
 
-    verdict: str
+    verdict: str = ""
     """FOUND, NONE or UNEXPLAINED."""
-    sentence: str
+    sentence: str = ""
     """The verdict in words."""
-    noise_m: float
+    noise_m: Number = NAN
     """Noise of the data [m]: what repeats of a state differ by."""
-    before: Errors
+    before: Errors = field(default_factory=Errors)
     """Of the declared model, calibrated."""
-    after: Errors
+    after: Errors = field(default_factory=Errors)
     """Of the model that is handed back."""
-    effects: tuple[NamedEffect, ...]
+    effects: tuple[NamedEffect, ...] = ()
     """In the order in which they were added."""
-    entries: tuple[Entry, ...]
-    """The effects as tables of `[[effects]]`."""
-    candidates: tuple[TriedEffect, ...]
+    candidates: tuple[TriedEffect, ...] = ()
     """Every effect that was tried."""
-    confounded: tuple[ConfoundedPair, ...]
+    confounded: tuple[ConfoundedPair, ...] = ()
     """Pairs that the data cannot distinguish."""
-    next_experiment: str
+    next_experiment: str = ""
     """What to record to distinguish them, in words."""
-    not_testable: tuple[Untestable, ...]
+    not_testable: tuple[Untestable, ...] = ()
     """Effects that the data cannot show."""
-    detectable: Mapping[str, Detectable]
+    detectable: Mapping[str, Detectable] = field(default_factory=dict)
     """Effect that was not found → the smallest size that would have been seen."""
-    left: Left
+    left: Left = field(default_factory=Left)
     """What the remaining residual looks like."""
-    robot: Robot
-    """The improved robot."""
-    declared: Robot
-    """The robot that came in."""
-    data: DataCard
+    data: DataCard = field(default_factory=DataCard)
     model_error: ModelError | None = field(default=None, metadata=AS_EMPTY)
     """What is left that is no noise."""
     fitted_along: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
@@ -78,6 +73,26 @@ class LoopResult:
     """Held-out residuals before and after, for figures."""
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)
     """What the report draws and tabulates besides."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SavedLoop(Loop):
+    """loop.json as it is read back: what the loop says, and what it was made from."""
+
+    inputs: LoopInputs = field(default_factory=LoopInputs)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class LoopResult(Loop):
+    """What closing the loop returns: what loop.json holds, with the robots."""
+
+    entries: tuple[Entry, ...]
+    """The effects as tables of `[[effects]]`."""
+    robot: Robot
+    """The improved robot."""
+    declared: Robot
+    """The robot that came in."""
 
     def __repr__(self) -> str:
         named = ", ".join(effect.name for effect in self.effects) or "no effect"

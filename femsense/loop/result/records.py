@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-from femsense.loop.result.tables import LEFT_OUT
+import numpy as np
+
+from femsense.loop.result.tables import LEFT_OUT, NAN, Columns, Number, Triple, Vector
 from femsense.model.effects import Entry
 
 NAMED, PASSES = "named", "passes"
@@ -17,29 +19,29 @@ NAMED, PASSES = "named", "passes"
 class Errors:
     """Errors of a model: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
 
-    train_rms_m: float
+    train_rms_m: Number = NAN
     """Where it is fitted [m]."""
-    validation_rms_m: float
+    validation_rms_m: Number = NAN
     """On held-out data [m]."""
-    validation_ci_m: tuple[float, float]
+    validation_ci_m: Vector = ()
     """Its 95 % interval [m]."""
-    validation_ci_by: str
+    validation_ci_by: str = ""
     """What was drawn again for that: "sweeps" or "frames"."""
     train_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
     """Along the normals of clouds [m]; None without clouds."""
     validation_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
-    validation_normal_ci_m: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    validation_normal_ci_m: Vector | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Value:
     """One key of an effect. Vectors and tables keep their shape."""
 
-    value: Any
+    value: Any = None
     """In `unit`."""
-    std: Any
+    std: Any = None
     """Standard deviation of each number in the same shape; None: not fitted."""
-    unit: str
+    unit: str = "1"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,11 +49,11 @@ class NamedEffect:
     """An effect that the model lacks."""
 
     name: str
-    parameters: Mapping[str, Value]
+    parameters: Mapping[str, Value] = field(default_factory=dict)
     """Key of robot.toml → value."""
-    validation_rms_before_m: float
+    validation_rms_before_m: Number = NAN
     """Held-out error without it [m]."""
-    validation_rms_after_m: float
+    validation_rms_after_m: Number = NAN
     """Held-out error with it [m]."""
 
 
@@ -60,7 +62,7 @@ class RefitRecord:
     """What became of a candidate that was refitted together with all that the model has."""
 
     name: str
-    seed: Entry
+    seed: Entry = field(default_factory=dict)
     """What was not fitted of it: a place, a radius, a time."""
     verdict: str = ""
     """NAMED, PASSES, or why not, in words."""
@@ -86,7 +88,7 @@ class RefitRecord:
     """Discretisation error that calibration leaves [m]."""
     takes_over: tuple[str, ...] | None = field(default=None, metadata=LEFT_OUT)
     """Nuisances that are significant without it, and not with it."""
-    seed_std: tuple[float, ...] | None = field(default=None, metadata=LEFT_OUT)
+    seed_std: Vector | None = field(default=None, metadata=LEFT_OUT)
     """Scatter of its coordinates over seeds that explain as much."""
 
     @property
@@ -114,16 +116,16 @@ class TriedEffect:
     """An effect that was tried, with its linear scores at the start and its refits."""
 
     name: str
-    seed: Entry
-    dchi2: float | None
+    seed: Entry = field(default_factory=dict)
+    dchi2: float | None = None
     """Decrease of χ² by its linear step."""
-    dbic: float | None
-    retained_share: float | None
+    dbic: float | None = None
+    retained_share: float | None = None
     """Share of its field that calibration leaves; None: not screened."""
-    dbic_at_end: float | None
+    dbic_at_end: float | None = None
     """Linear dBIC beside all that is named."""
-    refits: tuple[RefitRecord, ...]
-    verdict: str
+    refits: tuple[RefitRecord, ...] = ()
+    verdict: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -144,9 +146,9 @@ class Untestable:
     """An effect that these data cannot show."""
 
     name: str
-    absorbed_share: float
+    absorbed_share: Number = NAN
     """Share of its field that is absorbed by calibration."""
-    retained_share: float
+    retained_share: Number = NAN
     """Share that is left; the squares of the two add up to 1."""
 
 
@@ -154,9 +156,9 @@ class Untestable:
 class Detectable:
     """The smallest size of an effect that would have been seen."""
 
-    smallest: Mapping[str, float | None]
+    smallest: Mapping[str, float | None] = field(default_factory=dict)
     """Label of a parameter → size in `unit`, as `kind` says; empty where the effect is there as a whole or not."""
-    would_be_seen: bool
+    would_be_seen: bool = True
     """Whether any plausible size would be."""
     kind: str | None = field(default=None, metadata=LEFT_OUT)
     """"change", "factor" or "softer_than"."""
@@ -170,9 +172,9 @@ class Correlation:
     """Spearman's correlation of a number a frame with a covariate."""
 
     covariate: str
-    rank_correlation: float
-    p_value: float
-    p_holm: float
+    rank_correlation: Number = NAN
+    p_value: Number = NAN
+    p_holm: Number = NAN
     """Adjusted after Holm (1979)."""
 
 
@@ -180,23 +182,23 @@ class Correlation:
 class FrameError:
     """A frame and what is left in it."""
 
-    recording: int
-    frame: int
-    rms_m: float
+    recording: int = 0
+    frame: int | None = None
+    rms_m: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WorstMarker:
     """The marker with most of what is left."""
 
-    marker: str
-    position_m: tuple[float, ...]
+    marker: str = ""
+    position_m: Vector = ()
     """On the body at rest [m], (3,)."""
-    mean_residual_m: tuple[float, ...]
+    mean_residual_m: Vector = ()
     """[m], (3,)."""
-    direction: tuple[float, ...]
+    direction: Vector = ()
     """The direction that holds most of its mean square, (3,); its sign is that of the mean."""
-    direction_share: float
+    direction_share: Number = NAN
     """How much it holds."""
 
 
@@ -204,13 +206,13 @@ class WorstMarker:
 class Structure:
     """Tests for structure in a residual; p-values as they are, not adjusted."""
 
-    lag_one: float
+    lag_one: Number = NAN
     """Correlation of neighbouring states."""
-    p_value: float
+    p_value: Number = NAN
     """The smallest of all tests."""
-    tests: Mapping[str, float]
+    tests: Mapping[str, Number] = field(default_factory=dict)
     """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart."""
-    significant: bool
+    significant: bool | None = None
     """Whether any test stands after Holm's adjustment."""
 
 
@@ -218,18 +220,18 @@ class Structure:
 class Left:
     """What is left of the residual at the end: how large, where on the body, in which frames, which way, and what it goes with."""
 
-    rms_m: float
-    marker_rms_m: Mapping[str, float]
-    where: WorstMarker
-    worst_frame: FrameError
-    worst_frames: tuple[FrameError, ...]
-    half_in_frames: float
+    rms_m: Number = NAN
+    marker_rms_m: Mapping[str, Number] = field(default_factory=dict)
+    where: WorstMarker = field(default_factory=WorstMarker)
+    worst_frame: FrameError = field(default_factory=FrameError)
+    worst_frames: tuple[FrameError, ...] = ()
+    half_in_frames: Number = NAN
     """Share of the frames, the worst first, that hold half of the mean square."""
-    goes_with: tuple[Correlation, ...]
-    held_out: bool
+    goes_with: tuple[Correlation, ...] = ()
+    held_out: bool = False
     """Whether it is that of held-out data, which alone show it."""
-    structure: Structure
-    explained_share: float
+    structure: Structure = field(default_factory=Structure)
+    explained_share: Number = NAN
     """Share of the mean square beyond the noise that the effects took away."""
 
 
@@ -240,21 +242,21 @@ class ModelError:
     Root mean squares [m] over all axes of a marker; where there are only clouds, along their normals.
     """
 
-    fitted_m: float
+    fitted_m: Number = NAN
     """The model's own error where it is fitted, with all that was found."""
-    held_out_m: float
+    held_out_m: Number = NAN
     """That of the model that is handed back, on held-out data."""
-    noise_m: float
+    noise_m: Number = NAN
     """What a point repeats to."""
-    noise_is_measured: bool
+    noise_is_measured: bool = True
     """Whether that is declared or measured, not assumed."""
-    noise_source: str
+    noise_source: str = ""
     """Where it comes from, in words."""
-    placement_m: float
+    placement_m: Number = NAN
     """How far markers are likely to sit from where they are declared."""
-    discretisation_m: float | None
+    discretisation_m: float | None = None
     """Discretisation error; None where it is not known."""
-    discretisation_note: str
+    discretisation_note: str = ""
     """Why it is not known; empty where it is."""
 
 
@@ -262,9 +264,9 @@ class ModelError:
 class CorrectionRecord:
     """An empirical correction: how far markers are from the model as a function of the inputs. It is no cause."""
 
-    accepted: bool
+    accepted: bool = False
     """Whether held-out markers are predicted better with it."""
-    verdict: str
+    verdict: str = ""
     """Why, in words."""
     validation_rms_before_m: float | None = None
     """Error of the markers on held-out data without it [m]."""
@@ -284,14 +286,14 @@ class CorrectionRecord:
 class CloudCard:
     """What was used of clouds."""
 
-    frames: tuple[int, ...]
+    frames: tuple[int, ...] = ()
     """Frames of each recording."""
-    rows: tuple[int, ...]
+    rows: tuple[int, ...] = ()
     """Rows of each recording."""
-    points_m: Mapping[str, tuple[float, ...]]
+    points_m: Mapping[str, Triple] = field(default_factory=dict)
     """Name of a point of the surface → its place at rest [m], (3,)."""
-    noise_components_m: Mapping[str, float]
-    noise_m: float
+    noise_components_m: Mapping[str, Number] = field(default_factory=dict)
+    noise_m: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -299,43 +301,66 @@ class Outlier:
     """A marker in a frame that is left out."""
 
     frame: int
-    marker: str
+    marker: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DataCard:
     """What the data are and how they were split."""
 
-    recordings: tuple[str, ...]
-    split: tuple[str, ...]
+    recordings: tuple[str | None, ...] = ()
+    split: tuple[str, ...] = ()
     """How each recording was split, in words."""
-    frames_fitted: tuple[tuple[int, ...], ...]
-    frames_held_out: tuple[tuple[int, ...], ...]
-    measured: tuple[str, ...]
+    frames_fitted: tuple[tuple[int, ...], ...] = ()
+    frames_held_out: tuple[tuple[int, ...], ...] = ()
+    measured: tuple[str, ...] = ("markers",)
     """"markers", "clouds" or both."""
-    clouds: CloudCard | None
-    noise_components_m: Mapping[str, float]
-    noise_source: str
-    mesh_error_m: float | None
+    clouds: CloudCard | None = None
+    noise_components_m: Mapping[str, Number] = field(default_factory=dict)
+    noise_source: str = ""
+    mesh_error_m: float | None = None
     """Discretisation error [m], root mean square; None where it is not known."""
-    outliers: tuple[Outlier, ...]
-    effective_observations: float
-    nuisance_after: Mapping[str, Mapping[str, Value]]
+    outliers: tuple[Outlier, ...] = ()
+    effective_observations: Number = NAN
+    nuisance_after: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     """What calibration moves → its values beside all effects."""
-    placement_std_m: float
+    placement_std_m: Number = NAN
     """How well markers are placed [m]."""
     seed: int | None = field(default=None, metadata=LEFT_OUT)
     """Of the random numbers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Residuals:
+class Residuals(Columns):
     """Held-out residuals, one row for each measured point, as columns of equal length."""
 
-    recording: tuple[int, ...]
-    frame: tuple[int, ...]
-    marker: tuple[str, ...]
-    before_m: tuple[tuple[float, ...], ...]
+    recording: tuple[int, ...] = ()
+    frame: tuple[int, ...] = ()
+    marker: tuple[str, ...] = ()
+    before_m: tuple[Triple, ...] = ()
     """Of the declared model, calibrated [m], (k, 3)."""
-    after_m: tuple[tuple[float, ...], ...]
+    after_m: tuple[Triple, ...] = ()
     """Of the model that is handed back [m], (k, 3)."""
+
+    def known(self) -> Residuals:
+        """Return the rows that are finite before and after."""
+        whole = [i for i, pair in enumerate(zip(self.before_m, self.after_m)) if np.isfinite(pair).all()]
+        return Residuals(*(tuple(getattr(self, f.name)[i] for i in whole) for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InputFile:
+    """A robot or a recording that a result was made from."""
+
+    name: str | None = None
+    path: str | None = None
+    sha256: str | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LoopInputs:
+    """What a loop was made from."""
+
+    robot: InputFile = field(default_factory=InputFile)
+    recordings: tuple[InputFile, ...] = ()
+    validation: tuple[InputFile, ...] = ()

@@ -1,10 +1,16 @@
-"""From the types of a result to the plain tables of loop.json."""
+"""Between the types of a result and the plain tables of loop.json.
+
+A type is declared once: `table_of` writes it, `read_table` reads it. A number that is not known is NaN in a type and null in a
+file. What a file does not hold keeps its default, and keys that no type has are left alone: files of other versions can be read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
 
 NONE_AS = "none_as"
 ABSENT = object()
@@ -12,6 +18,23 @@ LEFT_OUT = {NONE_AS: ABSENT}
 """Metadata of a field that is no key of the table where it is None …"""
 AS_EMPTY = {NONE_AS: dict[str, Any]()}
 """… and of one that is an empty table then."""
+NAN = float("nan")
+Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None else value)]
+"""NaN where it is not known."""
+Vector = tuple[Number, ...]
+Triple = Annotated[Vector, Field(min_length=3, max_length=3)]
+
+
+class Columns:
+    """A table as columns of equal length."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where columns differ in length."""
+        columns = (getattr(self, f.name) for f in fields(self) if f.name != "direction")  # type: ignore[arg-type]
+        if len({len(column) for column in columns if isinstance(column, tuple)}) > 1:
+            raise ValueError("the columns differ in length")
 
 
 def table_of(value: Any, *, without: Sequence[str] = ()) -> Any:

@@ -13,7 +13,8 @@ from femsense.loop.data.surface_rows import cloud_frames
 from femsense.loop.data.trial import heads_of
 from femsense.loop.fit.fitted_model import FittedModel, terms_of
 from femsense.loop.fit.joint_fit import JointFit
-from femsense.loop.result.evidence import CalibrationShift, InputShift, PoseShift, TermShift, Vector
+from femsense.loop.result.evidence import CalibrationShift, InputShift, PoseShift, TermShift
+from femsense.loop.result.tables import Vector
 from femsense.model.recording import Recording
 
 

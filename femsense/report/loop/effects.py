@@ -1,21 +1,22 @@
-"""Effects: those that were found, and all that were tried."""
+"""Effects in words: what each means, its values with their plausible range, and the smallest size that would have been seen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from femsense.loop.result.records import NAMED, PASSES
+from femsense.loop.result.evidence import Estimate, Evidence, Ranked, Size
+from femsense.loop.result.loop_result import Loop
+from femsense.loop.result.records import NAMED, PASSES, Detectable, NamedEffect, TriedEffect
 from femsense.model.effects import EFFECTS
 from femsense.report import words
-from femsense.report.loop.document import Candidate, Effect, Parameter
-from femsense.report.loop.evidence import Estimate, Ranked
-from femsense.report.page import Cell, Html, code, element, paragraph, table, together
 
 OUTCOMES = {
     NAMED: "named: part of the improved model",
     PASSES: "alternative: passes all tests too, with less evidence than the one that was named",
 }
 LISTED = 6
+CHANGE = "a change of "
+UNSEEN = "too small to be seen here"
 
 
 def lacks(name: str) -> str:
@@ -23,145 +24,117 @@ def lacks(name: str) -> str:
     return next((effect.lacks for effect in EFFECTS if effect.name == name), "")
 
 
-def soft_line(text: str) -> Html | None:
-    """Return a line in small grey type; None for no text."""
-    return element("div", text, class_="soft") if text else None
-
-
-def effect_name(name: str) -> Html:
-    """Return the name of an effect with what it means below it."""
-    return together(code(name), soft_line(lacks(name)))
-
-
-def effects_table(effects: Sequence[Effect]) -> Html | None:
-    """Return the effects that were found, with their parameters and the held-out error around each."""
-    rows: list[list[object]] = []
-    for effect in effects:
-        parts = [
-            (f"{key} {name}".strip(), words.parameter(value, std, parameter.unit))
-            for key, parameter in effect.parameters.items()
-            for name, value, std in words.entries(parameter.value, parameter.std)
-        ] or [("", words.NOTHING)]
-        errors = [Cell(words.length(e), len(parts)) for e in (effect.validation_rms_before_m, effect.validation_rms_after_m)]
-        first, *more = parts
-        rows.append([Cell(effect_name(effect.name), len(parts)), code(first[0]) if first[0] else "", first[1], *errors])
-        rows += [[None, code(name), value, None, None] for name, value in more]
-    headers = ("Effect", "Parameter", "Value ± std", "Held-out error before", "after")
-    return table(
-        headers,
-        rows,
-        caption="Effects in the order in which they were added, with the parameters of the final fit.",
-        numeric=(3, 4),
-    )
-
-
-def along_table(fitted_along: Mapping[str, Mapping[str, Parameter]]) -> Html | None:
-    """Return what the improved robot has beside the effects that are named, since these were fitted with it; None where that is nothing."""
+def value_rows(effect: NamedEffect) -> list[tuple[str, str]]:
+    """Return the parameters of an effect, each with its label and its value ± standard deviation."""
     rows = [
-        [code(name), code(f"{key} {part}".strip()), words.parameter(value, std, parameter.unit)]
-        for name, parameters in fitted_along.items()
-        for key, parameter in parameters.items()
-        for part, value, std in words.entries(parameter.value, parameter.std)
+        (f"{key} {name}".strip(), words.parameter(value, std, parameter.unit))
+        for key, parameter in effect.parameters.items()
+        for name, value, std in words.entries(parameter.value, parameter.std)
     ]
-    caption = "Fitted along, and part of the improved robot too: what is named was fitted with it, but it is not named itself."
-    return table(("Fitted along", "Parameter", "Value ± std"), rows, caption=caption) if rows else None
+    return rows or [("", words.NOTHING)]
 
 
-def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked], effects: Sequence[Effect]) -> Html | None:
-    """Return all effects that were tried, the best first."""
-    final = {effect.name: effect for effect in effects}
-    rows = [
-        [
-            effect_name(c.name),
-            together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))),
-            words.statistic(c.dchi2),
-            words.statistic(c.dbic),
-            _left_out(c),
-            words.percent(c.retained_share),
-            words.percent(ranked.get(c.name, Ranked()).first_share),
-            _verdict(c),
-        ]
-        for c in candidates
-    ]
-    ranking = table(
-        ("Effect", "Value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "Verdict"),
-        rows,
-        caption="Every effect that was tried, by what the first screening says of it.",
-        numeric=(2, 3, 4, 5, 6),
-        strong=[i for i, c in enumerate(candidates) if c.verdict == NAMED],
-        dense=True,
-    )
-    text = paragraph(
-        "Δχ² is what the effect explains of the residual beyond all that calibration can absorb; ΔBIC takes off a price "
-        "for each parameter and each effect tried, "
-        "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not "
-        "fitted rises, ± its standard error. “Retained” is the share of its trace "
-        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: "
-        "of the final fit where named, else of the linear screening. The modulus and the input offsets are not among "
-        "them: they are always fitted along.",
-        class_="soft",
-    )
-    return together(text, ranking) if ranking else None
-
-
-def _left_out(c: Candidate) -> str:
-    known = [r for r in c.refits if words.known(r.cv_gain)]
-    if not known:
-        return words.NOTHING
-    return words.with_std(known[-1].cv_gain, known[-1].cv_std)
-
-
-def _verdict(c: Candidate) -> str:
-    text = c.verdict.replace("dBIC ", "ΔBIC\u00a0").replace("\u00a0-", "\u00a0−")
+def outcome(tried: TriedEffect) -> str:
+    """Return what became of an effect that was tried."""
+    text = tried.verdict.replace("dBIC ", "ΔBIC\u00a0").replace("\u00a0-", "\u00a0−")
     if text in OUTCOMES or not text or text.startswith("not testable"):
         return OUTCOMES.get(text, text) or words.NOTHING
     return f"excluded: {text}"
 
 
-def _values(effect: Effect | None, ranked: Ranked) -> list[Html]:
-    """Return the values of an effect with their plausible range, a line each; a span where there are many."""
+def ranked_values(
+    tried: TriedEffect, effects: Sequence[NamedEffect], ranking: Mapping[str, Ranked]
+) -> list[tuple[str, str, str]]:
+    """Return label, value and plausible range of each parameter: of the final fit where named, else of the linear screening.
+    Many parameters are drawn together."""
+    ranked = ranking.get(tried.name, Ranked())
+    effect = next((effect for effect in effects if effect.name == tried.name), None)
     if effect is not None and effect.parameters:
         ranges = {p.label.partition("[")[0]: p for p in ranked.parameters}
         parts = [
-            (key, words.parameter(v, s, p.unit), ranges.get(key))
+            (key, words.parameter(value, std, p.unit), _range(ranges.get(key)))
             for key, p in effect.parameters.items()
-            for _, v, s in words.entries(p.value, p.std)
+            for _, value, std in words.entries(p.value, p.std)
         ]
-        return [_value_line(label, text, estimate) for label, text, estimate in parts[:LISTED]]
+        return parts[:LISTED]
     shown = [p for p in ranked.parameters if words.known(p.value) or p.ends]
     if len(shown) > LISTED:
-        seen = [p.value for p in shown if words.known(p.value) and p.value is not None]
+        seen = [p.value for p in shown if p.value is not None and words.known(p.value)]
         text = f"{words.quantity(min(seen), shown[0].unit, 2)} … {words.quantity(max(seen), shown[0].unit, 2)}" if seen else ""
-        return [_value_line(f"{len(shown)} parameters", text, shown[0])]
-    return [_value_line(p.label, words.with_std(p.value, p.std, p.unit) if words.known(p.value) else "", p) for p in shown]
+        return [(f"{len(shown)} parameters", text, _range(shown[0]))]
+    return [(p.label, words.with_std(p.value, p.std, p.unit) if words.known(p.value) else "", _range(p)) for p in shown]
 
 
-def _value_line(label: str, text: str, estimate: Estimate | None) -> Html:
-    ends = estimate.ends if estimate else []
-    factor, unit = words.UNITS.get(estimate.unit, (1.0, estimate.unit)) if estimate else (1.0, "")
-    span = ""
-    if len(ends) == 2 and words.known(ends[0]):
-        top = words.number(factor * (ends[1] or 0.0), 2) if words.known(ends[1]) else "∞"
-        span = " " + words.joined(f"in\u00a0[{words.number(factor * (ends[0] or 0.0), 2)},\u00a0{top}]", unit)
-    return element("div", code(label), f" {text}", element("span", span, class_="soft") if span else "", class_="value")
+def _range(estimate: Estimate | None) -> str:
+    if estimate is None or len(estimate.ends) != 2 or not words.known(estimate.ends[0]):
+        return ""
+    factor, unit = words.UNITS.get(estimate.unit, (1.0, estimate.unit))
+    low, high = (words.number(factor * end, 2) if words.known(end) else "∞" for end in estimate.ends)
+    return words.joined(f"in\u00a0[{low},\u00a0{high}]", unit)
 
 
-def refits_table(candidates: Sequence[Candidate]) -> Html | None:
-    """Return what became of the candidates that were fitted together with calibration."""
-    rows = [
-        [
-            code(c.name),
-            words.statistic(r.dchi2),
-            words.statistic(r.dbic),
-            words.length(r.validation_rms_m),
-            OUTCOMES.get(r.verdict, r.verdict) or words.NOTHING,
-        ]
-        for c in candidates
-        for r in c.refits
+def smallest_sizes(loop: Loop, evidence: Evidence) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return, for every effect that was not found, the smallest change of each parameter that would have been seen, in words."""
+    hidden = {effect.name for effect in loop.not_testable}
+    return [
+        (
+            name,
+            [("", "not testable")] if name in hidden else _sizes(entry, evidence.power.get(name, ()), evidence.ranking.get(name)),
+        )
+        for name, entry in loop.detectable.items()
+        if entry.smallest or evidence.power.get(name)
     ]
-    return table(
-        ("Effect", "Δχ²", "ΔBIC", "Held-out error", "Outcome"),
-        rows,
-        caption="The best of them, fitted together with calibration in full.",
-        numeric=(1, 2, 3),
-    )
+
+
+def _sizes(entry: Detectable, own: Sequence[Size], ranked: Ranked | None) -> list[tuple[str, str]]:
+    kind, unit = entry.kind or "change", entry.unit or "1"
+    sizes = own or [Size(label, kind, size, unit) for label, size in entry.smallest.items()]
+    if len(sizes) > LISTED:
+        return [("", _size_span(entry, sizes))]
+    ends = {p.label: p.ends for p in ranked.parameters} if ranked else {}
+    return [(s.label, _seen_words(entry, s, ends.get(s.label, ()))) for s in sizes]
+
+
+def _size_span(entry: Detectable, sizes: Sequence[Size]) -> str:
+    count = f"({len(sizes)} parameters)"
+    known = sorted((s for s in sizes if words.known(s.size)), key=lambda s: s.size or 0.0)
+    if not known:
+        return f"cannot be seen {count}"
+    least, most = (smallest_words(s.size, s.kind, s.unit) for s in (known[0], known[-1]))
+    span = f"{least} … {most.removeprefix(CHANGE)} {count}"
+    return span if entry.would_be_seen else f"{UNSEEN} ({span})"
+
+
+def _seen_words(entry: Detectable, size: Size, ends: Sequence[float | None]) -> str:
+    """Return the smallest visible size of a parameter, or that no plausible one would be seen."""
+    text = smallest_words(size.size, size.kind, size.unit)
+    if size.kind == "whole" or not words.known(size.size):
+        return text
+    beyond = not entry.would_be_seen or is_beyond(size.size or 0.0, size.kind, ends)
+    return f"{UNSEEN}: it would take {text}" if beyond else text
+
+
+def is_beyond(size: float, kind: str, ends: Sequence[float | None]) -> bool:
+    """Return whether a change leads out of the plausible range from wherever in it one starts."""
+    low, high = (end if end is not None and words.known(end) else None for end in (ends if len(ends) == 2 else (None, None)))
+    if low is None:
+        return False
+    if kind == "softer_than":
+        return size < low
+    if high is None:
+        return False
+    return size * low > high > 0 if kind == "factor" else size > high - low
+
+
+def smallest_words(size: float | None, kind: str, unit: str) -> str:
+    """Return the smallest visible size of a parameter in its own unit, in words."""
+    if size is None or not words.known(size) or size <= 0:
+        return "cannot be seen"
+    if kind == "whole":
+        larger = f"its whole change would have to be {words.number(size)} times as large"
+        return "would have been seen" if size < 1.0 else f"{UNSEEN}: {larger}"
+    if kind == "factor":
+        return f"{CHANGE}{words.number(100.0 * (size - 1.0), 2)} %" if size < 2.0 else f"a factor of {words.number(size, 2)}"
+    if kind == "softer_than":
+        return f"softer than {words.quantity(size, unit, 2)}"
+    return f"{CHANGE}{words.quantity(size, unit, 2)}"

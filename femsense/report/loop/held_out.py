@@ -7,20 +7,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import BoolArray, FloatArray
+from femsense.loop.result.evidence import FrameTable
+from femsense.loop.result.records import Residuals
 from femsense.report import words
 from femsense.report.drawing import AFTER, BEFORE, LINE, MANY, PALE, SOFT, add_legend, as_image, clipped, name_axes, new_axes
-from femsense.report.loop.document import Residuals
-from femsense.report.loop.evidence import Frames
 from femsense.report.loop.residual_against import sweep_labels
-from femsense.report.page import Html, panels
 
 
-def held_out_errors(residuals: Residuals, table: Frames, noise_m: float | None) -> Html | None:
+def held_out_errors(residuals: Residuals, table: FrameTable, noise_m: float) -> list[Markup | None]:
     """Return the errors on held-out data: their distribution, and those of sweeps or frames."""
     if not residuals.frame:
-        return sweep_dots(table, noise_m)
+        return [sweep_dots(table, noise_m)]
     before, after = (np.linalg.norm(np.asarray(values, float), axis=1) for values in (residuals.before_m, residuals.after_m))
     median = [words.length(float(np.median(values))) for values in (before, after)]
     frames = _per_frame(residuals, before, after)
@@ -38,10 +38,10 @@ def held_out_errors(residuals: Residuals, table: Frames, noise_m: float | None) 
         alt=f"Root mean square error of each held-out frame before and after; {fell}.",
         caption="Error of each held-out frame.",
     )
-    return panels(shares, dots)
+    return [shares, dots]
 
 
-def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) -> Any:
+def _distribution(before: FloatArray, after: FloatArray, noise_m: float) -> Any:
     """Draw the shares of errors below a size, with what noise alone would give."""
     figure, axes = new_axes()
     for values, color, name in ((before, BEFORE, "before"), (after, AFTER, "after")):
@@ -56,7 +56,7 @@ def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) 
             label=name,
         )
     top = 1e3 * float(np.quantile(np.concatenate([before, after]), 0.995)) * 1.08
-    if noise_m is not None and words.known(noise_m) and noise_m > 0:
+    if noise_m > 0:
         top = max(top, 2.2e3 * noise_m)
         x = np.linspace(0.0, top, 200)
         axes.plot(
@@ -78,8 +78,7 @@ def _noise_share(ratio: FloatArray) -> FloatArray:
 
 def _per_frame(residuals: Residuals, before: FloatArray, after: FloatArray) -> list[tuple[int, int, float, float]]:
     """Return (recording, frame, rms before, rms after) of each held-out frame, in order."""
-    recording = residuals.recording or [0] * len(residuals.frame)
-    keys = list(zip(recording, residuals.frame))
+    keys = list(zip(residuals.recording, residuals.frame))
     rows: dict[tuple[int, int], list[int]] = {}
     for i, key in enumerate(keys):
         rows.setdefault(key, []).append(i)
@@ -90,7 +89,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float | None) -> Any:
+def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float) -> Any:
     figure, axes = new_axes()
     places = np.arange(len(frames)) + np.array([0.8 * recording for recording, *_ in frames])
     before, after = 1e3 * np.array([f[2] for f in frames]), 1e3 * np.array([f[3] for f in frames])
@@ -101,7 +100,7 @@ def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float 
     axes.plot(places, before, "o", color=BEFORE, markersize=size, markeredgewidth=0, label="before", rasterized=many)
     axes.plot(places, after, "o", color=AFTER, markersize=size, markeredgewidth=0, label="after", rasterized=many)
     if words.known(noise_m):
-        axes.axhline(1e3 * float(noise_m or 0.0), color=SOFT, linewidth=1.2, linestyle=(0, (4, 3)), label="noise")
+        axes.axhline(1e3 * noise_m, color=SOFT, linewidth=1.2, linestyle=(0, (4, 3)), label="noise")
     step = max(1, math.ceil(len(frames) / 9))
     several = len({f[0] for f in frames}) > 1
     labels = [f"{f[1]}\nR{f[0] + 1}" if several else str(f[1]) for f in frames]
@@ -116,7 +115,7 @@ def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float 
 DASH = (0, (4, 3))
 
 
-def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
+def sweep_dots(frames: FrameTable, noise_m: float) -> Markup | None:
     """Return the error of each sweep, held-out ones marked, with its frames as small dots."""
     labels = sweep_labels(frames)
     names = list(dict.fromkeys(zip(labels, frames.held_out)))
@@ -130,7 +129,7 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
     before = _draw_sweeps(axes, frames.before_rms_m, rows, "before", BEFORE, -0.13)
     after = _draw_sweeps(axes, frames.after_rms_m, rows, "after", AFTER, 0.13)
     if words.known(noise_m):
-        axes.axhline(1e3 * float(noise_m or 0.0), color=SOFT, linewidth=1.2, linestyle=DASH, label="noise")
+        axes.axhline(1e3 * noise_m, color=SOFT, linewidth=1.2, linestyle=DASH, label="noise")
     _name_sweeps(axes, [label for label, _ in names])
     name_axes(axes, "sweep", "rms error [mm]")
     add_legend(axes)
@@ -147,10 +146,10 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
 
 
 def _draw_sweeps(
-    axes: Any, rms_m: Sequence[float | None], rows: Sequence[BoolArray], label: str, color: str, side: float
+    axes: Any, rms_m: Sequence[float], rows: Sequence[BoolArray], label: str, color: str, side: float
 ) -> list[float]:
     """Draw the frames of each sweep and their root mean square; return the latter [mm]."""
-    squares = np.array([np.nan if v is None else (1e3 * v) ** 2 for v in rms_m])
+    squares = (1e3 * np.array(rms_m)) ** 2
     sizes = []
     for i, members in enumerate(rows):
         values = squares[members]

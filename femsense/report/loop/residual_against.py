@@ -7,25 +7,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray
+from femsense.loop.result.evidence import FrameTable, Pattern, Tip
 from femsense.report import words
 from femsense.report.drawing import AFTER, BEFORE, INK, PALE, SERIES, add_legend, as_image, clipped, name_axes, new_axes
-from femsense.report.loop.evidence import Frames, Score, Tip
-from femsense.report.page import Html, panels, table
 
 SWEEPS = len(SERIES)
 """So many sweeps have a colour of their own."""
 
 
-def residual_against(frames: Frames, score: Score, tip: Tip) -> Html | None:
+def residual_against(frames: FrameTable, score: Pattern, tip: Tip) -> list[Markup | None]:
     """Return the leading pattern against its best covariate, coloured by direction and by sweep, and the way of the tip."""
-    figures = []
+    figures = list[Markup | None]()
     if score.covariate and len(score.covariate_values) == len(frames.score_before_m) > 0:
-        x, y, z = (
-            np.asarray([np.nan if v is None else v for v in values], float)
-            for values in (score.covariate_values, frames.score_before_m, frames.score_after_m)
-        )
+        x, y, z = (np.asarray(values, float) for values in (score.covariate_values, frames.score_before_m, frames.score_after_m))
         best = score.goes_with_before[0] if score.goes_with_before else None
         strength = "" if best is None else f" (rank correlation {words.number(best.rank_correlation, 2)})"
         x = x + _spread(x)
@@ -56,8 +53,7 @@ def residual_against(frames: Frames, score: Score, tip: Tip) -> Html | None:
                 caption=f"The same, by sweep ({words.counted(len(names), 'sweep')}).",
             )
         )
-    loop = _tip_loop(frames, tip)
-    return panels(*figures, loop)
+    return [*figures, _tip_loop(frames, tip)]
 
 
 def _spread(x: FloatArray) -> FloatArray:
@@ -93,13 +89,13 @@ def _with_unit(name: str) -> str:
     )
 
 
-def sweep_labels(frames: Frames) -> list[str]:
+def sweep_labels(frames: FrameTable) -> list[str]:
     """Return the name of the sweep of each frame, with its recording where there are several."""
     several = len(set(frames.recording)) > 1
     return [f"R{r + 1} {s}" if several else s for r, s in zip(frames.recording, frames.sweep)]
 
 
-def _tip_loop(frames: Frames, tip: Tip) -> Html | None:
+def _tip_loop(frames: FrameTable, tip: Tip) -> Markup | None:
     """Draw the way of the tip against actuation: measured, before and after."""
     place = {key: i for i, key in enumerate(zip(frames.recording, frames.frame))}
     rows = [(place[key], i) for i, key in enumerate(zip(tip.recording, tip.frame)) if key in place]
@@ -117,7 +113,7 @@ def _tip_loop(frames: Frames, tip: Tip) -> Html | None:
     for title, color, way in kinds:
         for n, run in enumerate(runs):
             x = [frames.actuation[a] for a, _ in run]
-            y = [1e3 * (way[b] if way[b] is not None else math.nan) for _, b in run]  # type: ignore[operator]
+            y = [1e3 * way[b] for _, b in run]
             style = (
                 {"linestyle": "none", "marker": "o", "markersize": 3.4, "markeredgewidth": 0}
                 if title == "measured"
@@ -135,29 +131,6 @@ def _tip_loop(frames: Frames, tip: Tip) -> Html | None:
     )
 
 
-def _gap(measured: Sequence[float | None], model: Sequence[float | None]) -> str:
-    gaps = [(a - b) ** 2 for a, b in zip(measured, model) if a is not None and b is not None]
+def _gap(measured: Sequence[float], model: Sequence[float]) -> str:
+    gaps = [(a - b) ** 2 for a, b in zip(measured, model) if math.isfinite(a - b)]
     return words.length(math.sqrt(sum(gaps) / len(gaps))) if gaps else words.NOTHING
-
-
-def covariate_table(score: Score) -> Html | None:
-    """Return what the leading pattern of the residual goes with, before and after."""
-    after = {c.covariate: c for c in score.goes_with_after}
-    rows = [
-        [
-            c.covariate,
-            words.number(c.rank_correlation, 2),
-            words.number(c.p_holm, 2),
-            words.number(after[c.covariate].rank_correlation, 2) if c.covariate in after else words.NOTHING,
-        ]
-        for c in score.goes_with_before
-    ]
-    return table(
-        ("Goes with", "Rank correlation before", "p (Holm)", "after"),
-        rows,
-        caption=(
-            "The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, "
-            "so p is optimistic)."
-        ),
-        numeric=(1, 2, 3),
-    )

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray
+from femsense.loop.result.loop_result import Loop
+from femsense.loop.result.records import Residuals
 from femsense.model.robot import Robot
 from femsense.report import words
 from femsense.report.drawing import (
@@ -29,8 +32,7 @@ from femsense.report.drawing import (
     new_axes,
     nice,
 )
-from femsense.report.loop.document import Loop
-from femsense.report.page import Html, panels, paragraph, together
+from femsense.report.page import render
 
 ARROW_SHARE = 0.2
 """The longest arrow, in sizes of the body."""
@@ -79,10 +81,9 @@ class MeanResidual:
         return float((self.view.flat(before) ** 2).sum() / max((before**2).sum(), 1e-300))
 
 
-def mean_residual(loop: Loop, robot: Robot, surface: DrawnSurface) -> MeanResidual | None:
+def mean_residual(loop: Loop, residuals: Residuals, robot: Robot, surface: DrawnSurface) -> MeanResidual | None:
     """Return the mean residual of each marker, or point of the surface, on the robot of the loop;
     None where nothing has a place on it."""
-    residuals = loop.residuals.known()
     place = {name: point for name, point in zip(robot.marker_names, robot.marker_points)} | surface_points(loop)
     rows = np.array([i for i, name in enumerate(residuals.marker) if name in place], dtype=np.int64)
     if not len(rows):
@@ -122,12 +123,13 @@ def _per_marker(names: Sequence[str], values: FloatArray) -> FloatArray:
     return np.array([np.mean(values[labels == name], axis=0) for name in sorted(set(names))])
 
 
-def mean_residual_panels(loop: Loop, robot: Robot | None, surface: DrawnSurface | None) -> Html | None:
-    """Return both pictures and how they are read."""
-    residual = None if robot is None or surface is None else mean_residual(loop, robot, surface)
+def mean_residual_panels(
+    loop: Loop, residuals: Residuals, cameras: Sequence[FloatArray], robot: Robot | None, surface: DrawnSurface | None
+) -> Markup:
+    """Return both pictures and how they are read; empty without a robot."""
+    residual = None if robot is None or surface is None else mean_residual(loop, residuals, robot, surface)
     if residual is None:
-        return None
-    cameras = [] if loop.evidence is None else loop.evidence.pictures.camera_axes()
+        return Markup()
     pictures = [
         as_image(
             draw_mean_residual(residual, title, cameras if title == "before" else ()),
@@ -136,7 +138,7 @@ def mean_residual_panels(loop: Loop, robot: Robot | None, surface: DrawnSurface 
         )
         for title, mean in residual.means.items()
     ]
-    return together(paragraph(_how_to_read(residual, bool(cameras))), panels(*pictures))
+    return render("pictures.html", text=_how_to_read(residual, bool(cameras)), pictures=pictures)
 
 
 def _how_to_read(residual: MeanResidual, cameras: bool) -> str:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray
+from femsense.loop.result.evidence import Pictures, Snapshot
 from femsense.report import words
 from femsense.report.drawing import (
     AFTER,
@@ -26,9 +28,7 @@ from femsense.report.drawing import (
     new_panels,
     nice,
 )
-from femsense.report.loop.evidence import Pictures, Snapshot
 from femsense.report.loop.residual_at_rest import exaggeration
-from femsense.report.page import Html, paragraph, together
 
 WIDTH = 9.4
 """Of the whole figure [inch]."""
@@ -100,13 +100,13 @@ def _shape(snapshot: Snapshot, pictures: Pictures, rest: DrawnSurface | None) ->
     return DrawnSurface(nodes, triangles) if len(triangles) and triangles.max() < len(nodes) else None
 
 
-def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Html | None:
-    """Return the residuals of three frames as one picture, and how it is read."""
+def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Markup:
+    """Return the residuals of three frames as one picture, and how it is read; empty where there are none."""
     frames = frame_residuals(pictures, rest)
     if frames is None:
-        return None
+        return Markup()
     length = "at true length" if frames.factor == 1 else f"drawn {frames.factor:g} times as long"
-    text = paragraph(
+    text = (
         "Single frames of the fitted data, from little to much actuation, on the shape that the declared model has there. "
         f"Arrows point from the model to the measurement, {length}, with one scale in all pictures; numbers are the rms "
         f"of the frame."
@@ -116,11 +116,11 @@ def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Html
         for title, before, after in zip((f.title for f in pictures.frames if f.measured_m), *frames.residuals.values())
     )
     picture = as_image(
-        draw_frame_residuals(frames, pictures.camera_axes()),
+        draw_frame_residuals(frames, pictures.camera_axes),
         alt=f"Residuals in {len(frames.titles)} frames: {sizes}.",
         wide=True,
     )
-    return together(text, picture)
+    return Markup("<p>{}</p>\n{}").format(text, picture)
 
 
 def draw_frame_residuals(frames: FrameResiduals, cameras: list[FloatArray]) -> Any:

@@ -5,10 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from femsense.loop.result.loop_result import NONE
-from femsense.report.loop.document import Corrected, Detectable, Effect, Left, Loop, Parameter, Untestable, Where
+from femsense.loop.result.loop_result import NONE, Loop
+from femsense.loop.result.records import (
+    ConfoundedPair,
+    CorrectionRecord,
+    Detectable,
+    Left,
+    NamedEffect,
+    Untestable,
+    Value,
+    WorstMarker,
+)
 from femsense.report.text import columns
-from femsense.report.words import VERDICTS
+from femsense.report.words import VERDICTS, known
 
 SURE = 0.05
 """What remains goes with a quantity whose probability under chance, corrected for many tests (Holm), is below this."""
@@ -24,7 +33,7 @@ def loop_text(loop: Loop) -> str:
     for name, parameters in loop.fitted_along.items():
         lines += ["", f"{name} (fitted along, part of the improved robot, not named)", _values(parameters)]
     for title, said in (
-        ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(loop))),
+        ("cannot be distinguished", ", ".join(" / ".join(pair.pair) for pair in open_pairs(loop))),
         ("not testable", ", ".join(map(_untestable, loop.not_testable))),
         ("would have been seen", _seen(loop) if loop.verdict == NONE else ""),
         ("next experiment", loop.next_experiment),
@@ -35,11 +44,11 @@ def loop_text(loop: Loop) -> str:
     return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
 
 
-def effect_text(effect: Effect) -> str:
+def effect_text(effect: NamedEffect) -> str:
     """Return an effect that was found: its name, parameters with one standard deviation, and what it changed."""
     rows = _value_rows(effect.parameters)
     before, after = effect.validation_rms_before_m, effect.validation_rms_after_m
-    if before is not None and after is not None:
+    if known(before) and known(after):
         rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
     return f"{effect.name}\n{columns(rows)}"
 
@@ -47,49 +56,49 @@ def effect_text(effect: Effect) -> str:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _values(parameters: Mapping[str, Parameter]) -> str:
+def _values(parameters: Mapping[str, Value]) -> str:
     return columns(_value_rows(parameters))
 
 
-def _value_rows(parameters: Mapping[str, Parameter]) -> list[list[str]]:
+def _value_rows(parameters: Mapping[str, Value]) -> list[list[str]]:
     return [[key, _parameter(entry.value, entry.std, entry.unit)] for key, entry in parameters.items()]
 
 
-def _open_pairs(loop: Loop) -> list[list[str]]:
+def open_pairs(loop: Loop) -> list[ConfoundedPair]:
     """Return the pairs that the data cannot distinguish: those of what is named, or all where nothing is."""
     names = {effect.name for effect in loop.effects}
-    return [row.pair for row in loop.confounded if names & set(row.pair) or not names]
+    return [row for row in loop.confounded if names & set(row.pair) or not names]
 
 
 def _untestable(effect: Untestable) -> str:
     share = effect.absorbed_share
-    return effect.name + ("" if share is None else f" ({100 * share:.1f} % of it is absorbed by calibration)")
+    return effect.name + ("" if not known(share) else f" ({100 * share:.1f} % of it is absorbed by calibration)")
 
 
 def _seen(loop: Loop) -> str:
     """Return in one line from which size on effects that are testable, and were not found, would have been seen."""
     hidden = {effect.name for effect in loop.not_testable}
-    shown = {name: entry for name, entry in loop.detectable.items() if name not in hidden and entry.would_be_seen is not False}
+    shown = {name: entry for name, entry in loop.detectable.items() if name not in hidden and entry.would_be_seen}
     return ", ".join(f"{name} ({_size(entry)})" for name, entry in shown.items() if entry.smallest)
 
 
 def _size(entry: Detectable) -> str:
     """Return the smallest size that would be seen in all places."""
     largest = max((size for size in entry.smallest.values() if size is not None), default=float("nan"))
-    size = f"{largest:.{4 if entry.kind == 'factor' else 3}g}" + ("" if entry.unit in ("", "1") else f" {entry.unit}")
-    return {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(entry.kind, size)
+    size = f"{largest:.{4 if entry.kind == 'factor' else 3}g}" + ("" if entry.unit in (None, "", "1") else f" {entry.unit}")
+    return {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(entry.kind or "", size)
 
 
 def _left(left: Left) -> str:
     """Return in one line how large the remaining residual is, where, when, what it goes with, and whether it has structure."""
-    if left.rms_m is None:
+    if not known(left.rms_m):
         return ""
     words = [f"{1e3 * left.rms_m:.3g} mm rms" + (" in held-out data" if left.held_out else "")]
     if left.where.marker:
         words.append("most " + _place_text(left.where))
     if left.worst_frame.frame is not None:
         words.append(f"in frame {left.worst_frame.frame}")
-    goes = next((row for row in left.goes_with if (row.p_holm or 0.0) < SURE), None)
+    goes = next((row for row in left.goes_with if not row.p_holm >= SURE), None)
     if goes is not None:
         words.append(f"going with {goes.covariate}")
     if left.structure.significant is not None:
@@ -97,26 +106,26 @@ def _left(left: Left) -> str:
     return ", ".join(words)
 
 
-def _place_text(where: Where) -> str:
+def _place_text(where: WorstMarker) -> str:
     """Return where a residual is largest: at a marker, or at a place on the body at rest."""
-    if not where.marker.startswith("surface ") or where.position_m is None:
+    if not where.marker.startswith("surface ") or not where.position_m:
         return f"at marker {where.marker}"
-    return "at ({:.0f}, {:.0f}, {:.0f}) mm on the body".format(*(1e3 * (v or 0.0) for v in where.position_m))
+    return "at ({:.0f}, {:.0f}, {:.0f}) mm on the body".format(*(1e3 * v for v in where.position_m))
 
 
 def _rows(loop: Loop) -> list[list[str]]:
     rows = []
     keys = [("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")]
-    if loop.before.validation_normal_rms_m != loop.before.validation_rms_m:
+    if loop.before.validation_normal_rms_m not in (None, loop.before.validation_rms_m):
         keys.append(("validation_normal_rms_m", "clouds, along normals, held out"))
     for key, name in keys:
         before, after = getattr(loop.before, key), getattr(loop.after, key)
-        if before is not None and after is not None:
+        if known(before) and known(after):
             rows.append([name, f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
-    if loop.noise_m is not None:
+    if known(loop.noise_m):
         rows.append(["noise", f"{1e3 * loop.noise_m:.3f} mm"])
     own = loop.model_error
-    if own.held_out_m is not None:
+    if own is not None and known(own.held_out_m):
         said = f"{1e3 * own.held_out_m:.3f} mm held out, beyond noise and discretisation; noise: {own.noise_source}"
         rows.append(["error of the model", said])
     if loop.correction is not None:
@@ -124,7 +133,7 @@ def _rows(loop: Loop) -> list[list[str]]:
     return rows
 
 
-def correction_text(own: Corrected) -> str:
+def correction_text(own: CorrectionRecord) -> str:
     """Return what an empirical correction does to held-out markers, and whether it is handed back."""
     before, after = own.validation_rms_before_m, own.validation_rms_after_m
     sizes = "" if before is None or after is None else f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms held out; "

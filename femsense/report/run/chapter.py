@@ -7,12 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from femsense.report import words
+from femsense.report.compare import load_error
 from femsense.report.documents import read_document
-from femsense.report.page import Chapter, Html, section, table, tiles, together
+from femsense.report.page import Chapter, render
 from femsense.report.run.document import RunFacts
-from femsense.report.run.forces import contacts_table, force_panels, force_text, known_loads_table
-from femsense.report.run.frames import frame_panels, status_table
-from femsense.report.run.tables import ContactTable, FrameTable, median_of, read_contacts, read_frames, strongest_contact
+from femsense.report.run.forces import ROWS, ListedContacts, force_pictures, force_text, listed_contacts
+from femsense.report.run.frames import LISTED, frame_pictures, statuses
+from femsense.report.run.tables import (
+    ContactTable,
+    FrameTable,
+    first_of,
+    median_of,
+    read_contacts,
+    read_frames,
+    strongest_contact,
+)
 from femsense.sensing.run_files import RUN_FORMAT
 
 
@@ -30,13 +39,28 @@ def run_chapter(file: Path, title: str) -> Chapter:
     folder = file.parent
     contacts = read_contacts(folder / "contacts.csv") if (folder / "contacts.csv").is_file() else None
     frames = read_frames(folder / "frames.csv") if (folder / "frames.csv").is_file() else None
-    body = together(
-        _summary(facts, contacts, frames),
-        section("Contact forces", force_panels(contacts, frames, folder)),
-        section("Known loads", known_loads_table(facts.known_loads)),
-        section("Contacts", contacts_table(contacts)),
-        section("Frames", status_table(frames), frame_panels(frames)),
-        section("Made from", _origin(facts)),
+    listed: ListedContacts | None = None if contacts is None else listed_contacts(contacts)
+    body = render(
+        "run.html",
+        facts=facts,
+        count=_count(facts, contacts),
+        touched=None if contacts is None else len(set(contacts.frame[contacts.sensed].tolist())),
+        undetermined="" if contacts is None else _undetermined(contacts),
+        residual=None if frames is None or not len(frames) else _residual(frames),
+        forces=force_pictures(contacts, frames, folder),
+        load_error=load_error(facts.known_loads),
+        listed=ROWS,
+        contacts=listed,
+        statuses=[] if frames is None else statuses(frames),
+        listed_statuses=LISTED,
+        first_of=first_of,
+        frames=frame_pictures(frames),
+        origin=(
+            ("Robot", facts.robot),
+            ("Recording", Path(facts.inputs.recording.path or "").name),
+            ("Time in all", f"{words.number(facts.timing.seconds)} s" if words.known(facts.timing.seconds) else ""),
+            ("Versions", ", ".join(f"{name} {version}" for name, version in facts.versions.items())),
+        ),
     )
     return Chapter(title, body, _headline(facts, contacts, frames), facts.robot)
 
@@ -70,28 +94,8 @@ def _count(facts: RunFacts, contacts: ContactTable | None) -> int:
     return facts.contacts if contacts is None else len(set(contacts.contact[contacts.sensed].tolist()))
 
 
-def _summary(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> Html:
-    items = [("Frames ok", f"{facts.frames_ok} of {facts.frames}", "")]
-    touched = 0 if contacts is None else len(set(contacts.frame[contacts.sensed].tolist()))
-    where = (
-        "" if contacts is None else "; ".join(filter(None, [f"in {words.counted(touched, 'frame')}", _undetermined(contacts)]))
-    )
-    items.append(("Contacts", str(_count(facts, contacts)), where))
-    if frames is not None and len(frames):
-        rows = frames.good & (frames.contacts > 0) if (frames.good & (frames.contacts > 0)).any() else frames.good
-        before, after = median_of(frames.before_m[rows]), median_of(frames.after_m[rows])
-        items.append(("Residual with the forces", words.length(after), f"{words.length(before)} without them; median rms"))
-    if words.known(facts.timing.ms_per_frame_median):
-        items.append(("Time a frame", words.joined(words.number(facts.timing.ms_per_frame_median), "ms"), "median"))
-    return tiles(items)
-
-
-def _origin(facts: RunFacts) -> Html | None:
-    recording = Path(facts.inputs.recording.path or "").name
-    rows = [
-        ["Robot", facts.robot],
-        ["Recording", recording],
-        ["Time in all", f"{words.number(facts.timing.seconds)} s" if words.known(facts.timing.seconds) else ""],
-        ["Versions", ", ".join(f"{name} {version}" for name, version in facts.versions.items())],
-    ]
-    return table(("Item", "Value"), [row for row in rows if row[1]], caption="run.json beside this file has the hashes.")
+def _residual(frames: FrameTable) -> tuple[float, float]:
+    """Return the median residuals without and with the forces [m], of the frames with contact if there are any."""
+    touched = frames.good & (frames.contacts > 0)
+    rows = touched if touched.any() else frames.good
+    return median_of(frames.before_m[rows]), median_of(frames.after_m[rows])

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.report import words
-from femsense.report.compare import load_error
 from femsense.report.drawing import (
     MANY,
     SERIES,
@@ -27,8 +28,6 @@ from femsense.report.drawing import (
     nice,
     skin,
 )
-from femsense.report.page import Html, panels, paragraph, table, together
-from femsense.report.run.document import KnownLoad
 from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
 from femsense.sensing.run_arrays import NOISE, undetermined_text
 from femsense.sensing.run_files import read_states
@@ -47,10 +46,10 @@ def force_text(size: float, std: float) -> str:
     return words.joined(words.with_std(factor * float(size), factor * float(std)), unit)
 
 
-def force_panels(contacts: ContactTable | None, frames: FrameTable | None, folder: Path) -> Html | None:
+def force_pictures(contacts: ContactTable | None, frames: FrameTable | None, folder: Path) -> list[Markup | None]:
     """Return the forces over time, and on the body in the frame of the strongest."""
     if contacts is None or not np.isfinite(contacts.size_n).any():
-        return None
+        return []
     numbers = _largest_series(contacts)
     times = contacts.time_s if frames is None or not len(frames) else frames.time_s
     more = len(set(contacts.contact.tolist())) - len(numbers)
@@ -66,7 +65,7 @@ def force_panels(contacts: ContactTable | None, frames: FrameTable | None, folde
         alt=f"Force of {words.counted(len(numbers), 'contact')} over time; {largest}.",
         caption=f"Size of each force; the bands are ± 1 and ± 2 standard deviations.{rest}",
     )
-    return panels(over_time, None if strongest is None else _force_on_body(contacts, frames, folder, contacts.frame[strongest]))
+    return [over_time, None if strongest is None else _force_on_body(contacts, frames, folder, contacts.frame[strongest])]
 
 
 def _largest_series(contacts: ContactTable) -> list[int]:
@@ -119,7 +118,7 @@ def _draw_run(axes: Any, time: FloatArray, size: FloatArray, std: FloatArray, co
     axes.plot(time, size, color=color, linewidth=1.3, rasterized=many)
 
 
-def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Path, number: int) -> Html | None:
+def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Path, number: int) -> Markup | None:
     """Draw the body in the frame of the strongest force, with the forces on it."""
     surface = None if frames is None else _surface_at(folder / "states.npz", frames, number)
     whole = np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
@@ -164,36 +163,29 @@ def _draw_forces(surface: DrawnSurface, contacts: ContactTable, rows: IntArray) 
     return figure
 
 
-def known_loads_table(loads: Sequence[KnownLoad]) -> Html | None:
-    """Return declared loads beside what was sensed there."""
-    rows = [
-        [str(load.frame), words.number(load.declared_n), words.number(load.sensed_n), _signed(load.error_percent)]
-        for load in loads[:ROWS]
-    ]
-    error = load_error(loads)
-    text = paragraph(f"The median size of the error is {error}.") if error != words.NOTHING else None
-    caption = "Declared loads at the given places next to the forces that were sensed there." + first_of(
-        len(loads), ROWS, "run.json"
-    )
-    return (
-        together(text, table(("Frame", "Declared [N]", "Sensed [N]", "Error [%]"), rows, caption=caption, numeric=(1, 2, 3)))
-        or None
-    )
+@dataclass(frozen=True, eq=False, slots=True)
+class ListedContacts:
+    """Contacts one by one."""
+
+    unit: str
+    """Of their forces."""
+    rows: Sequence[tuple[str, ...]]
+    """Frame, time, contact, force, its components, its place, its source."""
+    note: str
+    """What is not listed."""
 
 
-def _signed(value: float | None) -> str:
-    return words.NOTHING if value is None or not words.known(value) else f"{value:+.1f}".replace("-", "−")
+def listed_contacts(contacts: ContactTable) -> ListedContacts | None:
+    """Return the contacts one by one, the first of many, also those that were seen and whose size is not determined.
 
-
-def contacts_table(contacts: ContactTable | None) -> Html | None:
-    """Return the contacts one by one, also those that were seen and whose size is not determined; other forces that noise may make
-    are counted below."""
-    if contacts is None or not (contacts.sensed | contacts.undetermined).any():
+    Other forces that noise may make are counted. None where there are none.
+    """
+    if not (contacts.sensed | contacts.undetermined).any():
         return None
     felt = np.flatnonzero(contacts.sensed | contacts.undetermined)
     factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
     rows = [
-        [
+        (
             str(contacts.frame[i]),
             words.number(float(contacts.time_s[i])),
             str(contacts.contact[i]),
@@ -201,15 +193,15 @@ def contacts_table(contacts: ContactTable | None) -> Html | None:
             _vector(factor * contacts.force_n[i]),
             _vector(1e3 * contacts.place_m[i], 1),
             contacts.source[i] or words.NOTHING,
-        ]
+        )
         for i in felt[:ROWS]
         for size in [words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i]))]
     ]
-    headers = ("Frame", "Time [s]", "Contact", f"Force [{unit}]", f"Components x, y, z [{unit}]", "Place x, y, z [mm]", "Source")
-    caption = "Force on the body and its place on the deformed body, robot frame." + first_of(len(felt), ROWS, "contacts.csv")
+    note = first_of(len(felt), ROWS, "contacts.csv")
     if len(felt) < len(contacts):
-        caption += f" Of less than {NOISE:g} standard deviations, and so none: {words.counted(len(contacts) - len(felt), 'row')} more of contacts.csv."
-    return table(headers, rows, caption=caption, numeric=(1, 2, 3, 4, 5))
+        left_out = words.counted(len(contacts) - len(felt), "row")
+        note += f" Of less than {NOISE:g} standard deviations, and so none: {left_out} more of contacts.csv."
+    return ListedContacts(unit, rows, note)
 
 
 def _vector(values: FloatArray, decimals: int | None = None) -> str:

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray
 from femsense.report import words
@@ -22,35 +23,31 @@ from femsense.report.drawing import (
     new_axes,
     whole_numbers,
 )
-from femsense.report.page import Html, panels, table
 from femsense.report.run.forces import SHOWN
-from femsense.report.run.tables import FrameTable, first_of, median_of
+from femsense.report.run.tables import FrameTable, median_of
 
 LISTED = 40
 
 
-def status_table(frames: FrameTable | None) -> Html | None:
-    """Return the table of frames without a result by their reason."""
-    if frames is None or not len(frames):
-        return None
+def statuses(frames: FrameTable) -> list[tuple[str, list[int]]]:
+    """Return each status with its frames: "ok" first, then the most frequent."""
     counts = Counter(frames.status)
-    reasons = sorted(counts, key=lambda status: (status != "ok", -counts[status]))
-    rows = []
-    for status in reasons[:LISTED]:
-        members = [int(f) for f, s in zip(frames.frame, frames.status) if s == status]
-        rows.append(["with a result" if status == "ok" else f"none: {status}", str(counts[status]), words.frame_list(members)])
-    caption = "What became of the frames." + first_of(len(reasons), LISTED, "frames.csv")
-    return table(("Result", "Frames", "Which"), rows, caption=caption, numeric=(1,))
+    return [
+        (status, [int(frame) for frame, own in zip(frames.frame, frames.status) if own == status])
+        for status in sorted(counts, key=lambda status: (status != "ok", -counts[status]))
+    ]
 
 
-def frame_panels(frames: FrameTable | None) -> Html | None:
+def frame_pictures(frames: FrameTable | None) -> list[Markup | None]:
     """Return residual, time, tensions and pressures over the frames."""
     if frames is None or not frames.good.any():
-        return None
-    return panels(_residual_panel(frames), _time_panel(frames), _tension_panel(frames), _pressure_panel(frames))
+        return []
+    tensions = _drive_panel(frames, frames.tension_n, "tension [N]", "Tension of the cables")
+    pressures = _drive_panel(frames, frames.pressure_pa, "pressure [Pa]", "Pressure in the chambers")
+    return [_residual_panel(frames), _time_panel(frames), tensions, pressures]
 
 
-def _residual_panel(frames: FrameTable) -> Html | None:
+def _residual_panel(frames: FrameTable) -> Markup | None:
     if not np.isfinite(frames.before_m).any():
         return None
     figure, axes = new_axes()
@@ -75,7 +72,7 @@ def _dots(axes: Any, frames: FrameTable, values: FloatArray, color: str, name: s
     )
 
 
-def _time_panel(frames: FrameTable) -> Html | None:
+def _time_panel(frames: FrameTable) -> Markup | None:
     times = frames.ms[np.isfinite(frames.ms)]
     if not len(times):
         return None
@@ -91,15 +88,7 @@ def _time_panel(frames: FrameTable) -> Html | None:
     return as_image(figure, alt=f"Computing time of each frame: {span}.", caption=f"Computing time of each frame; {span}.")
 
 
-def _tension_panel(frames: FrameTable) -> Html | None:
-    return _drive_panel(frames, frames.tension_n, "tension [N]", "Tension of the cables")
-
-
-def _pressure_panel(frames: FrameTable) -> Html | None:
-    return _drive_panel(frames, frames.pressure_pa, "pressure [Pa]", "Pressure in the chambers")
-
-
-def _drive_panel(frames: FrameTable, drives: dict[str, FloatArray], label: str, title: str) -> Html | None:
+def _drive_panel(frames: FrameTable, drives: dict[str, FloatArray], label: str, title: str) -> Markup | None:
     shown = [(name, values) for name, values in drives.items() if np.isfinite(values).any()][:SHOWN]
     if not shown:
         return None

@@ -19,6 +19,7 @@ from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.packet_limit import PacketLimit
 from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
 from femsense.xr.stream.quiet import keep_quiet
 
@@ -102,6 +103,7 @@ class MqttSink:
         self._client.on_connect = self._greet
         self.connected = Event()
         self.was_connected = False
+        self._packets = PacketLimit(f"{address.host}:{address.port}")
         self._client.on_disconnect = self._leave
         self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
         self._client.connect_async(address.host, address.port, keepalive=5)
@@ -131,9 +133,10 @@ class MqttSink:
         client.subscribe([(one, 0) for one in WANTED])
         self.connected.set()
         self.was_connected = True
-        self.send(tuple(message for message in self.hub.newest().values() if message.retained))
+        self.send(self._packets.fitting(tuple(message for message in self.hub.newest().values() if message.retained)))
 
     def _leave(self, *_: object) -> None:
+        self._packets.ended()
         self._refusal.closed(was_connected=self.connected.is_set())
         self.connected.clear()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import re
 import socket
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -18,12 +19,17 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.io.text_numbers import Notation
 from femsense.xr.stream.growing_file import GrowingFile
 from femsense.xr.stream.mqtt import MqttSource, broker_address
 from femsense.xr.stream.serial_line import LONGEST_LINE, WAIT_S, SerialLine
 
 SHOWN = 60
 """Characters of a line that is no reading."""
+WHOLE_PAIR = re.compile(r"[-+]?\d+,\d+")
+"""Two whole numbers with a comma between."""
+NOTATION = Notation(",")
+"""Between semicolons or tabs numbers may have decimal commas."""
 QUIET_S = 3.0
 """After which readings have stopped, as it is said to people."""
 
@@ -84,7 +90,9 @@ class Readings(Iterator[Reading]):
     @property
     def refused(self) -> str:
         """What was passed over, with the first of it; empty where all were readings."""
-        return f"what comes is no reading of its channels, first {_shown(self._first)}" if self.passed else ""
+        text = self._first.decode("utf-8", "replace").strip() if isinstance(self._first, bytes) else ""
+        comma = ": a decimal comma? Write a point, or semicolons between numbers" if WHOLE_PAIR.fullmatch(text) else ""
+        return f"what comes is no reading of its channels, first {_shown(self._first)}{comma}" if self.passed else ""
 
     def close(self) -> None:
         """Let go of the source."""
@@ -134,7 +142,10 @@ def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
         with suppress(ValueError, RecursionError):
             return _of_object(json.loads(text), channels)
         return None
-    cells = [_cell(part) for part in text.replace(";", ",").split(",")]
+    if len(channels) == 1 and WHOLE_PAIR.fullmatch(text):
+        return None  # 0,512: a time and a value, or one value with a decimal comma
+    parts = re.split("[;\t]", text)
+    cells = [_cell(NOTATION.plain(part)) for part in parts] if len(parts) > 1 else [_cell(part) for part in text.split(",")]
     values = [value for value in cells if value is not None]
     if len(values) < len(cells) or not np.isfinite(values).any():
         return None

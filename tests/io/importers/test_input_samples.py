@@ -10,7 +10,7 @@ from imported import imported
 
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Options, Source
-from femsense.io.importers.input_samples import samples_of
+from femsense.io.importers.tables.input_samples import samples_of
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 
@@ -49,7 +49,7 @@ def test_empty_cells_are_filled_between_neighbours_and_left_out_in_a_hole(tmp_pa
 
 
 def test_a_log_with_a_hole_that_ends_early(tmp_path: Path) -> None:
-    from femsense.io.importers.actuation import read_actuation_log
+    from femsense.io.importers.tables.actuation import read_actuation_log
 
     times = [t for t in np.arange(0.0, 2.01, 0.1) if not 0.55 < t < 1.45]
     (tmp_path / "log.csv").write_text("\n".join(["time,cable_a", *(f"{t:.2f},{2 * t:.2f}" for t in times)]) + "\n")

@@ -14,7 +14,7 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
-from femsense.io.importers.kinect import calibrated_lens
+from femsense.io.importers.images.kinect import calibrated_lens
 
 SMALL = (288, 320)
 

@@ -10,9 +10,9 @@ import pytest
 from imported import imported
 
 from femsense.core.errors import InputError
-from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source, open_sources
+from femsense.io.importers.tables.actuation import read_actuation_log
 
 NEXUS = "Trajectories\n100\n,,arm:base,,,arm:tip,,\nFrame,Sub Frame,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n" + "".join(
     f"{k},0,1,2,3,100,200,{300 + k}\n" for k in range(4)

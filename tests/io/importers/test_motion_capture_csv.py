@@ -11,9 +11,9 @@ import pytest
 from helpers import DATA
 
 from femsense.core.errors import InputError
-from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
+from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.model.recording import Recording, marker_grid

@@ -10,8 +10,8 @@ pytest.importorskip("rosbags")
 from ros_writers import BagWriter, write_camera
 
 from femsense.core.errors import InputError
-from femsense.io.importers.ros_bag import open_bag
-from femsense.io.importers.ros_recovery import RecoveredReader
+from femsense.io.importers.ros.bag import open_bag
+from femsense.io.importers.ros.recovery import RecoveredReader
 
 
 @pytest.mark.parametrize("kind", ["1", "mcap"])

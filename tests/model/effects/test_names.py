@@ -19,7 +19,7 @@ OTHER_MEANINGS = {
     ("xr/stream", "payload"),  # the bytes of a message
     ("fem", "hyperelastic"),  # a kind of element
     ("io/robot_toml.py", "gravity"),  # a table of robot.toml
-    ("io/importers/folders.py", "depth_scale"),  # a key of Open3D's lenses
+    ("io/importers/images/folders.py", "depth_scale"),  # a key of Open3D's lenses
     ("io/robot_body.py", "gravity"),
     ("io/robot_toml.py", "creep"),  # a property of the material
     ("io/meshing", "gravity"),  # a table of robot.toml

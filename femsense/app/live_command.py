@@ -1,0 +1,221 @@
+"""`femsense live`: camera, session, page, brokers and terminal put together."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.io.files import write_json
+from femsense.io.robot_toml import load_robot
+from femsense.live.actuation import ActuationLimits, make_actuation
+from femsense.live.dashboard import shown
+from femsense.live.feed import CameraFeed, FeedOptions
+from femsense.live.frames import StampedFrame
+from femsense.live.growing import make_scratch, remove_scratch
+from femsense.live.keeper import start_keeper
+from femsense.live.link import LinkState
+from femsense.live.mcap_sink import McapSink
+from femsense.live.outlet import Outlet, live_document
+from femsense.live.recorder import check_session
+from femsense.live.session import Session, SessionOptions
+from femsense.live.watch import Notice
+from femsense.xr.stream.access import Access, read_password
+from femsense.xr.stream.hub import Hub
+from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
+from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
+from femsense.xr.view import PAGE, live_page_files
+
+PASSWORD = "FEMSENSE_PASSWORD"
+TELL_S = 0.2
+"""How often the state of the session is sent."""
+KEEPER_S = 10.0
+LIVE_FILE = "live.json"
+"""In a session that runs: where its page is."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutletOptions:
+    """Where a session is shown and sent to."""
+
+    is_served: bool = True
+    """Whether there is a page."""
+    host: str = "127.0.0.1"
+    port: int = 0
+    mqtt: str | None = None
+    """Address of a broker."""
+    broker_port: int | None = None
+    """Serve a broker of our own here; 0 takes a free port."""
+    password_file: Path | None = None
+    mcap: Path | None = None
+    page: Path = PAGE
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How `sense_live` runs."""
+
+    actuation: str | None = None
+    """Source of the inputs; None: those that come with the frames."""
+    limits: ActuationLimits = field(default_factory=ActuationLimits)
+    feed: FeedOptions = field(default_factory=FeedOptions)
+    session: SessionOptions = field(default_factory=SessionOptions)
+    outlet: OutletOptions = field(default_factory=OutletOptions)
+    seconds: float | None = None
+    """The session ends by itself after this time [s]."""
+
+
+def sense_live(
+    robot: str | Path,
+    camera: str,
+    options: LiveOptions,
+    *,
+    say: Callable[[str], None],
+    on_url: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Run a session until the camera ends, a person ends it, or its time is over; return its figures.
+
+    Arguments:
+        robot: folder or name.
+        camera: source of frames.
+        options: everything else.
+        say: takes lines for people.
+        on_url: called with the address of the page once it is there.
+
+    Raises:
+        FemsenseError: bad input, a source that cannot be used, no calibration that suffices.
+    """
+    folder = options.session.folder
+    if folder is not None:
+        check_session(folder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of single frames; what matters is a notice
+        body = load_robot(robot)
+    actuation = None if options.actuation is None else make_actuation(options.actuation, body, options.limits)
+    scratch = make_scratch()
+    keeper = start_keeper(scratch, None if folder is None else folder.absolute())
+    with contextlib.ExitStack() as undo:
+        undo.callback(_wait_for, keeper)
+        undo.callback(lambda: keeper.stdin and keeper.stdin.close())
+        undo.callback(remove_scratch, scratch)
+        holder: list[Session] = []
+
+        def skipped(frame: StampedFrame) -> None:
+            for session in holder:
+                session.skipped(frame)
+
+        hub = Hub()
+        undo.callback(hub.close)
+        url, brokers = _serve(hub, body.name, options.outlet)
+        outlet = Outlet(hub, body) if url or brokers or options.outlet.mcap else None
+        feed = undo.enter_context(CameraFeed(camera, replace(options.feed, ring=scratch.name), on_skipped=skipped))
+        session = Session(
+            body,
+            feed,
+            scratch,
+            actuation=actuation,
+            options=options.session,
+            on_answer=outlet.show if outlet is not None else lambda _answer, _taken: None,
+        )
+        holder.append(session)
+        undo.callback(session.close)
+        if url:
+            say(url)
+            on_url(url)
+        stop = Event()
+        undo.callback(stop.set)
+        Thread(target=_tell, args=(session, outlet, brokers, options.seconds, stop, url), daemon=True).start()
+        keys = {"t": session.tare, "q": session.stop}
+        with shown(session.snapshot, lambda key: keys[key](), say, url), contextlib.suppress(KeyboardInterrupt):
+            session.run()
+        session.close()
+        stop.set()
+        if outlet is not None:
+            outlet.end()
+        return _summary(session)
+
+
+def _wait_for(keeper: subprocess.Popen[bytes]) -> None:
+    """Let the keeper tidy up; one that takes long goes on by itself."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        keeper.wait(KEEPER_S)
+
+
+def page_of_session(folder: Path) -> str:
+    """Return where the page of a session is that runs now. Raises InputError where none does."""
+    import json
+
+    file = folder / LIVE_FILE
+    try:
+        return str(json.loads(file.read_text(encoding="utf-8"))["url"])
+    except (OSError, ValueError, KeyError):
+        raise InputError(
+            "no session runs there",
+            where=folder,
+            found=f"no {LIVE_FILE}",
+            expected="the folder of a running `femsense live … -o SESSION`",
+            hint=f"femsense view {folder} shows one that is over",
+        ) from None
+
+
+def summary_text(document: dict[str, Any]) -> str:
+    """Return the figures of a session for people."""
+    d = document
+    received, used = d["frames_received"], d["frames_used"]
+    lines = [
+        f"{used} of {received} frames sensed, {d['frames_skipped']} skipped, {d['frames_dropped']} dropped by the device",
+    ]
+    if "latency_p50_s" in d:
+        p50, p95, p99 = (1e3 * d[f"latency_{name}_s"] for name in ("p50", "p95", "p99"))
+        lines.append(f"latency {p50:.0f} / {p95:.0f} / {p99:.0f} ms (p50 / p95 / p99 of the last seconds)")
+    lines += [f"{notice['kind']}: {notice['text']}" for notice in d["notices"]]
+    if d["link"] != LinkState.STREAMING.value:
+        lines.append(f"camera: {d['link_text']}")
+    if d["recording"]:
+        lines.append(f"\nrecorded: {d['recording']}\nlook at it: femsense view {d['recording']}")
+    return "\n".join(lines)
+
+
+def _serve(hub: Hub, name: str, options: OutletOptions) -> tuple[str, list[MqttSink]]:
+    """Attach page, brokers and file to a hub; return the address of the page, or "", and clients of brokers elsewhere."""
+    password = read_password(options.password_file, os.environ.get(PASSWORD))
+    access, url, brokers = Access(options.host, password), "", []
+    if options.is_served:
+        url = WebSocketServer(hub, live_page_files(options.page), access=access, options=ServerOptions(port=options.port)).url
+    if options.broker_port is not None:
+        EmbeddedBroker(hub, port=options.broker_port, access=access)
+    if options.mqtt is not None:
+        brokers.append(MqttSink(hub, broker_address(options.mqtt, password=password), name))
+    if options.mcap is not None:
+        hub.attach(McapSink(options.mcap))
+    return url, brokers
+
+
+def _tell(session: Session, outlet: Outlet | None, brokers: list[MqttSink], seconds: float | None, stop: Event, url: str) -> None:
+    """Send the state of the session again and again, watch brokers, and end the session in time."""
+    end = time.monotonic() + (float("inf") if seconds is None else seconds)
+    folder, is_told = session.options.folder, False
+    while not stop.wait(TELL_S):
+        for broker in brokers:
+            session.note(Notice.BROKER_AWAY, broker.trouble)
+        if folder is not None and url and not is_told and folder.is_dir():
+            write_json(folder / LIVE_FILE, {"url": url})
+            is_told = True
+        if outlet is not None:
+            outlet.tell(session.snapshot(), time.monotonic())
+        if time.monotonic() > end:
+            session.stop()
+    if is_told and folder is not None:
+        (folder / LIVE_FILE).unlink(missing_ok=True)
+
+
+def _summary(session: Session) -> dict[str, Any]:
+    return dict(live_document(session.snapshot(), time.monotonic()))

@@ -1,0 +1,83 @@
+"""The noise of a row: a mixture of the robot (Gaussian) and of something else (uniform), with its responsibilities.
+
+    −2 log[ exp(−z²/2κ²) + o ],   z = r/σ,   o = (1 − π) √(2π) σ b / (π · size)
+
+π: probability that the pixel shows the robot; size: length over which a pixel that shows something else may lie; b: how likely such a pixel lies on
+this side of the surface. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
+Source of the mixture: Verbeek, Vlassis & Kröse 2003 for EM; Aitkin & Wilson 1980 for outliers as a mixture component.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from femsense.core.arrays import BoolArray, FloatArray
+
+
+def misfit(z: FloatArray, log_other: FloatArray, share: FloatArray, kappa: FloatArray | float = 1.0) -> tuple[float, FloatArray]:
+    """Return Σ share · −2 log[…] of whitened residuals (r,) and the responsibilities of the robot, shape (r,)."""
+    weight = np.empty_like(z)
+    return float(_misfit(z / kappa, log_other, share, weight)), weight
+
+
+@njit(cache=True)
+def _misfit(z, log_other, share, weight):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for j in range(len(z)):
+        a, b = -0.5 * z[j] ** 2, log_other[j]
+        top = max(a, b)
+        log_sum = top + np.log(np.exp(a - top) + np.exp(b - top))
+        total -= 2.0 * share[j] * log_sum
+        weight[j] = np.exp(a - log_sum)
+    return total
+
+
+def log_odds_of_other(robot_share: FloatArray, std: FloatArray, length: float, seen_through: FloatArray) -> FloatArray:
+    """Return log o of pixels.
+
+    Arguments:
+        robot_share: π, shape (r,).
+        std: σ along the ray [m], shape (r,).
+        length: over which something else may lie [m].
+        seen_through: b, shape (r,).
+    """
+    return np.asarray(np.log((1.0 - robot_share) * np.sqrt(2.0 * np.pi) * std * seen_through / (robot_share * length)))
+
+
+@dataclass(frozen=True, slots=True)
+class Width:
+    """κ of the pixels and of all other rows."""
+
+    pixels: float = 1.0
+    others: float = 1.0
+
+    def of(self, pixel: BoolArray) -> FloatArray:
+        """Return κ of rows, of which some are pixels, shape (r,)."""
+        return np.where(pixel, self.pixels, self.others)
+
+    @property
+    def narrow(self) -> bool:
+        """Whether the noise has its own width."""
+        return self.pixels == 1.0 and self.others == 1.0
+
+    def narrowed(self) -> Width:
+        """Return the next, narrower widths."""
+        return Width(*(max(1.0, kappa / 3.0) if kappa > 1.5 else 1.0 for kappa in (self.pixels, self.others)))
+
+
+def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) -> Width:
+    """Return κ at the start of a fit: nine in ten pixels lie within 1.65 κ, and every other row.
+
+    Arguments:
+        z: whitened residuals, shape (r,).
+        pixel: which rows are pixels, shape (r,).
+        coloured: whether colour separates the robot; else κ of pixels is at most `most`.
+    """
+    kappa = np.abs(z) / 1.65
+    common = float(np.quantile(kappa[pixel], 0.9)) if pixel.any() else 1.0
+    common = common if coloured else min(common, most)
+    others = float(kappa[~pixel].max(initial=1.0)) if pixel.any() else 1.0
+    return Width(*(value if value > 1.5 else 1.0 for value in (common, others)))

@@ -1,0 +1,163 @@
+"""Nuisance parameters η: what moves the rows besides contact forces, with a Gaussian prior that contact-free frames teach.
+
+    η = (pose step of each camera, relative softness, relative pull of each cable and chamber, error field b of the cameras, error field m of the model)
+    r = C(x) η + noise,   C = [∂r/∂pose, d·∂x/∂softness, d·∂x/∂pulls, k, |x − x_rest| k]
+
+Contact-free frames i have η_i = (θ, e + e_i): θ and e are common to all, e_i is each frame's own error. With b = s_b·unit, m = s_m·unit
+and the share a of their variance that is common, θ and e have the posterior of a linear Gaussian model in which e_i is marginalised;
+(s_b, s_m, a) maximise its evidence over a grid (type-II maximum likelihood, MacKay 1992). A new frame has η ~ N(μ, R Rᵀ) with the posterior of (θ, e)
+and the prior of its own e_i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.inference.mixture import misfit
+from femsense.inference.rows import Rows
+
+BIAS_M = 5e-6 * 2.0 ** np.arange(10)
+MODEL_SHARE = 0.000625 * 2.0 ** np.arange(8)
+COMMON = (0.0, 0.5, 0.8, 0.95)
+"""Grid of s_b [m], s_m [1] and a [1]."""
+EXPECTED, SIZE_FACTOR = np.array([1e-4, 0.01]), 8.0
+"""Prior of s_b and s_m: log-normal about these, within this factor at one standard deviation."""
+EM_STEPS, EM_TOLERANCE = 8, 0.1
+"""Steps of a fit of η at most, and the decrease of Φ below which it ends."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Nuisance:
+    """The prior N(μ, R Rᵀ) of η in the next frame."""
+
+    first_mean: FloatArray
+    """Mean of (pose steps, softness, pulls) before any frame is seen, shape (c,)."""
+    first_covariance: FloatArray
+    """Its covariance, shape (c, c)."""
+    mean: FloatArray
+    """μ, shape (c + 2p,)."""
+    root: FloatArray
+    """R, shape (c + 2p, q)."""
+    sizes: tuple[float, float, float] = (1e-4, 0.01, 0.0)
+    """s_b [m], s_m [1], a [1]."""
+
+    @property
+    def common(self) -> int:
+        """Number of parameters that are not of the error field."""
+        return len(self.first_mean)
+
+
+def first_nuisance(mean: FloatArray, covariance: FloatArray, centres: int) -> Nuisance:
+    """Return the prior before any contact-free frame is seen, with an error field of so many centres."""
+    root = block_diag(root_of(covariance), np.diag(np.repeat(EXPECTED, centres)))
+    return Nuisance(freeze(mean), freeze(covariance), freeze(np.append(mean, np.zeros(2 * centres))), freeze(root))
+
+
+def columns(rows: Rows, softening: FloatArray) -> FloatArray:
+    """Return C, shape (r, c + 2p); `softening`: node displacements for unit softness and pulls [m], shape (1 + a, n, 3)."""
+    return np.hstack([rows.by_pose, rows.of(softening), rows.field, rows.way[:, None] * rows.field])
+
+
+def fit_nuisance(
+    rows: Rows, residual: FloatArray, N: FloatArray, eta: FloatArray, *, kappa: FloatArray | float = 1.0, steps: int = EM_STEPS
+) -> tuple[FloatArray, float, FloatArray]:
+    """Return the whitened η̃ (unit prior) that minimises Φ by expectation maximisation, Φ, and the weights W of the rows [1/m²], shape (r,).
+
+    Arguments:
+        residual: r − Cμ [m], shape (r,).
+        N: C R [m], shape (r, q).
+        eta: η̃ to start from, shape (q,).
+        kappa: widening of the noise.
+    """
+    last = np.inf
+    for _ in range(steps):
+        phi, weight = misfit((residual - N @ eta) / rows.std, rows.log_other, rows.share, kappa)
+        phi += float(eta @ eta)
+        if last - phi < EM_TOLERANCE:
+            break
+        last = phi
+        W = weight * rows.share / (kappa * rows.std) ** 2
+        NW = N * W[:, None]
+        eta = np.asarray(np.linalg.solve(np.eye(N.shape[1]) + NW.T @ N, NW.T @ residual), dtype=np.float64)
+    phi, weight = misfit((residual - N @ eta) / rows.std, rows.log_other, rows.share, kappa)
+    return eta, phi + float(eta @ eta), weight * rows.share / (kappa * rows.std) ** 2
+
+
+def gram_of(rows: Rows, C: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the inner products of (C, r) under weights W of the rows, shape (c + 2p + 1,) squared."""
+    A = np.hstack([C, rows.residual[:, None]])
+    return np.asarray((A * weight[:, None]).T @ A)
+
+
+def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[float, float, float] | None = None) -> Nuisance:
+    """Return the prior of the next frame from contact-free frames (see above).
+
+    Arguments:
+        grams: of `gram_of`, one a frame.
+        sizes: (s_b, s_m, a) where they are known; else those of the highest evidence.
+    """
+    if sizes is None:
+        grid = ((b, m, a) for b in BIAS_M for m in MODEL_SHARE for a in (0.0, 0.8))
+        best = min(grid, key=lambda s: _evidence(nuisance, grams, s))
+        sizes = min(((*best[:2], a) for a in COMMON), key=lambda s: _evidence(nuisance, grams, s))
+    own, mean, root, inner, right = _normal_equations(nuisance, grams, sizes)[:5]
+    covariance = root @ np.linalg.solve(inner, root.T) + np.diag(np.append(np.zeros(nuisance.common), own**2))
+    return replace(
+        nuisance, mean=freeze(mean + root @ np.linalg.solve(inner, right)), root=freeze(root_of(covariance)), sizes=sizes
+    )
+
+
+def without_poses(gram: FloatArray, pose_steps: int, common: int) -> FloatArray:
+    """Return inner products of a frame with the error field made orthogonal to the pose: what looks like a pose is one (restricted spatial
+    regression, Reich, Hodges & Zadnik 2006).
+
+    Arguments:
+        gram: of `gram_of`.
+        pose_steps: 6 v.
+        common: c, columns before the field.
+    """
+    pose, field = slice(0, pose_steps), slice(common, len(gram) - 1)
+    change = np.eye(len(gram))
+    change[pose, field] = -np.linalg.lstsq(gram[pose, pose], gram[pose, field], rcond=1e-10)[0]
+    return np.asarray(change.T @ gram @ change)
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return a square root R of a covariance R Rᵀ, of the same shape."""
+    values, vectors = np.linalg.eigh(covariance) if covariance.size else (np.zeros(0), np.zeros((0, 0)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _normal_equations(
+    nuisance: Nuisance, grams: Sequence[FloatArray], sizes: tuple[float, float, float]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float, FloatArray]:
+    """Return the sizes of each frame's own errors (2p,), prior mean and root of (θ, e), and the normal equations of its whitened form: matrix and right-hand
+    side; the log determinant of the marginalised errors; and the summed inner products."""
+    c = nuisance.common
+    p = (len(nuisance.mean) - c) // 2
+    spread = np.repeat(sizes[:2], p)
+    own, shared = np.sqrt(1.0 - sizes[2]) * spread, np.sqrt(sizes[2]) * spread
+    total, logdet = np.zeros_like(grams[0]), 0.0
+    for gram in grams:
+        side = own[:, None] * gram[c:-1]
+        core = np.eye(2 * p) + side[:, c:-1] * own
+        total += gram - side.T @ np.linalg.solve(core, side)
+        logdet += float(np.linalg.slogdet(core)[1])
+    root = block_diag(root_of(nuisance.first_covariance), np.diag(shared))
+    mean = np.append(nuisance.first_mean, np.zeros(2 * p))
+    inner = np.eye(root.shape[1]) + root.T @ total[:-1, :-1] @ root
+    right = root.T @ (total[:-1, -1] - total[:-1, :-1] @ mean)
+    return own, mean, root, inner, right, logdet, total
+
+
+def _evidence(nuisance: Nuisance, grams: Sequence[FloatArray], sizes: tuple[float, float, float]) -> float:
+    """Return −2 log evidence of the frames and of the sizes, up to a constant."""
+    _, mean, _, inner, right, logdet, total = _normal_equations(nuisance, grams, sizes)
+    left = total[-1, -1] - 2.0 * mean @ total[:-1, -1] + mean @ total[:-1, :-1] @ mean
+    beforehand = float(((np.log(np.array(sizes[:2]) / EXPECTED) / np.log(SIZE_FACTOR)) ** 2).sum())
+    return float(left - right @ np.linalg.solve(inner, right) + logdet + np.linalg.slogdet(inner)[1]) + beforehand

@@ -1,0 +1,1 @@
+"""Depth images and clouds in folders and files: lenses, registration of colours, pictures."""

@@ -1,0 +1,317 @@
+"""What is settled before the frames of a bag are read: columns, clock, loads, where markers stand."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.importers.frames import Options, unit_of
+from femsense.io.importers.images.pictures import FINE_UNIT
+from femsense.io.importers.ros.bag import Bag, Message
+from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
+from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
+from femsense.io.importers.several import camera_names
+from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
+
+LAG_S = 0.5
+"""A message is written at most this much later than others of its moment."""
+PEEKED = 50
+"""So many first messages of a topic say whether its header stamps are a clock."""
+
+SCANNED = 5000
+"""So many first messages of motors say which of their fields is used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A value of a message that becomes an input."""
+
+    field: str
+    """"position", "effort", "velocity", or "" where the message has one field only."""
+    target: Target
+    """Its name is the column of frames.csv."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """How the messages of a bag become frames."""
+
+    choice: Choice
+    clock: str
+    unit: float
+    actuation: str | None
+    columns: dict[str, dict[str, Taken]]
+    """Topic → name of a value → what it becomes."""
+    load_points: dict[str, list[float]]
+    T_camera_markers: dict[str, FloatArray]
+    metadata: dict[str, str]
+    """Topic of a stream's metadata → its images, where the SDK keeps the device's times there."""
+    up: str | None
+    notes: tuple[str, ...]
+    marker_names: dict[str, str]
+    """Name of a marker, or topic of one without a name → its name in the recording."""
+    scale: float | None
+    """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
+    names: dict[str, str]
+    """Name that `--map` may take → what it may become."""
+
+
+def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
+    """Return what is read from a bag, and how: streams, columns, clock."""
+    notes = list(choice.notes)
+    names = _mappable(bag, choice, options)
+    pressures = [s.topic.name for s in choice.inputs if _is_pressure(s)]
+    own = dict(zip(pressures, camera_names(pressures))) if len(pressures) > 1 else {}
+    columns = {s.topic.name: _input_columns(bag, s, options, own.get(s.topic.name, "")) for s in choice.inputs}
+    notes += _notes_of_twice(columns) + _notes_of_units(columns)
+    fields = {one.field for values in columns.values() for one in values.values()} - {""}
+    actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields))
+    points = {}
+    for stream in choice.loads:
+        target = options.columns.get(stream.topic.name, "")
+        if target.startswith("load@"):
+            points[stream.topic.name] = _load_point(target)
+            notes.append(f"the forces of {stream.topic.name} (frame {stream.frame or '–'}) are taken in the robot's axes")
+        else:
+            notes.append(
+                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z says where they act"
+            )
+    poses = _marker_poses(bag, choice, notes)
+    used = [s for s in choice.markers if s.topic.name in poses]
+    choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
+    renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
+    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else options.depth_unit or choice.depth_unit_m
+    scale = None if options.unit is None else unit_of(options, None, bag.path, 0.0)
+    return Plan(
+        choice,
+        clock,
+        unit,
+        actuation,
+        columns,
+        points,
+        poses,
+        _metadata(bag, choice, clock),
+        options.up,
+        tuple(notes),
+        renamed,
+        scale,
+        names,
+    )
+
+
+def _notes_of_twice(columns: dict[str, dict[str, Taken]]) -> list[str]:
+    """Return a note for each input that several topics hold."""
+    topics: dict[str, list[str]] = {}
+    for topic, values in columns.items():
+        for one in values.values():
+            topics.setdefault(one.target.name, []).append(topic)
+    return [
+        f"{column} stands in {' and '.join(held)}: that of {held[-1]} is taken; --map {held[0]}.NAME={column} takes another's"
+        for column, held in topics.items()
+        if len(held) > 1
+    ]
+
+
+FIELDS = {
+    "effort": "effort, which is N or N m by its message, is taken as newtons",
+    "position": "position, which is m or rad by its message, is taken as metres",
+    "velocity": "velocity is taken as it is",
+    "": "values without a unit are taken as they are, in newtons or metres",
+}
+PRESSURES = "pressures are taken as pascals above the surroundings; FluidPressure is absolute by its definition"
+
+
+def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
+    """Return what is assumed of inputs whose unit nobody said."""
+    notes = []
+    for topic, values in columns.items():
+        for field in FIELDS:
+            names = [one.target.name for one in values.values() if one.field == field and not one.target.scaled]
+            if names and names[0].startswith("chamber_"):
+                notes.append(f"{topic} → {', '.join(names)}: {PRESSURES}: --map NAME={names[0]}*Pa_abs makes them relative")
+            elif names:
+                begin = f"{topic} → {', '.join(names)}: {FIELDS[field]}"
+                notes.append(f"{begin}; motors count ticks, radians or milliampere: --map NAME={names[0]}*FACTOR")
+    return notes
+
+
+def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
+    """Return the names that `--map` may take; those of markers are sought in the messages where one is not known otherwise."""
+    names = {stream.topic.name: LOAD for stream in choice.loads} | {stream.topic.name: MARKER for stream in choice.markers}
+    for stream in choice.inputs if options.columns else ():
+        for name, fld in _largest_values(bag, stream):
+            whole = (stream.topic.name,) if _is_pressure(stream) else ()
+            names |= dict.fromkeys((name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
+    for stream in choice.markers:
+        for message in bag.messages([stream.topic.name]):
+            if set(options.columns) <= set(names):
+                break
+            with contextlib.suppress(InputError):
+                found = markers_of(bag.decode(message), stream.topic.type)
+                names |= {label: MARKER for label, _ in found if label and label not in names}
+    return names
+
+
+def _is_pressure(stream: Stream) -> bool:
+    """Whether a topic holds one pressure, which its own name names."""
+    return stream.topic.type.endswith("FluidPressure")
+
+
+def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict[str, Taken]:
+    """Return name in the message → what it becomes; `own` is the name of a pressure where several topics hold one."""
+    topic = stream.topic.name
+    given = _largest_values(bag, stream)
+    names = list(dict.fromkeys(name for name, _ in given))
+    columns: dict[str, Taken] = {}
+    for name in names:
+        available = [fld for n, fld in given if n == name]
+        usual = next(
+            (fld for fld in ("effort", "position", "") if fld in available and (fld != "effort" or given[name, fld] != 0.0)),
+            available[0],
+        )
+        for key in (
+            *([topic] if _is_pressure(stream) else []),
+            f"{name}.{usual}",
+            name,
+            f"{topic}.{name}",
+            *(f"{name}.{fld}" for fld in available),
+        ):
+            if key in options.columns:
+                fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
+                columns[name] = Taken(fld, parse_target(options.columns[key]))
+    if not columns and not any(key in options.columns for key in names):
+        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) == INPUT}
+        prefix = "chamber_" if _is_pressure(stream) else "cable_"
+        for name in names:
+            usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
+            fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
+            column = name if name.startswith(("cable_", "chamber_")) else prefix + (own or name)
+            if column not in targets:  # --map takes another topic's for it
+                columns[name] = Taken(fld, Target(column))
+    return columns
+
+
+def _largest_values(bag: Bag, stream: Stream) -> dict[tuple[str, str], float]:
+    """Return (name, field) → the largest magnitude in the first messages: efforts are often zero until something moves."""
+    largest: dict[tuple[str, str], float] = {}
+    for message, _ in zip(bag.messages([stream.topic.name]), range(SCANNED)):
+        try:
+            values = named_values(bag.decode(message), stream.topic.type)
+        except InputError:
+            continue  # told when the frames are read
+        for key, value in values.items():
+            largest[key] = max(largest.get(key, 0.0), abs(value))
+    return largest
+
+
+def _load_point(target: str) -> list[float]:
+    try:
+        values = [float(part) for part in target.removeprefix("load@").split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3:
+        raise InputError(
+            "not a place of a load", where="--map", found=target, expected="load@X,Y,Z: metres on the body at rest, robot frame"
+        )
+    return values
+
+
+def _marker_poses(bag: Bag, choice: Choice, notes: list[str]) -> dict[str, FloatArray]:
+    """Return T_camera_markers of the topics of markers that can be had in the camera's frame."""
+    target, poses = choice.primary.frame, {}
+    tree = transforms_of(bag) if choice.markers else {}
+    for stream in choice.markers:
+        T = np.eye(4) if stream.frame == target else transform_between(tree, target, stream.frame)
+        if T is None:
+            notes.append(
+                f"the markers of {stream.topic.name} are left out: no static transform joins {stream.frame!r} and {target!r}"
+            )
+        else:
+            poses[stream.topic.name] = T
+    return poses
+
+
+def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
+    """Return whose time stamps are used.
+
+    "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
+    like the time of recording (those of the SDK may count from elsewhere); else "record".
+    """
+    if options.clock in ("header", "record"):
+        return options.clock
+    sdk = is_sdk(choice.primary.topic.name)
+    if sdk and _metadata(bag, choice, "metadata"):
+        return "metadata"
+    for stream in chosen_streams(choice):
+        shifts, last = [], -np.inf
+        for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
+            try:
+                decoded = bag.decode(message)
+            except InputError:
+                continue  # told when the frames are read
+            if header_of(decoded) is None:
+                continue
+            time, _ = stamp_of(decoded)
+            if time <= 0.0 or time < last:
+                return "record"
+            last = time
+            shifts.append(message.record - time)
+        if shifts and not sdk and (np.ptp(shifts) > LAG_S or abs(float(np.median(shifts))) > LAG_S):
+            return "record"
+    return "header"
+
+
+def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
+    """Return topic of metadata → topic of images where the first of them holds a time of the device."""
+    if clock != "metadata":
+        return {}
+    names = {t.name: t.type for t in bag.topics}
+    pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
+    found = {f"{name.split('/image/')[0]}/image/metadata": name for name in pictures}
+    firsts = [next(bag.messages([topic]), None) for topic in found if names.get(topic) == "std_msgs/msg/String"]
+    told = [first is not None and device_time(bag.decode(first)) is not None for first in firsts]
+    return found if told and len(told) == len(found) and all(told) else {}
+
+
+def device_time(decoded: Any) -> float | None:
+    """Return the device's time [s] in the text of an image's metadata; None where it holds none."""
+    parts = dict(part.split("=", 1) for part in str(decoded.data).split(";") if "=" in part)
+    return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
+
+
+def header_time(decoded: Any, message: Message) -> float:
+    """Return the time in the header of a message [s]; that of its record where it has none."""
+    time, _ = stamp_of(decoded)
+    return time if time > 0.0 else message.record
+
+
+def chosen_streams(choice: Choice) -> list[Stream]:
+    """Return the streams that are read, each once."""
+    chosen = [choice.primary, *choice.markers, *choice.inputs, *choice.loads]
+    chosen += [choice.color] if choice.color is not None else []
+    return list({s.topic.name: s for s in chosen}.values())
+
+
+def is_sdk(name: str) -> bool:
+    """Return whether a topic is of a file of the RealSense SDK."""
+    return name.startswith("/device_") and "/sensor_" in name
+
+
+def named_values(decoded: Any, kind: str) -> dict[tuple[str, str], float]:
+    """Return (name, field) → value of a message of inputs."""
+    if kind.endswith("FluidPressure"):
+        return {("pressure", ""): float(decoded.fluid_pressure)}
+    if not kind.endswith("JointState"):
+        return {(str(i), ""): float(value) for i, value in enumerate(decoded.data)}
+    return {
+        (name, fld): float(values[i])
+        for fld in ("position", "velocity", "effort")
+        for values in [getattr(decoded, fld)]
+        for i, name in enumerate(decoded.name)
+        if i < len(values)
+    }

@@ -1,0 +1,1 @@
+"""Tables of text and exports of motion capture: cells, units, times, mappings, logs of actuation."""

@@ -1,0 +1,245 @@
+"""`--map NAME=TARGET`: what a name in a source becomes in the recording, and what a unit beside a name says."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.core.text import did_you_mean, plain_name
+from femsense.core.units import Quantity, Unit, unit_named, units_of
+from femsense.io.importers.tables.csv_tables import column_unit
+
+INPUT, MARKER, LOAD, COLUMN = "input", "marker", "load", "input, time, axis"
+"""What a name may become."""
+TARGETS = (
+    "cable_NAME, chamber_NAME, time (a factor or a unit may follow: *0.001, *kPa, *1-101325), NAME.x, marker.NAME or load@X,Y,Z"
+)
+SHAPES = {
+    INPUT: "cable_NAME or chamber_NAME",
+    MARKER: "marker.NAME",
+    LOAD: "load@X,Y,Z",
+    "time": "time",
+    "axis": "NAME.x, NAME.y or NAME.z",
+}
+NAME = re.compile(r"[^\s,;\"'*=@](?:[^,;\"'*=@]*[^\s,;\"'*=@])?")
+IN_BRACKETS = re.compile(r".+?[\[(]\s*([^\[\]]+?)\s*[\])]\s*")
+NUMBER = r"\d*\.?\d+(?:[eE][-+]?\d+)?"
+SCALE = re.compile(rf"([-+]?{NUMBER}\.?)([-+]{NUMBER})?")
+QUANTITIES = {"time": (Quantity.TIME,), "chamber": (Quantity.PRESSURE,), "cable": (Quantity.FORCE, Quantity.LENGTH)}
+"""What a target holds, by how it begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What a name becomes: value = factor × what stands there + offset."""
+
+    name: str
+    factor: float = 1.0
+    offset: float = 0.0
+    unit: Unit | None = None
+    """Where one was named."""
+    scaled: bool = False
+    """Whether a factor or a unit was said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a table that becomes an input."""
+
+    name: str
+    """In the recording."""
+    index: int
+    """In the table."""
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def values(self, rows: npt.ArrayLike) -> FloatArray:
+        """Return the column of rows (n, columns) or of one row (columns,) in SI units."""
+        return np.asarray(self.factor * np.asarray(rows, dtype=np.float64)[..., self.index] + self.offset)
+
+
+def check_targets(columns: Mapping[str, str]) -> None:
+    """Refuse what is no target, and two names that become the same. Raises InputError."""
+    names: dict[str, str] = {}
+    for old, new in columns.items():
+        if kind_of_target(new) is None:
+            raise InputError("not a target", where=f"--map {old}={new}", found=new, expected=TARGETS)
+        name = new if new.startswith("load@") else parse_target(new).name
+        if name in names and not name.startswith("load@"):
+            raise InputError(
+                "two names become the same",
+                where=f"--map {old}={new}",
+                found=f"{names[name]} and {old}",
+                expected="a target each",
+            )
+        names[name] = old
+
+
+def kind_of_target(target: str) -> str | None:
+    """Return INPUT, MARKER, LOAD, "time" or "axis"; None for what is no target. Raises InputError: a factor that is none."""
+    if target.startswith("load@"):
+        return LOAD
+    name = parse_target(target).name
+    if name == "time":
+        return "time"
+    stem, dot, last = name.rpartition(".")
+    for begin in ("cable_", "chamber_"):
+        if name.startswith(begin):
+            return INPUT if NAME.fullmatch(name.removeprefix(begin)) else None
+    if "*" in target:  # lengths have --unit
+        return None
+    if dot and last in ("x", "y", "z") and NAME.fullmatch(stem):
+        return "axis"
+    return MARKER if name.startswith("marker.") and NAME.fullmatch(name.removeprefix("marker.")) else None
+
+
+def parse_target(target: str) -> Target:
+    """Return a target such as cable_north, cable_north*4.615, chamber_a*bar or chamber_a*1-101325.
+
+    Raises:
+        InputError: what follows the star is neither a factor, nor a factor with an offset, nor a unit of what the target holds.
+    """
+    name, star, text = target.partition("*")
+    name = plain_name(name)
+    if not star:
+        return Target(name)
+    match, unit = SCALE.fullmatch(text.replace(" ", "")), unit_named(text)
+    if match is not None and math.isfinite(float(match[1])) and float(match[1]) != 0.0:
+        return Target(name, float(match[1]), float(match[2] or 0.0), scaled=True)
+    wanted = QUANTITIES.get(name.partition("_")[0], ())
+    if match is None and unit is not None and unit.quantity in wanted:
+        return Target(name, unit.size, unit.zero, unit, scaled=True)
+    units = "|".join(units_of(*wanted))
+    raise InputError(
+        "not a factor", where="--map", found=target, expected=f"NAME=TARGET*NUMBER, or *{units}" if units else TARGETS
+    )
+
+
+def check_names(columns: Mapping[str, str], known: Mapping[str, str], path: Path, elsewhere: Sequence[str] = ()) -> None:
+    """Refuse names that the source lacks, and markers that would become inputs or the other way round.
+
+    Arguments:
+        columns: name in the source → target.
+        known: name in the source → what it may become, of INPUT, MARKER, LOAD, COLUMN.
+        path: the source, for the message.
+        elsewhere: names of the columns of a log of actuation, which were looked at first.
+
+    Raises:
+        InputError: with the names that are there.
+    """
+    for old, new in columns.items():
+        if old not in known:
+            raise unknown_name(old, new, known, path, elsewhere)
+        able, kind = known[old].split(", "), kind_of_target(new)
+        if kind not in able and not (kind == "axis" and new.startswith("marker.") and MARKER in able):
+            raise InputError(
+                f"{old} cannot become {new}",
+                where=f"{path}, --map {old}={new}",
+                found=new,
+                expected="; ".join(SHAPES[word] for word in able),
+            )
+
+
+def check_taken(columns: Mapping[str, str], known: Mapping[str, str], path: Path) -> None:
+    """Refuse a marker that gets the name of another one of the same source, which keeps it. Raises InputError."""
+    for old, new in columns.items():
+        name = new.removeprefix("marker.")
+        if known.get(old) == MARKER == known.get(name) and name not in {old, old.rpartition(":")[2], *columns}:
+            raise InputError(
+                "two names become the same",
+                where=f"{path}, --map {old}={new}",
+                found=f"{old} and {name}",
+                expected="a name that no other marker has, or a mapping of that one too",
+            )
+
+
+def unknown_name(old: str, new: str, names: Iterable[str], path: Path, elsewhere: Sequence[str] = ()) -> InputError:
+    """Return the error about a name that neither the source nor its log of actuation has."""
+    listed = [name for name in dict.fromkeys(names) if name]
+    text = ", ".join(listed[:20]) + (" …" if len(listed) > 20 else "") or "no names that can be mapped"
+    return InputError(
+        "a name that the source does not have",
+        where=f"{path}, --map {old}={new}",
+        found=old,
+        expected=f"{path.name}: {text}; the log: {', '.join(elsewhere[:20])}" if elsewhere else text,
+        hint=did_you_mean(old, [*listed, *elsewhere]),
+    )
+
+
+# Columns of tables
+
+
+def resolved(columns: Mapping[str, str], names: Sequence[str]) -> dict[str, str]:
+    """Return the mapping with names as the table has them: a unit in brackets, or from the row of units, may be left out."""
+    full = {name: name for name in names}
+    for name in names:
+        if IN_BRACKETS.fullmatch(name):
+            full.setdefault(column_unit(name)[0], name)
+    return {full.get(old, old): new for old, new in columns.items()}
+
+
+def mappable(names: Sequence[str]) -> dict[str, str]:
+    """Return the names of a table's columns, with and without a unit in brackets, as `check_names` takes them."""
+    return dict.fromkeys([*names, *(column_unit(name)[0] for name in names if IN_BRACKETS.fullmatch(name))], COLUMN)
+
+
+def mapped_inputs(names: Sequence[str], columns: Mapping[str, str]) -> tuple[list[Column], set[str]]:
+    """Return the mapped inputs in SI units, and what the units say that cables hold ("tension", "displacement").
+
+    A factor or a unit in the mapping stands for the unit; else the unit behind the name counts; without one the values are in N, m or Pa.
+
+    Raises:
+        InputError: a unit that is none of what the column becomes.
+    """
+    found, kinds = list[Column](), set[str]()
+    for old, new in columns.items():
+        if kind_of_target(new) != INPUT or old not in names:
+            continue
+        target = parse_target(new)
+        if not target.scaled:
+            unit = unit_beside(old, target.name)
+            target = target if unit is None else Target(target.name, unit.size, unit.zero, unit)
+        found.append(Column(target.name, list(names).index(old), target.factor, target.offset))
+        kinds |= cable_kind(target.name, target.unit)
+    return found, kinds
+
+
+def cable_kind(target: str, unit: Unit | None) -> set[str]:
+    """Return what a unit says that a cable's column holds."""
+    if unit is None or not target.startswith("cable_"):
+        return set()
+    return {"tension" if unit.quantity is Quantity.FORCE else "displacement"}
+
+
+def unit_beside(name: str, target: str, *, mapped: bool = True) -> Unit | None:
+    """Return a column's unit; None where its name says none.
+
+    A single letter counts only in brackets: a cable may be named arm_n.
+
+    Raises:
+        InputError: the unit is of another quantity, or unknown.
+    """
+    wanted = QUANTITIES["time" if target == "time" else target.partition("_")[0]]
+    bracketed, (bare, unit) = IN_BRACKETS.fullmatch(name), column_unit(name)
+    spelt = name[len(bare) :].strip(" _[]()./")
+    sure = bool(bracketed) or len(spelt) > 1 or target == "time"
+    if unit is not None and unit.quantity in wanted and sure:
+        return unit
+    other = unit is not None and len(spelt) > 1 and (mapped or unit.quantity not in (Quantity.TIME, Quantity.LENGTH))
+    if bracketed or other:
+        raise InputError(
+            "a unit that is not the input's" if target != "time" else "a unit that is not one of time",
+            where=f"column {name}",
+            found=bracketed[1] if bracketed else spelt,
+            expected="|".join(units_of(*wanted)),
+            hint=f"--map '{name}={bare if target == name else target}*FACTOR' says what one of it is in SI units",
+        )
+    return None

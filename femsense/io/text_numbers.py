@@ -1,0 +1,158 @@
+"""Numbers, dates and times of day as people and their programs write them in text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import product
+
+BLANKS = " \u00a0\u202f\u2009'’"
+"""What stands between thousands where neither a comma nor a point does."""
+GROUPED = re.compile(
+    rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?"
+)
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+FORTRAN = re.compile(r"^(\s*[-+]?\d*\.?\d*)[dD]([-+]?\d+\s*)$")
+"""A double-precision number as Fortran writes it: 1.0D-03."""
+DAY_FORMS = (
+    "%d.%m.%Y",
+    "%d.%m.%y",
+    "%Y/%m/%d",
+    "%Y.%m.%d",
+    "%d/%m/%Y",
+    "%m/%d/%Y",
+    "%d-%m-%Y",
+    "%d-%b-%Y",
+    "%d %b %Y",
+    "%b %d %Y",
+)
+CLOCK_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
+CLOCK = re.compile(r"(?:(\d{1,3}):)?(\d{1,2}):(\d{2}(?:[.,]\d+)?)\s*([AaPp]\.?[Mm]\.?)?")
+DAY = re.compile(r"\d{1,2}([./-])\d{1,2}\1\d{4}|\d{4}([./-])\d{1,2}\2\d{1,2}")
+TIMES_READ = (
+    "seconds, 10:15:00.5, 10:15:00 PM, 2024-01-31T10:15:00, 31.01.2024 10:15:00, 1/31/2024 10:15:00, or days of a spreadsheet"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Notation:
+    """How a table writes its numbers."""
+
+    decimal: str = "."
+    """"." or ","."""
+    grouped: bool = False
+    """Whether some numbers have marks between their thousands."""
+    commas: bool = False
+    """Whether decimal commas were seen."""
+
+    def plain(self, cell: str) -> str:
+        """Return a number with a decimal point and without marks between thousands; any other cell as it is."""
+        if "," not in cell and not self.grouped and cell.isascii():
+            return cell
+        text = cell.strip().replace("−", "-")
+        if not text or text[0] not in "+-.,0123456789":
+            return cell
+        match = GROUPED.fullmatch(text)
+        if match is not None and self._is_grouped(match):
+            whole = match[1] + re.sub(r"\D", "", match[2])
+            return whole + (match["rest"] or "").replace(",", ".") + (match["power"] or "")
+        return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else cell
+
+    def _is_grouped(self, match: re.Match[str]) -> bool:
+        mark, rest = match["mark"], match["rest"]
+        if rest is not None:
+            return rest[0] != mark
+        several = match[2].count(mark) > 1
+        return mark in BLANKS or several or (mark != self.decimal and match[1].lstrip("+-") != "0")
+
+
+def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
+    """Return how some cells write numbers: a comma or point that cannot stand between thousands is a decimal one.
+
+    Arguments:
+        cells: of a table's first lines.
+        default: the decimal mark where none of them tells it.
+    """
+    votes, grouped, cells = {".": 0, ",": 0}, False, [cell.strip() for cell in cells]
+    for cell in cells:
+        if not cell or not re.fullmatch(rf"[-+−]?[\d.,{BLANKS}]+(?:[eE][-+]?\d+)?", cell):
+            continue
+        match = GROUPED.fullmatch(cell.replace("−", "-"))
+        if match is not None and match["rest"] and match["rest"][0] != match["mark"]:
+            votes[match["rest"][0]] += 1
+            grouped = True
+        elif match is not None and match["mark"] in ".," and match[2].count(match["mark"]) > 1:
+            votes["," if match["mark"] == "." else "."] += 1
+            grouped = True
+        elif match is not None and (match["mark"] in BLANKS or match[1].lstrip("+-") != "0"):
+            grouped = grouped or match["mark"] in BLANKS
+        elif cell.count(",") + cell.count(".") == 1:
+            votes["," if "," in cell else "."] += 1
+    if bool(votes["."]) != bool(votes[","]):
+        default = "." if votes["."] else ","
+    return Notation(default, grouped, votes[","] > 0 or (default == "," and any("," in cell for cell in cells)))
+
+
+def number_in(cell: str) -> float | None:
+    """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
+    the seconds since midnight; None for all else."""
+    try:
+        return float(cell)
+    except ValueError:
+        fortran = FORTRAN.match(cell)
+        return float(f"{fortran[1]}e{fortran[2]}") if fortran and fortran[1].strip(" +-.") else moment_in(cell)
+
+
+def moment_in(cell: str) -> float | None:
+    """Return the seconds of a date and time since 1970 (UTC where no zone is named), or of a time of day since midnight; else None.
+
+    Of 01/02/2024 the day stands first, unless that is no date; differences of times are the same either way within a month.
+    """
+    text = cell.strip()
+    if DAY.fullmatch(text):
+        text += " 00:00:00"
+    if ":" not in text and not re.fullmatch(r"\d{8}T\d{4,6}.*", text):
+        return None
+    clock = CLOCK.fullmatch(text)
+    if clock is not None:
+        return _time_of_day(*clock.groups())
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        found = _written_date(text)
+        if found is None:
+            return None
+        moment = found
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def is_time_of_day(cell: str) -> bool:
+    """Whether a cell holds a time without a date."""
+    return CLOCK.fullmatch(cell.strip()) is not None
+
+
+def _time_of_day(hours: str | None, minutes: str, seconds: str, half: str | None) -> float | None:
+    """Return seconds since midnight of [HH:]MM:SS[.s] [AM|PM]; HH:MM where there are no seconds is read as MM:SS."""
+    hour, rest = int(hours or 0), 60.0 * int(minutes) + float(seconds.replace(",", "."))
+    if half is not None:
+        if hours is None:
+            hour, rest = int(minutes), 60.0 * float(seconds.replace(",", "."))
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + (12 if half[0] in "Pp" else 0)
+    return None if rest >= 3600.0 else 3600.0 * hour + rest
+
+
+def _written_date(text: str) -> datetime | None:
+    """Return a date and a time of day in one of the usual forms."""
+    text = re.sub(r"(\d),(\d)", r"\1.\2", text).replace(",", " ")
+    text = re.sub(r"([AaPp])\.?([Mm])\.?$", r"\1\2", text)
+    text = re.sub(r"(\.\d{6})\d+", r"\1", text.replace("T", " "))
+    for day, clock in product(DAY_FORMS, CLOCK_FORMS):
+        try:
+            return datetime.strptime(" ".join(text.split()), f"{day} {clock}")
+        except ValueError:
+            continue
+    return None

@@ -1,0 +1,110 @@
+"""The camera in a process of its own: drivers hang, crash and hold the interpreter's lock, and only a process can be ended."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from multiprocessing.connection import Connection
+
+from femsense.core.errors import FemsenseError
+from femsense.live.frames import frame_bytes
+from femsense.live.ring import Ring
+from femsense.live.sources import make_source
+from femsense.live.sources.source import FrameSource, Loss, Opening, SourceInfo, SourceLost
+
+POLL_S = 0.2
+"""How long a source may wait for a frame before the process looks whether it is to stop."""
+PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RingPlace:
+    """Answer to an opened source: where its frames go."""
+
+    name: str
+    slot_bytes: int
+
+
+class Request(StrEnum):
+    """What the session asks of the process."""
+
+    NEXT = "next"
+    """One more frame, of a source that waits to be asked."""
+    STOP = "stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The source has no more frames."""
+
+    loss: Loss
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The source cannot be used at all: wrong input, or a package that is missing."""
+
+    error: FemsenseError
+
+
+Report = SourceInfo | int | Lost | Failed
+"""What the process says: opened, the ticket of a frame, lost, failed."""
+
+
+def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: Opening) -> None:
+    """Open a source and write its frames into a ring until the session says stop or is gone; the target of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the session's
+    _end_with_parent()
+    try:
+        source = make_source(text, as_fast_as_possible=as_fast_as_possible)
+    except FemsenseError as error:
+        pipe.send(Failed(error))
+        return
+    try:
+        pipe.send(source.open(opening))
+        answer = pipe.recv()
+        if isinstance(answer, RingPlace):
+            _stream(source, pipe, Ring(answer.slot_bytes, answer.name, is_new=False), asked=as_fast_as_possible)
+    except SourceLost as lost:
+        _tell(pipe, Lost(lost.loss, lost.text))
+    except FemsenseError as error:
+        _tell(pipe, Failed(error))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the session is gone
+    finally:
+        source.close()
+
+
+def _stream(source: FrameSource, pipe: Connection, ring: Ring, *, asked: bool) -> None:
+    """Write frames until told to stop; with `asked` one for each request."""
+    try:
+        while True:
+            if pipe.poll(None if asked else 0) and pipe.recv() is Request.STOP:
+                return
+            _once(source, lambda data: pipe.send(ring.write(data)), until_one=asked)
+    finally:
+        ring.close()
+
+
+def _once(source: FrameSource, put: Callable[[bytes], None], *, until_one: bool) -> None:
+    frame = source.newest(POLL_S)
+    while frame is None and until_one:
+        frame = source.newest(POLL_S)
+    if frame is not None:
+        put(frame_bytes(frame))
+
+
+def _end_with_parent() -> None:
+    """Have Linux end this process with its parent, even while a driver hangs."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
+def _tell(pipe: Connection, report: Report) -> None:
+    with contextlib.suppress(OSError):  # the session is gone
+        pipe.send(report)

@@ -1,0 +1,289 @@
+"""Writes a session while it runs: a recording of the frames that were sensed, one of those that were skipped, and the answers.
+
+An image stands whole under its name before its row is appended, and a row is appended in one write: killed at any moment, the
+session opens as a recording. Answers go to a journal, from which `finish_session` makes the run.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import queue
+import shutil
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.io.files import write_json, write_toml
+from femsense.io.recording_folder import load_recording
+from femsense.io.recording_toml import recording_document
+from femsense.io.robot_toml import load_robot
+from femsense.live.frames import StampedFrame
+from femsense.live.growing import image_file
+from femsense.live.senser import Answer
+from femsense.model.recording import Recording
+
+SESSION_FORMAT = "femsense-session-1"
+SKIPPED, RUN, JOURNAL, STATES, EVENTS = "skipped", "run", "journal.jsonl", "states.f32", "events.csv"
+CALIBRATION, DESCRIPTION = "calibration.json", "session.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Frames that the disk was too slow for."""
+
+    sensed: int = 0
+    """Without them a replay gives other numbers from there on."""
+    skipped: int = 0
+
+    @property
+    def count(self) -> int:
+        return self.sensed + self.skipped
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Job:
+    """One frame to be written, or a row of something else."""
+
+    run: Callable[[], None]
+    has_image: bool
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file beside and rename it."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(data)
+    os.replace(part, path)
+
+
+def check_session(folder: Path) -> None:
+    """Raise InputError where a session cannot be written: sessions are never replaced."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "something stands there, and a session replaces nothing",
+            where=folder,
+            found="a file" if folder.is_file() else ", ".join(sorted(item.name for item in folder.iterdir())[:3]),
+            expected="a new folder",
+            hint="another -o",
+        )
+
+
+class Recorder:
+    """Writes one session in a thread of its own."""
+
+    def __init__(
+        self,
+        folder: Path,
+        empty: Recording,
+        columns: Sequence[str],
+        about: Mapping[str, object],
+        *,
+        most_waiting: int = 256,
+        write: Callable[[Path, bytes], None] = write_whole,
+    ) -> None:
+        """Make the folder and start.
+
+        Arguments:
+            folder: new.
+            empty: the recording without frames.
+            columns: of the inputs of a frame, as in frames.csv.
+            about: what session.json says: robot, camera, …
+            most_waiting: frames that may wait for the disk; skipped ones give way at half of it.
+            write: writes one file.
+        """
+        check_session(folder)
+        self.folder, self._columns, self._write = folder, tuple(columns), write
+        self._most = most_waiting
+        self._lock = Lock()
+        self._lost = Lost()
+        self._waiting = 0
+        self._has_skipped = False
+        self._views = empty.camera_names
+        self.error = ""
+        """Why nothing is written any more; empty while all is well."""
+        (folder / RUN).mkdir(parents=True)
+        self._files: dict[str, BinaryIO] = {}
+        self._document = recording_document(empty)
+        self._begin(folder, "free")
+        self._append(folder / EVENTS, ["time_s", "kind", "text"])
+        write_json(folder / DESCRIPTION, {"format": SESSION_FORMAT, **about})
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._thread = Thread(target=self._work, daemon=True, name="femsense-recorder")
+        self._thread.start()
+
+    @property
+    def lost(self) -> Lost:
+        """Frames that were not written."""
+        return self._lost
+
+    def keep(self, frame: StampedFrame, values: FloatArray, *, contact_free: bool) -> bool:
+        """Record a frame that is sensed, with its inputs, shape (columns,); return whether there was room for it."""
+        row = [frame.number, frame.time_s, *values.tolist(), int(contact_free)]
+        if not self._put(_Job(lambda: self._frame(self.folder, frame, row), True), self._most):
+            self._lost = replace(self._lost, sensed=self._lost.sensed + 1)
+            return False
+        return True
+
+    def skip(self, frame: StampedFrame, values: FloatArray | None) -> bool:
+        """Record a frame that is not sensed; its inputs where they are known. Return whether there was room for it."""
+        known = np.full(len(self._columns), np.nan) if values is None else values
+        row = [frame.number, frame.time_s, *known.tolist()]
+        if not self._has_skipped:
+            self._has_skipped = True
+            self._put(_Job(lambda: self._begin(self.folder / SKIPPED), False), self._most)
+        if not self._put(_Job(lambda: self._frame(self.folder / SKIPPED, frame, row), True), self._most // 2):
+            self._lost = replace(self._lost, skipped=self._lost.skipped + 1)
+            return False
+        return True
+
+    def answer(self, answer: Answer) -> None:
+        """Record what the estimator said of a frame."""
+        contacts = [_plain(asdict(contact)) for contact in answer.contacts]
+        line = json.dumps({"report": asdict(answer.report), "contacts": contacts}).encode() + b"\n"
+        states = answer.positions.astype("<f4").tobytes()
+        self._put(_Job(lambda: self._answer(line, states), False), self._most)
+
+    def event(self, time_s: float, kind: str, text: str) -> None:
+        """Record what happened at a time of the session [s]."""
+        self._put(_Job(lambda: self._append(self.folder / EVENTS, [time_s, kind, text]), False), self._most)
+
+    def copy(self, file: Path, name: str) -> None:
+        """Put a file into the session; it is there when this returns."""
+        part = self.folder / f".{name}.part"
+        shutil.copyfile(file, part)
+        os.replace(part, self.folder / name)
+
+    def close(self) -> None:
+        """Write what waits, and make the run."""
+        self._jobs.put(None)
+        self._thread.join()
+        for file in self._files.values():
+            file.close()
+        finish_session(self.folder)
+
+    def _put(self, job: _Job, most: int) -> bool:
+        with self._lock:
+            if job.has_image and (self._waiting >= most or self.error):
+                return False
+            self._waiting += job.has_image
+        self._jobs.put(job)
+        return True
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                if not self.error:
+                    job.run()
+            except OSError as error:  # a full disk, a folder that is gone: sensing goes on
+                self.error = f"nothing is recorded any more: {error.strerror or error}"
+            with self._lock:
+                self._waiting -= job.has_image
+
+    def _begin(self, folder: Path, *more: str) -> None:
+        folder.mkdir(exist_ok=True)
+        write_toml(folder / "recording.toml", self._document)
+        self._append(folder / "frames.csv", ["frame", "time_s", *self._columns, *more])
+
+    def _frame(self, folder: Path, frame: StampedFrame, row: Sequence[object]) -> None:
+        for image in frame.raw.images:
+            file = folder / image_file(image, frame.number, self._views)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._write(file, image.data)
+        if any(isinstance(value, float) and np.isnan(value) for value in row):
+            return  # its inputs are not known: an image without a row
+        self._append(folder / "frames.csv", row)
+        if frame.raw.markers:  # after the row: a marker of a frame that is not there would be an error
+            named = self._views != ("",)
+            if str(folder / "markers.csv") not in self._files:
+                self._append(folder / "markers.csv", ["frame", *(["camera"] if named else []), "marker", "x_m", "y_m", "z_m"])
+            for one in frame.raw.markers:
+                view = [self._views[one.view]] if named else []
+                self._append(folder / "markers.csv", [frame.number, *view, one.name, *one.xyz_m])
+
+    def _answer(self, line: bytes, states: bytes) -> None:
+        for name, data in ((STATES, states), (JOURNAL, line)):
+            self._file(self.folder / RUN / name).write(data)
+
+    def _append(self, path: Path, cells: Sequence[object]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(cells)
+        self._file(path).write(text.getvalue().encode())
+
+    def _file(self, path: Path) -> BinaryIO:
+        """Return an open file that writes each piece at once, whole."""
+        if str(path) not in self._files:
+            self._files[str(path)] = path.open("ab", buffering=0)
+        return self._files[str(path)]
+
+
+# The run of a session
+
+
+def finish_session(folder: Path) -> bool:
+    """Make the run of a session from its journal, in the session itself and in those that a tare began; return whether there was one.
+
+    A session that was killed is finished like any other: what its journal holds whole counts.
+    """
+    from femsense.calib.files import read_calibration
+    from femsense.sensing.run_files import run_inputs, write_run
+    from femsense.sensing.types import ContactForce, FrameReport, Run, States
+
+    for part in sorted(folder.glob("tare-*")):
+        finish_session(part)
+    journal, states = folder / RUN / JOURNAL, folder / RUN / STATES
+    if not journal.is_file() or not states.is_file():
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # who runs a session was told
+        robot = load_robot(json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["robot"])
+        recording, calibration = load_recording(folder), read_calibration(folder / CALIBRATION)
+    nodes = robot.body.mesh.nodes
+    whole = journal.read_bytes().rpartition(b"\n")[0].splitlines()
+    moved = np.fromfile(states, dtype="<f4")
+    count = min(len(whole), len(moved) // nodes.size)
+    if not count:
+        return False
+    moved = moved[: count * nodes.size].reshape(count, -1, 3)
+    answers = [json.loads(line) for line in whole[:count]]
+    reports = [FrameReport(**answer["report"]) for answer in answers]
+    contacts = tuple(ContactForce(**_arrays(row)) for answer in answers for row in answer["contacts"])
+    run = Run(
+        contacts=contacts,
+        frames=tuple(reports),
+        states=States(freeze([r.time_s for r in reports]), freeze(moved, np.float32), robot.body.mesh.tets, nodes),
+        robot=robot,
+        recording_folder=folder.absolute(),
+    )
+    write_run(run, folder / RUN, inputs=run_inputs(robot, recording, calibration), calibration=calibration)
+    for file in (journal, states):
+        with suppress(OSError):
+            file.unlink()
+    return True
+
+
+def session_run(folder: str | Path) -> Path:
+    """Return the folder of the run of a session, made where a killed session left only its journal; any other folder as it is."""
+    root = Path(folder).expanduser()
+    if not (root / DESCRIPTION).is_file() or not (root / RUN).is_dir():
+        return root
+    if (root / RUN / JOURNAL).is_file():
+        finish_session(root)
+    return root / RUN
+
+
+def _plain(table: dict[str, Any]) -> dict[str, Any]:
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in table.items()}
+
+
+def _arrays(table: dict[str, Any]) -> dict[str, Any]:
+    return {name: freeze(value) if isinstance(value, list) else value for name, value in table.items()}

@@ -1,0 +1,78 @@
+"""Frames from one process to another through shared memory: the newest ones, and nobody waits for anybody.
+
+Each slot has a counter that is odd while the slot is written. A reader copies the slot and keeps the copy only if the counter
+did not change and the checksum fits, so neither process needs a lock that the other could die with.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from multiprocessing.shared_memory import SharedMemory
+
+from femsense.core.errors import InputError
+
+SLOT = struct.Struct("<QQI")
+"""Counter, size of the frame and its checksum."""
+SLOTS = 8
+
+
+class Ring:
+    """A ring of frames in shared memory; one process writes, one reads."""
+
+    def __init__(self, slot_bytes: int, name: str, *, is_new: bool, slots: int = SLOTS) -> None:
+        """Make a ring, or attach to one that another process made.
+
+        Arguments:
+            slot_bytes: the largest frame that it takes [bytes].
+            name: by which both processes know it.
+            is_new: whether to make it.
+            slots: frames that it holds.
+        """
+        self.slot_bytes, self.slots, self.name = slot_bytes, slots, name
+        self._is_own = is_new
+        self._memory = SharedMemory(name, create=is_new, size=slots * (SLOT.size + slot_bytes))
+        self._count = 0
+
+    def write(self, data: bytes) -> int:
+        """Write a frame over the oldest one; return its ticket for `read`. Raises InputError where it is larger than a slot."""
+        if len(data) > self.slot_bytes:
+            raise InputError(
+                "a frame is larger than the ring's slots",
+                where="ring",
+                found=f"{len(data)} bytes",
+                expected=f"≤ {self.slot_bytes}",
+            )
+        ticket, at = self._count, self._place(self._count)
+        memory = self._buffer
+        SLOT.pack_into(memory, at, 2 * ticket + 1, len(data), zlib.crc32(data))
+        memory[at + SLOT.size : at + SLOT.size + len(data)] = data
+        SLOT.pack_into(memory, at, 2 * ticket + 2, len(data), zlib.crc32(data))
+        self._count += 1
+        return ticket
+
+    def read(self, ticket: int) -> bytes | None:
+        """Return the frame of a ticket; None where it has been overwritten."""
+        at = self._place(ticket)
+        memory = self._buffer
+        counter, size, checksum = SLOT.unpack_from(memory, at)
+        if counter != 2 * ticket + 2 or size > self.slot_bytes:
+            return None
+        data = bytes(memory[at + SLOT.size : at + SLOT.size + size])
+        same = SLOT.unpack_from(memory, at)[0] == counter
+        return data if same and zlib.crc32(data) == checksum else None
+
+    def close(self) -> None:
+        """Let go of the memory; who made the ring frees it."""
+        self._memory.close()
+        if self._is_own:
+            self._memory.unlink()
+
+    @property
+    def _buffer(self) -> memoryview:
+        buffer = self._memory.buf
+        assert buffer is not None
+        return buffer
+
+    def _place(self, ticket: int) -> int:
+        return (ticket % self.slots) * (SLOT.size + self.slot_bytes)

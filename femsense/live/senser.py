@@ -1,0 +1,110 @@
+"""The one seam to the estimator: all of `live` asks it for a frame's contacts through `Senser`, and nothing else of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
+from femsense.core.parallel import one_blas_thread
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+from femsense.sensing.false_alarms import with_gains_of_free_frames
+from femsense.sensing.judge import OK, trusted
+from femsense.sensing.pipeline import sense_frame
+from femsense.sensing.prepare import prepare
+from femsense.sensing.types import ContactForce, FrameReport, SensedFrame
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answer:
+    """What the estimator says of one frame."""
+
+    report: FrameReport
+    contacts: tuple[ContactForce, ...]
+    """With their tracks."""
+    positions: FloatArray
+    """Nodes of the deformed body [m], shape (n, 3); of the frame before where there is no result."""
+
+    @property
+    def is_ok(self) -> bool:
+        """Whether nothing is wrong with it."""
+        return self.report.status == OK
+
+    @property
+    def is_contact_free(self) -> bool:
+        """Whether it is a result without any contact."""
+        return self.is_ok and not self.contacts
+
+
+class Senser:
+    """Senses the frames of a recording that grows, one after another, as `estimate` senses those of one that is complete.
+
+    The contact-free frames of the recording that it is made with are those that teach noise, pose and model error. Frames that
+    are added later must not be declared contact-free, or `estimate` would learn more than was known here.
+    """
+
+    def __init__(self, robot: Robot, recording: Recording, calibration: Calibration) -> None:
+        """Learn from the contact-free frames of a recording. Raises as `estimate`."""
+        with one_blas_thread():
+            self._sensor = with_gains_of_free_frames(prepare(robot, recording, calibration))
+        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+        unknown = recording.actuation_zero == "unknown"
+        self._initial = np.array([table[name] for name in robot.body.cable_names]) if unknown else None
+        self._previous: SensedFrame | None = None
+        self._positions: FloatArray = robot.body.mesh.nodes
+        self._tracks = 0
+
+    def sense(self, recording: Recording, k: int) -> Answer:
+        """Return contacts and forces of frame k.
+
+        Arguments:
+            recording: up to this frame at least.
+            k: index 0 … F − 1; the frames before were sensed in their order.
+
+        Returns:
+            the answer; a frame without a result has a status that says why.
+        """
+        robot = self._sensor.robot
+        driven = DrivenRobot(robot, drive_of(robot, recording, initial=self._initial))
+        uncorrected = np.zeros(len(recording.marker_frame))
+        self._sensor = replace(self._sensor, recording=recording, driven=driven, correction_std=uncorrected)
+        try:
+            with one_blas_thread():
+                frame = sense_frame(self._sensor, k, self._previous)
+        except (FemsenseError, np.linalg.LinAlgError) as error:
+            if self._previous is not None:
+                self._positions = self._previous.free_state.positions
+            return Answer(self._without_result(recording, k, error), (), self._positions)
+        contacts = tuple(self._tracked(contact) for contact in frame.contacts)
+        self._positions = frame.state.positions
+        self._previous = replace(frame, contacts=contacts) if trusted(frame) else _without_contacts(frame)
+        return Answer(frame.report, contacts, self._positions)
+
+    def _tracked(self, contact: ContactForce) -> ContactForce:
+        """Return a contact with a number of its own if it begins a track."""
+        if contact.track >= 0:
+            return contact
+        self._tracks += 1
+        return replace(contact, track=self._tracks - 1)
+
+    def _without_result(self, recording: Recording, k: int, error: Exception) -> FrameReport:
+        body = self._sensor.robot.body
+        what = f"its equations have no solution: {error}" if isinstance(error, np.linalg.LinAlgError) else str(error)
+        number, time_s = int(recording.frame_numbers[k]), float(recording.time_s[k])
+        status = " ".join(what.split())
+        tensions, pressures = dict.fromkeys(body.cable_names, NAN), dict.fromkeys(body.chamber_names, NAN)
+        return FrameReport(number, time_s, status, 0, 0, NAN, NAN, NAN, tensions, pressures)
+
+
+def _without_contacts(frame: SensedFrame) -> SensedFrame:
+    """Return a frame under its inputs alone: the next one starts from it where its forces are not reliable."""
+    return replace(
+        frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), sure=(), response=frame.free_response
+    )

@@ -1,0 +1,122 @@
+"""A recording replayed as a camera would give it, at its own times or as fast as possible."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from femsense.core.errors import InputError
+from femsense.io.recording_folder import load_recording
+from femsense.io.recording_tables import GRAVITY_COLUMNS
+from femsense.live.frames import Image, ImageKind, Marker, RawFrame
+from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo, SourceLost
+from femsense.model.recording import Recording
+
+LARGEST = 1.2
+"""Room in the ring over the largest frame of the recording."""
+
+
+class Recorded:
+    """A recording that poses as a camera."""
+
+    def __init__(self, folder: str, *, as_fast_as_possible: bool = False, is_endless: bool = False) -> None:
+        """Arguments: folder; whether each frame comes when it is asked for; whether the recording begins again at its end."""
+        self.folder = Path(folder).expanduser()
+        self.as_fast_as_possible, self.is_endless = as_fast_as_possible, is_endless
+        self._recording: Recording | None = None
+        self._begun_s = 0.0
+        self._next = 0
+
+    def open(self, opening: Opening) -> SourceInfo:
+        """Start to replay: where the recording is now, counted from the first opening, or behind the last frame received."""
+        recording = self._recording = load_recording(self.folder)
+        if not recording.has_clouds and not recording.has_markers:
+            raise InputError("nothing to replay", where=self.folder, found="no clouds and no markers", expected="either")
+        self._begun_s = time.monotonic() if math.isnan(opening.begun_s) else opening.begun_s
+        self._next = opening.last_number + 1
+        steps = np.diff(recording.time_s)
+        return SourceInfo(
+            name=f"recording {self.folder.name}",
+            cameras=recording.cameras,
+            camera_names=recording.camera_names,
+            rate_hz=float(1.0 / np.median(steps)) if len(steps) else float("nan"),
+            T_robot_camera=recording.T_robot_camera,
+            actuation=recording.actuation,
+            actuation_zero=recording.actuation_zero,
+            marker_noise_m=recording.marker_noise_m,
+            begun_s=self._begun_s,
+            largest_frame=int(LARGEST * max(map(self._size, range(recording.frame_count)))) + (1 << 16),
+        )
+
+    def newest(self, timeout_s: float) -> RawFrame | None:
+        """Return the next frame when its time has come; frames whose time passed before are dropped, as a camera drops them."""
+        count = self.recording.frame_count
+        if not self.as_fast_as_possible:
+            while (self.is_endless or self._next + 1 < count) and self.due_s(self._next + 1) <= time.monotonic():
+                self._next += 1
+            if self.is_endless or self._next < count:
+                wait = self.due_s(self._next) - time.monotonic()
+                time.sleep(max(0.0, min(timeout_s, wait)))
+                if wait > timeout_s:
+                    return None
+        if self._next >= count and not self.is_endless:
+            raise SourceLost(Loss.ENDED, f"{self.folder} is over")
+        number, self._next = self._next, self._next + 1
+        stamp = self.due_s(number) - self._begun_s + float(self.recording.time_s[0])
+        return replace(self.frame(number % count), number=number, stamp_s=stamp)
+
+    def due_s(self, number: int) -> float:
+        """Return when a frame is to come [s, monotonic clock], by its number counted over all repetitions."""
+        times = self.recording.time_s
+        period = float(times[-1] - times[0]) * (1.0 + 1.0 / max(1, len(times) - 1))
+        return self._begun_s + float(times[number % len(times)] - times[0]) + number // len(times) * period
+
+    @property
+    def recording(self) -> Recording:
+        """What is replayed."""
+        assert self._recording is not None, "not open"
+        return self._recording
+
+    def frame(self, k: int) -> RawFrame:
+        """Return frame k of the recording, an index 0 … F − 1, as a camera would give it."""
+        r = self.recording
+        images = []
+        for view, (file, color) in enumerate(zip(r.cloud_files[k], r.color_files[k])):
+            if file is not None:
+                kind = ImageKind.DEPTH if file.suffix.lower() == ".png" else ImageKind.CLOUD
+                images.append(Image(kind, file.read_bytes(), file.suffix.lower(), view))
+            if color is not None:
+                images.append(Image(ImageKind.COLOR, color.read_bytes(), color.suffix.lower(), view))
+        rows = np.flatnonzero(r.marker_frame == k)
+        markers = tuple(
+            Marker(r.marker_names[r.marker_index[i]], tuple(r.marker_xyz[i].tolist()), int(r.marker_view[i])) for i in rows
+        )
+        inputs = [(f"cable_{name}", float(v)) for name, v in zip(r.cable_names, r.inputs[k])]
+        inputs += [(f"chamber_{name}", float(v)) for name, v in zip(r.chamber_names, r.pressures[k])]
+        if r.gravity is not None:
+            inputs += zip(GRAVITY_COLUMNS, r.gravity[k].tolist())
+        return RawFrame(
+            number=k,
+            stamp_s=float(r.time_s[k]),
+            images=tuple(images),
+            markers=markers,
+            arrived_s=time.monotonic(),
+            contact_free=None if r.free is None else bool(r.free[k]),
+            inputs=tuple(inputs),
+        )
+
+    def close(self) -> None:
+        """Forget the recording."""
+        self._recording = None
+
+    def list_devices(self) -> list[FoundCamera]:
+        """Return none: recordings are not plugged in."""
+        return []
+
+    def _size(self, k: int) -> int:
+        files = [*self.recording.cloud_files[k], *self.recording.color_files[k]]
+        return sum(file.stat().st_size for file in files if file is not None)

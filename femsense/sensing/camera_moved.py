@@ -1,0 +1,130 @@
+"""The hypothesis that a camera, or the base of the robot, has moved: its J against that of the contacts.
+
+The pose prior of every camera is widened to FAR; contacts that only the shape shows are left out. Rays are cast anew from where the pose has moved to. What
+stands around the robot is part of both hypotheses: its pixels keep their place before a camera that stands still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
+from femsense.core.pose import moved_poses
+from femsense.inference.mixture import misfit
+from femsense.inference.nuisance import root_of
+from femsense.sensing.fit import fit
+from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.pose_rows import background_rows, far, pose_gain
+from femsense.sensing.status import Status, Verdict, verdict
+
+MOVED = 2.0 * np.log(1000.0)
+"""L of a moved camera: one in 1000 frames."""
+EQUAL = 16.3
+"""Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
+STEPS, STILL = 8, 1e-3
+"""Steps of the pose at most, and the share of FAR below which one is the last."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moved:
+    """A frame as moved cameras fit it."""
+
+    step: FloatArray
+    """(rotation about the pivot [rad], shift [m]) of all poses, shape (6 v,)."""
+    criterion: float
+    """J, with L of the move."""
+
+
+def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
+    """Return the verdict of a frame, or that a moved camera fits it as well as its inferred contacts, or better than its contacts.
+
+    Asked are frames with inferred contacts, frames that fail the posterior check, and frames whose poses would lower Φ by more than noise does once in 1000.
+    """
+    if best.frame.pixels is None or len(model.sensor.places):
+        return found
+    inferred = any(contact.source == "shape" for contact in best.contacts)
+    failed = found.status in (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP)
+    limit = max(float(chi2.isf(1e-3, 6 * model.views)), 0.0 if model.limits is None else model.limits.pose)
+    if not (inferred or failed) and pose_gain(model, best) < limit:
+        return found
+    try:
+        stood = _stood(model, best)
+        moved = moved_cameras(model, best)
+    except FemsenseError:
+        return found
+    if stood is None or moved is None:
+        return found
+    numbers = _in_words(model, moved)
+    margin = EQUAL if inferred else 0.0 if failed else MOVED - limit
+    if moved.criterion > stood + margin:
+        return found
+    shown = _misfit_of_background(model, best) - _misfit_of_background(_at(model, moved.step), best) > EQUAL
+    return verdict(Status.CAMERA_MOVED if shown else Status.CAMERA_MAY_HAVE_MOVED, **numbers)
+
+
+def moved_cameras(model: Model, best: Fit) -> Moved | None:
+    """Return the poses that fit the frame best with its visible contacts alone; None where there is no equilibrium."""
+    visible = [i for i, contact in enumerate(best.contacts) if contact.source != "shape"]
+    contacts, forces, tau = [best.contacts[i] for i in visible], best.forces[visible], best.tau[visible]
+    step, found, lowest = np.zeros(6 * model.views), None, np.inf
+    start = best.state if visible else best.frame.predicted
+    for _ in range(STEPS):
+        there = _at(model, step)
+        frame = _seen_from(there, best.frame)
+        fitted = fit(there, frame, contacts, forces, start, tau=tau)
+        if fitted is None:
+            return found
+        change = (there.nuisance.mean + there.nuisance.root @ fitted.eta[: there.nuisance.root.shape[1]])[: len(step)]
+        if fitted.criterion < lowest:
+            lowest = fitted.criterion
+            found = Moved(step - change, lowest + MOVED)
+        if np.abs(change / far(model)).max() < STILL:
+            break
+        step, forces, tau, start = step - change, fitted.forces, fitted.tau, fitted.state
+    return found
+
+
+def _stood(model: Model, best: Fit) -> float | None:
+    """Return J of the best hypothesis with the background from where the cameras stood."""
+    frame = replace(best.frame, background=background_rows(model, best.frame.index))
+    again = fit(model, frame, best.contacts, best.forces, best.state, tau=best.tau, linearised=best.linearised)
+    return None if again is None else again.criterion
+
+
+def _at(model: Model, step: FloatArray) -> Model:
+    """Return the model with its cameras moved by a step and free to move on."""
+    sensor, nuisance, v = model.sensor, model.nuisance, len(step)
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, step, sensor.pivot))
+    mean = nuisance.mean.copy()
+    mean[:v] += step
+    covariance = nuisance.root @ nuisance.root.T + block_diag(np.diag(far(model) ** 2), np.zeros((len(mean) - v,) * 2))
+    calibration = replace(sensor.calibration, poses=poses, T_robot_camera=poses[0])
+    nuisance = replace(nuisance, mean=freeze(mean), root=freeze(root_of(covariance)))
+    return replace(model, sensor=replace(sensor, calibration=calibration), nuisance=nuisance)
+
+
+def _seen_from(model: Model, frame: Frame) -> Frame:
+    assert frame.scan is not None
+    return replace(frame, pixels=model.pixels(frame.scan), objects=(), background=background_rows(model, frame.index))
+
+
+def _misfit_of_background(model: Model, best: Fit) -> float:
+    rows = background_rows(model, best.frame.index)
+    return 0.0 if rows is None else misfit(rows.residual, rows.log_other, rows.share)[0]
+
+
+def _in_words(model: Model, moved: Moved) -> dict[str, float | str]:
+    """Return which camera moved farthest and how far."""
+    steps = moved.step.reshape(-1, 6)
+    farthest = int(np.argmax(np.linalg.norm(steps / np.repeat([1.0, model.sensor.size], 3), axis=1)))
+    name = model.sensor.recording.camera_names[farthest]
+    return {
+        "who": f"camera {name}" if name else "the camera",
+        "shift_mm": 1e3 * float(np.linalg.norm(steps[farthest, 3:])),
+        "turn_deg": float(np.degrees(np.linalg.norm(steps[farthest, :3]))),
+    }

@@ -1,0 +1,204 @@
+"""What contact-free frames teach: the prior of the nuisance parameters, the noise, its overdispersion, and the odds of an inferred contact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from femsense.calib.from_clouds import free_clouds
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
+from femsense.core.pose import moved_poses
+from femsense.inference.error_field import spread_field
+from femsense.inference.nuisance import first_nuisance, fit_nuisance, gram_of, learnt, without_poses
+from femsense.inference.pixels import Skin
+from femsense.inference.rows import Rows
+from femsense.model.quasi_static_path import free_path
+from femsense.sensing.background import background_of
+from femsense.sensing.fit import fit
+from femsense.sensing.model import Fit, Frame, Limits, Model
+from femsense.sensing.odds import INFERRED
+from femsense.sensing.pose_rows import pose_gain
+from femsense.sensing.prepare import pose_covariance, scan_of
+from femsense.sensing.proposals import inferred
+from femsense.sensing.types import Sensor
+
+MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
+"""Prior of the relative modulus: σ = 0.03, or 0.01 where cable pulls are nuisance parameters too, because the two are nearly collinear; of each pull 0.05."""
+SEVERAL = 4
+"""Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
+FLAG = 1e-3
+"""How often the nuisance of a contact-free frame may be as large by noise alone."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ContactFree:
+    """A contact-free frame."""
+
+    frame: Frame
+    fit: Fit
+
+
+def learn(sensor: Sensor) -> Model:
+    """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
+    model = _first_model(sensor)
+    first = free_clouds(sensor.recording)
+    if len(first):
+        background = background_of(sensor, int(first[0]))
+        model = replace(model, sensor=replace(sensor, background=background))
+    for turn in range(2):
+        frames = _contact_free(model)
+        if not frames:
+            return replace(model, inferred_odds=INFERRED)
+        model = _taught(model, [one.fit for one in frames])
+        if turn == 0:
+            model = _at_the_mean(model, [one.fit for one in frames])
+    frames = _contact_free(model)
+    return _with_limits(model, frames)
+
+
+def _first_model(sensor: Sensor) -> Model:
+    nodes, triangles = sensor.robot.body.mesh.nodes, sensor.surface.triangles
+    corners = nodes[triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    field = spread_field(corners.mean(axis=1), facing, sensor.size)
+    skin = Skin(triangles, nodes, freeze(facing), field, sensor.pivot, sensor.size)
+    pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
+    drives = len(sensor.robot.body.cables) + len(sensor.robot.body.chambers) if pulls else 0
+    modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
+    covariance = block_diag(pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives))
+    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(field))
+    return Model(sensor, skin, nuisance, sensor.knowledge.noises)
+
+
+def _contact_free(model: Model) -> list[ContactFree]:
+    """Return the contact-free frames, each fitted without contacts; a frame that gives nothing is left out."""
+    result = []
+    for k, state in free_path(model.sensor.driven, free_clouds(model.sensor.recording)):
+        try:
+            scan = scan_of(model.sensor, k, state)
+        except FemsenseError:
+            continue
+        if scan is None or len(scan.view) < 30:
+            continue
+        marked = model.drives > 0 and bool((model.sensor.recording.marker_frame == k).any())
+        frame = Frame(k, model.pixels(scan), scan, state, None, with_markers=marked)
+        found = fit(model, frame, (), np.zeros((0, 3)), state)
+        if found is not None:
+            result.append(ContactFree(frame, found))
+    return result
+
+
+def _taught(model: Model, frames: Sequence[Fit], *, sizes: tuple[float, float, float] | None = None) -> Model:
+    """Return the model with noise, overdispersion and prior as some contact-free frames show them."""
+    nuisance, scale, T = model.nuisance, 1.0, model.overdispersion
+    for _ in range(2):
+        grams, left = [], []
+        for one in frames:
+            rows = _rescaled(one.rows, scale, T)
+            N, residual = one.C @ nuisance.root, rows.residual - one.C @ nuisance.mean
+            eta, _, weight = fit_nuisance(rows, residual, N, np.zeros(N.shape[1]))
+            grams.append(gram_of(rows, one.C, weight))
+            z = (residual - N @ eta) / rows.std
+            left.append((np.where(weight * T * rows.std**2 > 0.5, z, np.nan), rows.rest))
+        scale *= float(np.clip(1.4826 * np.nanmedian(np.abs(np.concatenate([z for z, _ in left]))), 0.3, 30.0))
+        T = _overdispersion(left, 0.5 * model.skin.field.length)
+        nuisance = learnt(nuisance, grams, sizes=sizes)
+    return replace(model, nuisance=nuisance, scale=model.scale * scale, overdispersion=T)
+
+
+def _rescaled(rows: Rows, scale: float, T: float) -> Rows:
+    return replace(rows, std=rows.std * scale, share=np.full(len(rows), 1.0 / T))
+
+
+def _overdispersion(left: Sequence[tuple[FloatArray, FloatArray]], cell: float) -> float:
+    """Return T ≥ 1: variance of sums of whitened residuals over cells of the surface, relative to that of independent pixels."""
+    sums = squares = 0.0
+    for z, rest in left:
+        robot = np.isfinite(z)
+        label = np.unique(np.floor(rest[robot] / cell).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+        sums += float((np.bincount(label, z[robot]) ** 2).sum())
+        squares += float((z[robot] ** 2).sum())
+    return max(1.0, sums / max(squares, 1e-9))
+
+
+def _at_the_mean(model: Model, frames: Sequence[Fit]) -> Model:
+    """Return the model with cameras and modulus where the contact-free frames show them, so that rays and states are near the true ones.
+
+    Where pulls are nuisance parameters, a pose that is far off and an opposite error field fit a little better together than a small one of each; there
+    the field is held orthogonal to the pose.
+    """
+    v, sensor, nuisance = 6 * model.views, model.sensor, model.nuisance
+    shown = nuisance.mean[: nuisance.common]
+    if model.drives:
+        grams = [without_poses(gram_of(one.rows, one.C, one.weight), v, nuisance.common) for one in frames]
+        shown = learnt(nuisance, grams, sizes=nuisance.sizes).mean[: nuisance.common]
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -shown[:v], sensor.pivot))
+    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + shown[v])))
+    first = np.concatenate([-shown[:v], [1.0 / (1.0 + shown[v]) - 1.0], np.zeros(model.drives)])
+    sensor = replace(
+        sensor,
+        robot=robot,
+        driven=replace(sensor.driven, robot=robot),
+        calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
+    )
+    nuisance = first_nuisance(first, model.nuisance.first_covariance, len(model.skin.field))
+    return replace(model, sensor=sensor, nuisance=nuisance, modulus_shift=float(shown[v]))
+
+
+def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
+    """Return the model with the odds of an inferred contact and the limits of the posterior check, from what each contact-free frame shows by what the
+    others teach."""
+    fits = [one.fit for one in frames]
+    gains, checks = [], []
+    for i, one in enumerate(frames):
+        others = model
+        if len(frames) >= SEVERAL:
+            others = _taught(model, [f for j, f in enumerate(fits) if j != i], sizes=model.nuisance.sizes)
+            others = replace(others, scale=model.scale, overdispersion=model.overdispersion, inferred_odds=0.0)
+        alone = fit(others, one.frame, (), np.zeros((0, 3)), one.frame.predicted)
+        assert alone is not None
+        if len(frames) >= SEVERAL:
+            gains.append(max(inferred(others, alone)[0], 0.0))
+        checks.append((*check_values(others, alone), pose_gain(others, alone)))
+    odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
+    noises = tuple(
+        replace(one, at_1m=model.scale * one.at_1m, floor=model.scale * one.floor, slope=model.scale * one.slope)
+        for one in model.noises
+    )
+    bias, share = model.nuisance.sizes[:2]
+    knowledge = replace(model.sensor.knowledge, noises=noises, bias_m=bias, model_share=share)
+    sensor = replace(model.sensor, knowledge=knowledge)
+    misfit, nuisance, behind, pose = np.array(checks).T
+    limits = Limits(_limit(misfit, 0.05), max(1.0, _limit(nuisance, 0.05)), _limit(behind, 0.01), _limit(pose, 1.0))
+    return replace(model, sensor=sensor, inferred_odds=odds, limits=limits)
+
+
+def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
+    """Return the statistics of the posterior check: misfit per pixel, |η̃|² over its quantile at level FLAG, and the share of pixels behind the body.
+
+    The misfit is capped at five standard deviations; where colour does not separate the robot, it is that of the robot's own pixels. With
+    A = Nᵀ W N, the fitted η̃ has the covariance A (A + 1)⁻¹; its |η̃|² is that of a gamma distribution with the same mean and variance
+    (Satterthwaite 1946).
+    """
+    pixels, q = found.rows.pixel, model.nuisance.root.shape[1]
+    z = found.left(model.nuisance)[pixels]
+    robot = np.ones(len(z)) if found.frame.coloured else (found.weight * found.rows.std**2 / found.rows.share)[pixels]
+    N = found.N[:, :q]
+    seen = np.maximum(np.linalg.eigvalsh((N * found.weight[:, None]).T @ N), 0.0)
+    share = seen / (1.0 + seen)
+    degrees = share.sum() ** 2 / max(float((share**2).sum()), 1e-12)
+    expected = share.sum() / max(degrees, 1e-12) * float(chi2.isf(FLAG, degrees)) if degrees > 0.0 else 1.0
+    behind = float((found.rows.residual[pixels] < -4.0 * found.rows.std[pixels]).mean())
+    misfit = float(robot @ np.minimum(z**2, 25.0) / max(robot.sum(), 1.0))
+    return misfit, float((found.eta[:q] ** 2).sum()) / max(expected, 1e-12), behind
+
+
+def _limit(seen: FloatArray, least: float) -> float:
+    """Return the largest value to expect of a statistic that was so large in contact-free frames; it scatters by `least` at least."""
+    return float(seen.max() + 3.0 * max(float(seen.std()), least))

@@ -1,0 +1,278 @@
+"""Contacts and forces of one frame: predict, propose, fit, keep the best, stop.
+
+docs/estimator.md has the objective J, the proposals and the posterior check.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.inference.rows import Rows
+from femsense.model.drive import has_history
+from femsense.pointcloud.primitives import Shape
+from femsense.sensing.camera_moved import camera_verdict
+from femsense.sensing.fit import TOLERANCE, fit
+from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
+from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
+from femsense.sensing.prepare import scan_of
+from femsense.sensing.proposals import SAME, proposals
+from femsense.sensing.reported import contacts_of
+from femsense.sensing.run_arrays import sensed
+from femsense.sensing.status import checked
+from femsense.sensing.types import FrameReport, SensedFrame, Touch
+
+ROUNDS, FITTED = 8, 4
+"""Rounds of proposals at most, and proposals that are fitted in each."""
+UNDETERMINED_TAU = 2.0
+"""Prior scale of the force at an object in touch that the data do not determine [N]: what hands and grippers press with."""
+MANY = 30
+"""Pixels of an object without a known shape that may carry a latent force."""
+FEWEST = 30
+"""Fewer pixels of the robot say nothing of its shape."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimate:
+    """A frame, estimated."""
+
+    best: Fit
+    rms_before_m: float
+    """Residual of the predicted state, along the normal or of markers in 3-D."""
+    stages_ms: dict[str, float]
+
+
+def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
+    """Return contacts, forces and status of frame k. Raises FemsenseError."""
+    found = estimate_frame(model, k, previous)
+    best, sensor = found.best, model.sensor
+    status = camera_verdict(model, best, checked(model, best))
+    contacts = contacts_of(model, best, previous)
+    report = FrameReport(
+        int(sensor.recording.frame_numbers[k]),
+        float(sensor.recording.time_s[k]),
+        str(status),
+        len(sensed(contacts)),
+        measurements(best.rows),
+        found.rms_before_m,
+        rms_of(best.rows, inliers(best)),
+        sum(found.stages_ms.values()),
+        dict(best.state.tension),
+        dict(best.state.pressure),
+        found.stages_ms,
+    )
+    state = replace(best.state, factor=None)
+    return SensedFrame(
+        best.contacts, state, best.forces, best.frame.predicted, report, contacts, tau=best.tau, trusted=status.trusted
+    )
+
+
+def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estimate:
+    """Return the hypothesis of frame k with the lowest J.
+
+    Raises:
+        FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
+    """
+    clock = Clock()
+    frame = _predicted(model, k, previous, clock)
+    start = _carried_over(model, frame, previous)
+    best = start if start is not None else _without_contacts(model, frame)
+    clock.lap("fit")
+    if given := given_touches(model.sensor):
+        best = _at_given_places(model, frame, given, best, previous)
+    elif not said_free(model.sensor, k):
+        best = _searched(model, best)
+        best = _with_objects_in_touch(model, best)
+    clock.lap("search")
+    exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
+    best = best if exact is None else replace(best, state=exact)
+    before = rms_of(model.rows(frame, frame.predicted), inliers(best))
+    clock.lap("state")
+    return Estimate(best, before, clock.stages)
+
+
+def inliers(best: Fit) -> BoolArray:
+    """Return which rows of the measurements are the robot's with probability above one half, shape (r,)."""
+    responsibility = best.weight * best.rows.std**2 / best.rows.share
+    return np.asarray((responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
+
+
+def rms_of(rows: Rows, robot: BoolArray) -> float:
+    """Return the root mean square residual [m] of the robot's pixels along the normal, or of markers in 3-D."""
+    own = rows.residual[robot[: len(rows)]] if rows.pixel.any() else rows.residual.reshape(-1, 3)
+    return float(np.sqrt((own**2).sum() / max(len(own), 1))) if len(own) else float("nan")
+
+
+def measurements(rows: Rows) -> int:
+    """Return the number of pixels, or of markers."""
+    return int(rows.pixel.sum()) if rows.pixel.any() else len(rows) // 3
+
+
+def _searched(model: Model, best: Fit) -> Fit:
+    """Return the best fit after proposals have stopped to lower J."""
+    for _ in range(ROUNDS):
+        best = _with_objects(model, best)
+        better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
+        if better is None:
+            break
+        best = better
+    return best
+
+
+def _with_objects(model: Model, best: Fit) -> Fit:
+    """Return a fit with the objects near the body: where colour does not separate them, of the pixels in front that it does not take for the robot."""
+    frame = best.frame
+    if frame.coloured or frame.scan is None:
+        return best
+    pixels = best.rows.pixel
+    other = ~inliers(best)[pixels] & (best.rows.residual[pixels] > 0.0)
+    scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
+    seen = replace(frame, objects=tuple(objects_near(model.sensor, scan, best.state)))
+    again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
+    return best if again is None else again
+
+
+def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
+    """Return the best hypothesis fitted again with objects in touch that are none of its contacts, where there are any.
+
+    Their forces are not significant. Left out, they would bias those of their neighbours and make their intervals too narrow. An object whose surface
+    lies at the body's becomes a contact with a wide interval, another one a latent force.
+    """
+    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(best.frame.objects), best.state))
+    others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
+    at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
+    latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
+    if not at_surface and not (latent and best.contacts):
+        return best
+    again = fit(
+        model,
+        replace(best.frame, latent=tuple(latent)),
+        [*best.contacts, *at_surface],
+        np.vstack([best.forces, np.zeros((len(at_surface), 3))]),
+        best.state,
+        eta=best.eta,
+        tau=np.append(best.tau, np.full(len(at_surface), UNDETERMINED_TAU)),
+        linearised=best.linearised,
+    )
+    return best if again is None else again
+
+
+def _is_object(contact: Touch) -> bool:
+    """Return whether a contact is with an object of known shape, or with one whose pixels are too many for a scrap of the scene."""
+    shape = contact.shape
+    return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
+
+
+def _fits(model: Model, best: Fit) -> Iterator[Fit]:
+    """Yield fits of the most promising proposals, one after the other."""
+    for one in proposals(model, best)[:FITTED]:
+        start = best.state if best.contacts and one.contacts else best.frame.predicted
+        found = fit(model, best.frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
+        if found is not None:
+            yield found
+
+
+# --- predict ------------------------------------------------------------------------------------------------------------
+
+
+def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock) -> Frame:
+    """Return the frame with its predicted state, its pixels, and the objects near the body."""
+    tensions = previous.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
+    predicted = model.predict(k, None if previous is None else previous.free_state, tensions)
+    if predicted is None:
+        raise DataError("no equilibrium under the inputs")
+    clock.lap("equilibrium")
+    expected = _expected(predicted, previous)
+    scan = scan_of(model.sensor, k, expected)
+    clock.lap("read")
+    if scan is None:
+        return Frame(k, None, None, predicted, tensions)
+    if len(scan.view) < FEWEST:
+        raise DataError(
+            f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
+        )
+    objects: list[Shape] = []
+    if not len(model.sensor.places) and not said_free(model.sensor, k):
+        objects = objects_near(model.sensor, scan, expected)
+    clock.lap("objects")
+    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects))
+
+
+def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
+    """Return about where the body is: the previous state, moved as the inputs have moved the predicted one since."""
+    if previous is None or not previous.touches or not previous.trusted:
+        return predicted
+    moved = previous.state.positions + predicted.positions - previous.free_state.positions
+    return replace(previous.state, positions=moved)
+
+
+def _without_contacts(model: Model, frame: Frame) -> Fit:
+    found = fit(model, frame, (), np.zeros((0, 3)), frame.predicted)
+    assert found is not None
+    return found
+
+
+def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit | None:
+    """Return the fit of the previous frame's contacts where dropping any of them would raise J; else None."""
+    if (
+        previous is None
+        or not previous.touches
+        or not previous.trusted
+        or len(model.sensor.places)
+        or said_free(model.sensor, frame.index)
+    ):
+        return None
+    start = _expected(frame.predicted, previous)
+    seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), start))
+    kept = [i for i, contact in enumerate(previous.touches) if not contact.undetermined]
+    if not kept:
+        return None
+    contacts = [_followed(model, previous.touches[i], seen) for i in kept]
+    found = fit(model, frame, contacts, previous.forces[kept], start, tau=previous.tau[kept])
+    if found is None:
+        return None
+    alone = None if (found.drop_gain > found.odds).all() else _without_contacts(model, frame)
+    return found if alone is None or found.criterion < alone.criterion else alone
+
+
+def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
+    """Return a contact of the previous frame at the object that is seen to touch near it now; inferred where none is."""
+    distance = [float(np.linalg.norm(one.place - contact.place)) for one in seen] if contact.source == "cloud" else []
+    if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * seen[int(np.argmin(distance))].std_m):
+        return seen[int(np.argmin(distance))]
+    if contact.source == "shape":
+        return contact
+    std = float(np.sqrt(model.sensor.surface.area.sum() / (2.0 * np.pi)))
+    return replace(contact, source="shape", std_m=std, line=np.zeros(3), expected=contact.place, shape=None, pulls=False)
+
+
+def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: SensedFrame | None) -> Fit:
+    """Return the fit with forces at the given places, whatever its evidence."""
+    forces, start, tau = np.zeros((len(given), 3)), frame.predicted, None
+    if previous is not None and len(previous.touches) == len(given):
+        forces, start, tau = previous.forces, _expected(frame.predicted, previous), previous.tau
+    tried = [fit(model, frame, given, forces, start, tau=tau)]
+    if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
+        tried.append(fit(model, frame, given, forces, start, tau=tau, catch=np.inf))
+    found = [one for one in tried if one is not None]
+    return min(found, key=lambda one: one.criterion) if found else alone
+
+
+class Clock:
+    """Durations of the stages of a frame [ms]."""
+
+    def __init__(self) -> None:
+        self.began = self.last = time.perf_counter()
+        self.stages: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.stages[name] = self.stages.get(name, 0.0) + 1e3 * (now - self.last)
+        self.last = now

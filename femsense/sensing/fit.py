@@ -1,0 +1,321 @@
+"""Fitting a hypothesis: the minimum of Φ over forces, contact points and nuisance parameters, and its Laplace approximation.
+
+    Φ = Σ_j (1/T_j) · −2 log[exp(−z_j²/2) + o_j] + |η̃|² + |f̃|² + |s̃|²,   z = (r(x(f, s)) − C(μ + R η̃)) / σ
+    E = min Φ + log det A,   A = I + Jᵀ W J
+
+f̃: force over its prior scale, τ along the normal and τ/2 across; s̃: shift of the contact point over its standard deviation. Gauss–Newton steps over all of
+(f̃, s̃, η̃) with iteratively reweighted rows; each state is a new equilibrium. The tangent is kept while steps succeed (chord method).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.fem.equilibrium import Equilibrium
+from femsense.inference.mixture import first_width
+from femsense.inference.nuisance import columns, fit_nuisance
+from femsense.inference.rows import Rows, stacked
+from femsense.sensing.cone import within_cones
+from femsense.sensing.model import Fit, Frame, Linearised, Model
+from femsense.sensing.no_penetration import gap_rows
+from femsense.sensing.odds import odds_of
+from femsense.sensing.touches import moved_to, nodal_forces_by_shift, pressed, touch_normal, ways_of
+from femsense.sensing.types import Touch
+
+ACROSS = 0.5
+"""Prior scale of the force across the normal relative to that along it: friction of skins."""
+SWAYING = 0.1
+"""The same of a hanging weight, across gravity: a thread that is not quite plumb."""
+TAU = (0.02, 5.0)
+"""Bounds of the prior scale of a force [N]."""
+FIRST_TAU = 0.3
+"""Prior scale of a force that is not known yet [N]."""
+CATCH = 3.0
+"""κ at the start at most where colour does not separate the robot."""
+SIZINGS, SETTLED = 8, 0.02
+"""Updates of τ in one linear problem at most, and the relative change below which one is the last."""
+STEPS, HALVINGS = 14, (1.0, 0.5, 0.2, 0.05)
+TOLERANCE = 0.1
+"""A fit ends where a step lowers Φ by less."""
+LATENT = 0.2
+"""Prior scale of the force at an object that touches and is no contact of the hypothesis [N]."""
+CHORD = 0.02
+"""The tangent of a state serves for states whose nodes are nearer than this share of the body's diagonal."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Point:
+    """Where an iteration stands."""
+
+    contacts: tuple[Touch, ...]
+    forces: FloatArray
+    tau: FloatArray
+    state: Equilibrium
+    axes: FloatArray
+    """Outward normal of the deformed surface and two tangents of each contact, shape (m, 3, 3)."""
+    rows: Rows
+    C: FloatArray
+    N: FloatArray
+    residual: FloatArray
+    """r − Cμ [m], shape (r,)."""
+
+
+def fit(
+    model: Model,
+    frame: Frame,
+    contacts: Sequence[Touch],
+    forces: FloatArray,
+    start: Equilibrium,
+    *,
+    eta: FloatArray | None = None,
+    tau: FloatArray | None = None,
+    linearised: Linearised | None = None,
+    catch: float = CATCH,
+) -> Fit | None:
+    """Return a hypothesis at the minimum of Φ near a start; None where there is no equilibrium.
+
+    Arguments:
+        contacts: with their places at the start; forces: at the start [N], shape (m, 3).
+        start: a state near by.
+        catch: κ at the start at most where colour does not separate the robot.
+        eta, tau, linearised: where the nuisance, the prior scales and the tangent are known from a fit near by.
+    """
+    m, contacts = len(contacts), tuple(contacts)
+    forces = np.array(forces, dtype=np.float64).reshape(-1, 3)
+    contacts = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, forces))
+    state = model.solve(frame, contacts, forces, start) if m and forces.any() else start
+    if state is None:
+        return None
+    q = model.nuisance.root.shape[1]
+    near = linearised is not None and _near(model, linearised.positions, state.positions)
+    linear = linearised if near and linearised is not None else model.linearised(state)
+    here = _point(model, frame, contacts, forces, np.full(m, FIRST_TAU) if tau is None else np.array(tau), state, linear)
+    eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
+    if not m:
+        eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
+        return _finished(model, frame, here, linear, eta, True)
+    wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=30.0, steps=1)[0]
+    z = (here.residual - here.N @ wide) / here.rows.std
+    kappa = first_width(z, here.rows.pixel, frame.coloured, catch)
+    converged = False
+    for _ in range(STEPS):
+        eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
+        phi += _prior(model, here)
+        step, eta_there, tau = _step(model, here, linear, eta, weight)
+        phi += _prior(model, replace(here, tau=tau)) - _prior(model, here)
+        here = replace(here, tau=tau)
+        there = None
+        for length in HALVINGS:
+            there = _moved(model, frame, here, linear, length * step)
+            if there is None:
+                continue
+            eta_new, phi_there, _ = fit_nuisance(there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel))
+            phi_there += _prior(model, there)
+            if phi_there < phi:
+                break
+            there = None
+        if there is None:
+            if kappa.narrow:
+                converged = True
+                break
+            kappa = kappa.narrowed()
+            continue
+        here, eta = there, eta_new
+        if not _near(model, linear.positions, here.state.positions):
+            linear = model.linearised(here.state)
+            here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
+        if kappa.narrow and phi - phi_there < TOLERANCE:
+            converged = True
+            break
+        kappa = kappa.narrowed()
+    return _in_cones(model, frame, _finished(model, frame, here, linear, eta, converged), here)
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+def _near(model: Model, first: FloatArray, second: FloatArray) -> bool:
+    return float(np.abs(first - second).max()) < CHORD * model.sensor.size
+
+
+def _point(
+    model: Model,
+    frame: Frame,
+    contacts: tuple[Touch, ...],
+    forces: FloatArray,
+    tau: FloatArray,
+    state: Equilibrium,
+    linear: Linearised,
+) -> Point:
+    rows = stacked([model.rows(frame, state), *gap_rows(model, frame, contacts, state.positions)])
+    C = columns(rows, linear.softening)
+    axes = axes_at(model, contacts, state)
+    N = np.hstack([C @ model.nuisance.root, _latent_columns(model, frame, rows, state, linear)])
+    return Point(contacts, forces, tau, state, axes, rows, C, N, rows.residual - C @ model.nuisance.mean)
+
+
+def _latent_columns(model: Model, frame: Frame, rows: Rows, state: Equilibrium, linear: Linearised) -> FloatArray:
+    """Return the columns of latent normal forces (see `Frame.latent`), shape (r, l)."""
+    loads = [one.patch.spread(-LATENT * touch_normal(model.sensor, one, state), len(state.positions)) for one in frame.latent]
+    return rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(rows), 0))
+
+
+def axes_at(model: Model, contacts: Sequence[Touch], state: Equilibrium) -> FloatArray:
+    """Return axes of the force of each contact: outward normal and two tangents, or upward and two horizontals where a weight hangs; shape (m, 3, 3)."""
+    normals = [model.upward if c.pulls else touch_normal(model.sensor, c, state) for c in contacts]
+    return np.array([axes_of(normal) for normal in normals]).reshape(-1, 3, 3)
+
+
+def axes_of(normal: FloatArray) -> FloatArray:
+    """Return rows: a unit normal and two tangents, shape (3, 3)."""
+    across = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.8 else [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    return np.stack([normal, across, np.cross(normal, across)])
+
+
+def force_scale(tau: float, across: float = ACROSS) -> FloatArray:
+    """Return the prior standard deviation of a force along its axes [N], shape (3,)."""
+    return tau * np.array([1.0, across, across])
+
+
+def across(model: Model, contact: Touch) -> float:
+    """Return the prior scale of the force across its first axis relative to that along it: what acts at a given place and may pull, acts any way."""
+    if contact.pulls:
+        return SWAYING
+    return 1.0 if contact.source == "given" and not model.sensor.options.push else ACROSS
+
+
+def _place_scale(contact: Touch, force: FloatArray, limit: float = np.inf) -> FloatArray:
+    """Return the standard deviation of a contact point along its two ways [m], shape (2,); 0 where it does not move."""
+    if contact.std_m == 0.0 or not force.any():
+        return np.zeros(2)
+    std = ways_of(contact)[1]
+    return np.minimum(std, limit) if contact.source == "shape" else std
+
+
+def _place_offset(contact: Touch) -> FloatArray:
+    """Return s̃ of a contact: how far it is from where its object was seen, in standard deviations; an inferred one may be anywhere. Shape (2,)."""
+    if contact.source == "shape" or contact.std_m == 0.0:
+        return np.zeros(2)
+    ways, std = ways_of(contact)
+    return np.asarray(ways @ (contact.place - contact.expected) / std)
+
+
+def _prior(model: Model, here: Point) -> float:
+    """Return |f̃|² + |s̃|²."""
+    total = 0.0
+    for contact, force, axes, tau in zip(here.contacts, here.forces, here.axes, here.tau):
+        total += float(
+            (((axes @ force) / force_scale(tau, across(model, contact))) ** 2).sum() + (_place_offset(contact) ** 2).sum()
+        )
+    return total
+
+
+def _whitened(model: Model, here: Point, *, trust: bool) -> tuple[FloatArray, FloatArray]:
+    """Return prior scales of (force along its axes, contact point) of all contacts and where they stand in them, shapes (5m,).
+
+    trust: the contact point of an inferred contact moves by about an edge in one step.
+    """
+    limit = model.sensor.surface.edge if trust else np.inf
+    scales, at = [np.zeros(0)], [np.zeros(0)]
+    for contact, force, axes, tau in zip(here.contacts, here.forces, here.axes, here.tau):
+        own = force_scale(tau, across(model, contact))
+        scales += [own, _place_scale(contact, force, limit)]
+        at += [(axes @ force) / own, _place_offset(contact)]
+    return np.concatenate(scales), np.concatenate(at)
+
+
+def contact_columns(model: Model, here: Point | Fit, axes: FloatArray, linear: Linearised) -> FloatArray:
+    """Return J: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
+    n = len(here.state.positions)
+    loads = []
+    for contact, force, own in zip(here.contacts, here.forces, axes):
+        loads += [contact.patch.spread(axis, n) for axis in own]
+        loads += [nodal_forces_by_shift(model.sensor, contact, way, force) for way in ways_of(contact)[0]]
+    return here.rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(here.rows), 0))
+
+
+def _step(
+    model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, and the prior scales τ, shape (m,).
+
+    τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
+    expected under the posterior (MacKay 1992).
+    """
+    m = len(here.contacts)
+    J = contact_columns(model, here, here.axes, linear)
+    A = np.hstack([J, here.N])
+    WA = A * weight[:, None]
+    gram, tau = A.T @ WA, here.tau.copy()
+    for _ in range(SIZINGS):
+        scale, at = _whitened(model, replace(here, tau=tau), trust=True)
+        full = np.append(scale, np.ones(here.N.shape[1]))
+        inverse = np.linalg.inv(np.eye(len(full)) + full[:, None] * gram * full)
+        u = inverse @ (full * (WA.T @ (here.residual + J @ (at * scale))))
+        last = tau.copy()
+        for i, contact in enumerate(here.contacts):
+            f = slice(5 * i, 5 * i + 3)
+            if not contact.undetermined:
+                tau[i] = np.clip(tau[i] * np.sqrt((u[f] @ u[f] + np.trace(inverse[f, f])) / 3.0), *TAU)
+        if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
+            break
+    return (u[: 5 * m] - at) * scale, u[5 * m :], last
+
+
+def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: FloatArray) -> Point | None:
+    edge = model.sensor.surface.edge
+    contacts, forces = [], here.forces.copy()
+    for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
+        own = step[5 * i : 5 * i + 5]
+        forces[i] += axes.T @ own[:3]
+        way = own[3:] @ ways_of(contact)[0]
+        far = float(np.linalg.norm(way))
+        there = moved_to(model.sensor, contact, contact.place + way * min(1.0, edge / far)) if far > 1e-5 else contact
+        contacts.append(pressed(model.sensor, there, forces[i]))
+    state = model.solve(frame, tuple(contacts), forces, here.state)
+    return None if state is None else _point(model, frame, tuple(contacts), forces, here.tau, state, linear)
+
+
+# --- the optimum --------------------------------------------------------------------------------------------------------
+
+
+def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: FloatArray, converged: bool) -> Fit:
+    """Return the Laplace approximation at a point."""
+    m = len(here.contacts)
+    eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta)
+    J = contact_columns(model, here, here.axes, linear)
+    scale, at = _whitened(model, here, trust=False)
+    A = np.hstack([J * scale, here.N])
+    H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
+    P = np.linalg.inv(H)
+    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(H)[1])
+    force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
+    for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
+        f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
+        force_map[3 * i : 3 * i + 3, f] = axes.T * scale[f]
+        way = ways_of(contact)[0].T * scale[s]
+        places[i] = way @ P[s, s] @ way.T
+        gain[i] = float(at[f] @ np.linalg.solve(P[f, f], at[f]) + np.linalg.slogdet(P[f, f])[1])
+    odds = np.array([odds_of(model, contact, here.rows) for contact in here.contacts])
+    covariance = force_map @ P[: 5 * m, : 5 * m] @ force_map.T
+    return Fit(
+        frame, here.contacts, freeze(here.forces), here.tau, here.axes, here.state, here.rows, linear, here.C, here.N, eta, weight, phi, evidence,
+        odds, covariance, places, gain, converged,
+    )  # fmt: skip
+
+
+def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:
+    """Return the fit with its forces moved into their friction cones in the metric of the posterior, where they lie outside."""
+    inside = within_cones(model.sensor, found, here.axes)
+    if inside is None:
+        return found
+    state = model.solve(frame, found.contacts, inside, found.state)
+    if state is None:
+        return found
+    there = _point(model, frame, found.contacts, inside, found.tau, state, found.linearised)
+    return _finished(model, frame, there, found.linearised, found.eta, found.converged)

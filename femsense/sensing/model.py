@@ -1,0 +1,242 @@
+"""What estimating contacts takes and returns: the model of a recording, a frame, and a fitted hypothesis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from femsense.calib.scan import Scan
+from femsense.core.arrays import FloatArray
+from femsense.fem.assembly import internal
+from femsense.fem.compliance import Tangent, drive_rows, tangent_at
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.inference.nuisance import Nuisance
+from femsense.inference.pixels import Pixels, Skin, pixel_rows
+from femsense.inference.rows import Rows, stacked
+from femsense.model.camera import CameraNoise
+from femsense.model.frame_state import solve_frame
+from femsense.pointcloud.primitives import Shape
+from femsense.sensing.marker_rows import marker_rows
+from femsense.sensing.touches import nodal_forces
+from femsense.sensing.types import Sensor, Touch
+
+ROBOT = 0.99
+"""π of a pixel that has the robot's colour; 0.5 where colour does not separate it."""
+EXACT, ROUGH = 1e-9, 1e-6
+"""Unbalanced force relative to all loads: of a result, and of a state on the way."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Model:
+    """Everything that stays the same from frame to frame."""
+
+    sensor: Sensor
+    skin: Skin
+    nuisance: Nuisance
+    noises: tuple[CameraNoise, ...]
+    """Noise of each camera as declared or measured."""
+    scale: float = 1.0
+    """Factor on that noise: what contact-free frames scatter."""
+    overdispersion: float = 1.0
+    """T: variance of sums of whitened residuals over neighbouring pixels, relative to independent ones."""
+    slant: float = 0.0
+    """Power of 1/cos(incidence) with which the noise along the ray grows beyond what is declared."""
+    inferred_odds: float = 0.0
+    """L of an inferred contact: −2 log of its prior odds, raised by what the search gains in contact-free frames."""
+    modulus_shift: float = 0.0
+    """Relative softness that contact-free frames asked for and that the body has been given."""
+    limits: Limits | None = None
+    """What the posterior check compares with; None before contact-free frames are seen."""
+    candidates: Candidates = field(default_factory=lambda: Candidates())
+
+    @property
+    def upward(self) -> FloatArray:
+        """Unit vector against gravity, shape (3,); 0 where the model has no weight."""
+        gravity = self.sensor.robot.body.gravity
+        return np.asarray(-gravity / max(float(np.linalg.norm(gravity)), 1e-12))
+
+    @property
+    def views(self) -> int:
+        return len(self.sensor.calibration.poses)
+
+    @property
+    def compliance_std(self) -> float:
+        """Relative standard deviation of the compliance at a contact [1].
+
+        Gravity and cables pull as declared, and yet the model needs another modulus or other pulls to move as the body does (law, mesh, ties): what it
+        needs there, it needs at a contact. The root mean square of the pulls that contact-free frames ask for, and that of the modulus.
+        """
+        asked = np.arange(6 * self.views, self.nuisance.common)
+        square = self.nuisance.mean[asked] ** 2 + (self.nuisance.root[asked] ** 2).sum(axis=1)
+        return float(np.sqrt(self.modulus_shift**2 + square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
+
+    @property
+    def drives(self) -> int:
+        """Number of cables and chambers whose pulls are nuisance parameters."""
+        return self.nuisance.common - 6 * self.views - 1
+
+    def pixels(self, scan: Scan) -> Pixels:
+        """Return the pixels of a scan with their noise."""
+        poses = self.sensor.calibration.poses
+        share = np.full(len(scan.view), ROBOT if scan.segmented else 0.5)
+        std = self.scale * scan.ray_std(self.noises)
+        return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, share, 1.0 / self.overdispersion, scan.segmented)
+
+    def rows(self, frame: Frame, state: Equilibrium) -> Rows:
+        """Return the rows of a frame at a state: its pixels, or its markers where it has none. Raises DataError."""
+        if frame.pixels is None:
+            return marker_rows(self.sensor, frame.index, state, len(self.skin.field))
+        rows = pixel_rows(frame.pixels, self.skin, state.positions, self.views)
+        more = [] if frame.background is None else [frame.background]
+        if frame.with_markers:
+            more.append(marker_rows(self.sensor, frame.index, state, len(self.skin.field)))
+        return stacked([rows, *more])
+
+    def solve(
+        self, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium | None, *, exact: bool = False
+    ) -> Equilibrium | None:
+        """Return the equilibrium under the inputs and contact forces (m, 3) [N]; None where there is none near the start."""
+        loads = None
+        if len(contacts) and start is not None:
+            loads = nodal_forces(contacts, forces, len(start.positions))
+        options = SolveOptions(
+            before=frame.previous_tensions,
+            reuse_factor=start is not None,
+            relative_tolerance=EXACT if exact else ROUGH,
+            rough=not exact,
+        )
+        state = solve_frame(self.sensor.driven, frame.index, start=start, nodal_forces=loads, options=options)
+        return state if state.converged else None
+
+    def predict(self, k: int, start: Equilibrium | None, tensions: tuple[FloatArray, ...] | None) -> Equilibrium | None:
+        """Return the equilibrium of frame k under its inputs without contact forces; None where there is none."""
+        options = SolveOptions(before=tensions, reuse_factor=start is not None, relative_tolerance=EXACT)
+        state = solve_frame(self.sensor.driven, k, start=start, options=options)
+        return state if state.converged else None
+
+    def linearised(self, state: Equilibrium) -> Linearised:
+        """Return how the body answers to small forces, softness and pulls near a state."""
+        body = self.sensor.robot.body
+        tangent = tangent_at(body, state)
+        loads = [internal(body, state.positions, tangent=False).forces]
+        if not self.drives:
+            return Linearised(state.positions, tangent, tangent.respond(np.array(loads)))
+        pulls = np.array([*state.tension.values(), *state.pressure.values()])
+        shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
+        unit = drive_rows(body, state.positions, shares).reshape(len(pulls), -1, 3)
+        moves = tangent.respond(np.concatenate([loads, pulls[:, None, None] * unit]))
+        held = np.flatnonzero(state.held)
+        if len(held):
+            moves[1 + held] = (pulls[held] * np.diag(tangent.held_compliance))[:, None, None] * tangent.respond_to_held()
+        return Linearised(state.positions, tangent, moves)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Linearised:
+    """The body near a state."""
+
+    positions: FloatArray
+    """Nodes of the state [m], shape (n, 3)."""
+    tangent: Tangent
+    softening: FloatArray
+    """∂x/∂(softness, pulls) [m], shape (1 + a, n, 3)."""
+
+
+@dataclass(eq=False, slots=True)
+class Candidates:
+    """Answers of the body to unit forces at the candidate nodes near one state, kept while the body stays near it."""
+
+    positions: FloatArray | None = None
+    answers: FloatArray | None = None
+    """[m/N], shape (n, 3, 3c)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """One frame: what was measured and what is known of it beforehand."""
+
+    index: int
+    pixels: Pixels | None
+    scan: Scan | None
+    predicted: Equilibrium
+    """Under the inputs without contact forces."""
+    previous_tensions: tuple[FloatArray, ...] | None
+    """Tensions along the cables before this frame (friction)."""
+    background: Rows | None = None
+    """Rows of what stands around the robot, where it is asked whether a camera has moved."""
+    with_markers: bool = False
+    """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
+    objects: tuple[Shape, ...] = ()
+    """Rigid objects seen or declared near the body, completed."""
+    latent: tuple[Touch, ...] = ()
+    """Objects in touch that are no contact of the best hypothesis: each may carry a small force along its normal, which left out would bias those of its
+    neighbours and make their intervals too narrow. Empty while hypotheses are compared."""
+
+    @property
+    def coloured(self) -> bool:
+        """Whether colour separates the robot from the rest."""
+        return self.pixels is None or self.pixels.coloured
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Fit:
+    """A hypothesis at the minimum of Φ, with its Laplace approximation."""
+
+    frame: Frame
+    contacts: tuple[Touch, ...]
+    forces: FloatArray
+    """[N], shape (m, 3)."""
+    tau: FloatArray
+    """Prior scale of each force [N], shape (m,)."""
+    axes: FloatArray
+    """Axes of each force: outward normal and two tangents, shape (m, 3, 3)."""
+    state: Equilibrium
+    rows: Rows
+    linearised: Linearised
+    C: FloatArray
+    """Derivatives of the rows with η, shape (r, p)."""
+    N: FloatArray
+    """C R, shape (r, q)."""
+    eta: FloatArray
+    """Whitened nuisance η̃, shape (q,)."""
+    weight: FloatArray
+    """W [1/m²], shape (r,)."""
+    phi: float
+    """Φ at the minimum."""
+    evidence: float
+    """E = Φ + log det A."""
+    odds: FloatArray
+    """L of each contact, shape (m,)."""
+    covariance: FloatArray
+    """Of all force components [N²], shape (3m, 3m)."""
+    place_covariance: FloatArray
+    """Of each contact point [m²], shape (m, 3, 3)."""
+    drop_gain: FloatArray
+    """−2 log evidence ratio of each contact against its absence (Savage–Dickey), shape (m,)."""
+    converged: bool = True
+
+    @property
+    def criterion(self) -> float:
+        """J = E + Σ L."""
+        return self.evidence + float(self.odds.sum())
+
+    def left(self, nuisance: Nuisance) -> FloatArray:
+        """Return the whitened residual with η fitted, shape (r,)."""
+        return np.asarray((self.rows.residual - self.C @ nuisance.mean - self.N @ self.eta) / self.rows.std)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Largest values of the posterior check that contact-free frames let expect."""
+
+    misfit: float
+    nuisance: float
+    behind: float
+    pose: float
+    """Decrease of Φ by a step of the poses."""
+
+
+def with_state(start: Equilibrium, positions: FloatArray) -> Equilibrium:
+    """Return a state as a start at other node positions."""
+    return replace(start, positions=positions)

@@ -1,0 +1,167 @@
+"""Rigid objects and the body do not overlap: the gap g between them as residual rows.
+
+g(x) is the signed distance of the surface of the body from a completed or declared object, at the surface point where it is least. The row measures the
+object's surface where a pixel measures the body's, so the pose and the error field of the camera move it alike.
+
+An object that does not touch is anywhere within D of the body: density 1/D for g > 0, a Gaussian tail for g < 0. One that touches has g = 0 ± σ_g, or is
+not where it seems with probability ε. Relative to the first, a contact costs
+
+    −2 log[(1 − ε) D/(√2π σ_g) exp(−z²/2) + ε],   z = g/σ_g
+
+which is negative where the object lies at the surface: there a contact needs no force to be likely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.inference.pixels import rows_on
+from femsense.inference.rows import Rows
+from femsense.pointcloud.primitives import Shape
+from femsense.sensing.model import Frame, Model
+from femsense.sensing.places import NEAR
+from femsense.sensing.types import Touch
+
+MISPLACED = 0.1
+"""ε: probability that a touching object is not where it seems, because its depth errs otherwise than the body's or its shape is another."""
+OVERLAPPING = 0.01
+"""Probability that an object seems to overlap the body although it does not touch."""
+GAP_STD = 1e-4
+"""Standard deviation of a gap beyond that of the object's surface: facets and the seat of the pressure on them [m]."""
+LATTICE = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4.0
+"""Barycentric points of a triangle at which the gap is taken, shape (15, 3)."""
+SLOPE = 1e-5
+"""Step of the central difference of a distance [m]."""
+TOUCHING = 2.0
+"""An object is in touch whose gap is below this many standard deviations."""
+ZONE = 3.0
+"""Where several contacts are with one object, surface points within this many edges of a contact point belong to it."""
+COMPLETED = ("sphere", "cylinder", "plate", "known")
+"""Kinds of objects whose surface is known."""
+
+
+def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: FloatArray) -> list[Rows]:
+    """Return one row for each contact with an object whose surface is known, and one for each object that overlaps the body elsewhere."""
+    rows = []
+    for contact in contacts:
+        if is_rigid(model, contact):
+            assert contact.shape is not None
+            shape = contact.shape.towards(positions[model.sensor.surface.nodes])
+            shared = sum(is_with(other, contact.shape) for other in contacts) > 1
+            at = _closest(model, shape, positions, contact.place if shared else None)
+            if at is not None:
+                rows.append(_row(model, frame, shape, *at, positions, odds=_density(model, contact)[1]))
+    for own in frame.objects:
+        if _is_known(model, own) and not any(is_with(contact, own) for contact in contacts):
+            shape = own.towards(positions[model.sensor.surface.nodes])
+            at = _closest(model, shape, positions, None)
+            if at is not None and at[2] < 0.0 and shape.behind_m == 0.0:
+                rows.append(_row(model, frame, shape, *at, positions, odds=float(np.log(OVERLAPPING))))
+    return rows
+
+
+def is_with(contact: Touch, shape: Shape | None) -> bool:
+    """Return whether a contact is with an object, whichever of its sides touches: the pixels of the two lie in the same place."""
+    if contact.shape is None or shape is None:
+        return False
+    if contact.shape.points is shape.points:
+        return True
+    first, second = contact.shape.points, shape.points
+    apart = float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)))
+    return apart < 0.5 * float(np.linalg.norm(np.ptp(first, axis=0)))
+
+
+def is_rigid(model: Model, contact: Touch) -> bool:
+    """Return whether a contact is with an object whose surface is known where it touches: of a plate, the side that is seen."""
+    return contact.shape is not None and _is_known(model, contact.shape) and contact.shape.behind_m == 0.0
+
+
+def _is_known(model: Model, shape: Shape) -> bool:
+    """Return whether the surface of an object is known better than the mesh resolves."""
+    return shape.kind in COMPLETED and gap_std(model, shape) < model.sensor.surface.edge
+
+
+def in_touch(model: Model, contact: Touch, positions: FloatArray) -> bool:
+    """Return whether an object whose surface is known lies at the surface of the body within two standard deviations."""
+    if not is_rigid(model, contact):
+        return False
+    assert contact.shape is not None
+    at = _closest(model, contact.shape.towards(positions[model.sensor.surface.nodes]), positions, None)
+    return at is not None and at[2] < TOUCHING * gap_std(model, contact.shape)
+
+
+def gap_odds(model: Model, contact: Touch) -> float:
+    """Return −2 log of the density of a gap of 0 of a touching object, relative to one that hovers anywhere near the body; 0 where its surface is not known."""
+    return -2.0 * _density(model, contact)[0] if is_rigid(model, contact) else 0.0
+
+
+def _density(model: Model, contact: Touch) -> tuple[float, float]:
+    """Return log[(1 − ε) D/(√2π σ)] and the log odds ε √2π σ / ((1 − ε) D) that the object is not where it seems."""
+    assert contact.shape is not None
+    top = float(np.log((1.0 - MISPLACED) * NEAR * model.sensor.size / (np.sqrt(2.0 * np.pi) * gap_std(model, contact.shape))))
+    return top, float(np.log(MISPLACED)) - top
+
+
+def gap_std(model: Model, shape: Shape) -> float:
+    """Return σ_g of an object [m]: its surface is known as well as its pixels, which err together, and seats on facets."""
+    return float(np.hypot(np.sqrt(model.overdispersion) * shape.std_m, GAP_STD))
+
+
+def _closest(model: Model, shape: Shape, positions: FloatArray, near: FloatArray | None) -> tuple[int, FloatArray, float] | None:
+    """Return triangle, barycentric weights and gap [m] of the surface point closest to an object; None where nothing comes near.
+
+    Arguments:
+        near: only surface within a zone about this place at rest [m], shape (3,).
+    """
+    sensor, surface = model.sensor, model.sensor.surface
+    rest = model.skin.rest
+    considered = _free_triangles(model)
+    if near is not None:
+        middle = rest[surface.triangles[considered]].mean(axis=1)
+        considered = considered[np.linalg.norm(middle - near, axis=1) < ZONE * surface.edge]
+    by_node = np.full(len(positions), np.inf)
+    nodes = np.unique(surface.triangles[considered])
+    if not len(nodes):
+        return None
+    by_node[nodes] = shape.distance(positions[nodes], within=2.0 * surface.edge + 0.02 * sensor.size)
+    least = float(by_node[nodes].min())
+    if not np.isfinite(least):
+        return None
+    close = considered[by_node[surface.triangles[considered]].min(axis=1) <= least + surface.edge]
+    places = np.einsum("wi,tic->twc", LATTICE, positions[surface.triangles[close]])
+    gap = shape.distance(places.reshape(-1, 3)).reshape(len(close), -1)
+    t, w = np.unravel_index(int(np.argmin(gap)), gap.shape)
+    return int(close[t]), LATTICE[w], float(gap[t, w])
+
+
+def _free_triangles(model: Model) -> IntArray:
+    """Return the triangles that are not on the clamp, where a holder always touches."""
+    clamped = np.zeros(len(model.skin.rest), dtype=bool)
+    clamped[model.sensor.robot.body.clamped] = True
+    return np.flatnonzero(~clamped[model.skin.triangles].any(axis=1))
+
+
+def _row(
+    model: Model,
+    frame: Frame,
+    shape: Shape,
+    triangle: int,
+    weights: FloatArray,
+    gap: float,
+    positions: FloatArray,
+    *,
+    odds: float,
+) -> Rows:
+    """Return the row of a gap [m] at a surface point."""
+    place = weights @ positions[model.skin.triangles[triangle]]
+    step = SLOPE * np.eye(3)
+    slope = shape.distance(place + step) - shape.distance(place - step)
+    direction = slope / max(float(np.linalg.norm(slope)), 1e-12)
+    view = 0 if frame.scan is None or not len(frame.scan.others_view) else int(np.bincount(frame.scan.others_view).argmax())
+    return rows_on(
+        model.skin, positions, np.array([triangle]), weights[None], direction[None], np.array([-gap]), np.array([gap_std(model, shape)]), np.array([odds]),
+        np.ones(1), (place - gap * direction)[None], np.array([view]), model.views, pixel=False,
+    )  # fmt: skip

@@ -1,0 +1,147 @@
+"""The status of a frame: an enum with a text; the posterior check that sets it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError
+from femsense.fem.mesh import TetMesh
+from femsense.sensing.contact_free import check_values
+from femsense.sensing.marker_rows import marker_rows
+from femsense.sensing.model import Fit, Model
+from femsense.sensing.no_penetration import is_rigid
+
+SQUEEZED = 0.6
+"""Least principal stretch of the elements under a contact at which law and mesh hold [1]."""
+MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
+"""Markers disagree with the cloud where they are off by more than so many times the residual of the calibration, and this share of the diagonal."""
+MARKERS_MISFIT = 9.0
+"""Mean square of the whitened residuals of markers above which a frame is not explained: three standard deviations everywhere."""
+UNDETERMINED = 3.0
+"""A force below so many standard deviations has no determined size."""
+OVERLAP = 3.0
+"""Objects overlap the body by more than so many standard deviations of their gap."""
+
+
+class Status(Enum):
+    """What a frame's result is worth; the value is the text, with its numbers."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not converged: the forces still changed after the last step"
+    SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: use a finer mesh or the effect hyperelastic"
+    NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.1f} times what contact-free frames let expect"
+    NOT_EXPLAINED_MARKERS = "not explained: the markers are off by {times:.1f} standard deviations"
+    LARGE_ERROR_FIELD = (
+        "not explained: a smooth error takes up the residual, {times:.1f} times what contact-free frames let expect"
+    )
+    BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
+    MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
+    OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
+    UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
+    CAMERA_MOVED = (
+        "{who} seems to have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°, since the background did: that fits the frame better"
+    )
+    CAMERA_MAY_HAVE_MOVED = (
+        "{who} or the robot's base may have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°: that fits the frame as well"
+    )
+    PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
+    FAILED = "{what}"
+
+
+TRUSTED = (Status.OK, Status.UNDETERMINED)
+"""Frames from which the next one starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A status with its numbers."""
+
+    status: Status
+    numbers: tuple[tuple[str, float | str], ...] = ()
+
+    def __str__(self) -> str:
+        return self.status.value.format(**dict(self.numbers))
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the next frame may start from this one."""
+        return self.status in TRUSTED
+
+
+def verdict(status: Status, **numbers: float | str) -> Verdict:
+    """Return a status with its numbers."""
+    return Verdict(status, tuple(numbers.items()))
+
+
+def checked(model: Model, best: Fit) -> Verdict:
+    """Return the verdict of the posterior check on a fitted frame."""
+    if best.contacts and not best.converged:
+        return verdict(Status.NOT_CONVERGED)
+    carrying = np.unique([node for contact in best.contacts for node in contact.patch.nodes])
+    stretch = least_stretch(model.sensor.robot.body.mesh, best.state.positions, carrying)
+    if stretch < SQUEEZED:
+        return verdict(Status.SQUEEZED, percent=100.0 * max(stretch, 0.0))
+    if best.frame.pixels is None:
+        z = best.left(model.nuisance)
+        if (z**2).mean() > MARKERS_MISFIT:
+            return verdict(Status.NOT_EXPLAINED_MARKERS, times=float(np.sqrt((z**2).mean())))
+    else:
+        failed = _pixels_fail(model, best)
+        if failed is not None:
+            return failed
+    for i, contact in enumerate(best.contacts):
+        force, std = float(np.linalg.norm(best.forces[i])), _std_along(best, i)
+        if contact.source != "given" and force < UNDETERMINED * std:
+            return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
+    return verdict(Status.OK)
+
+
+def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
+    limits = model.limits
+    if limits is not None:
+        misfit, nuisance, behind = check_values(model, best)
+        if misfit > limits.misfit:
+            rms = 1e3 * float(np.sqrt(np.mean(best.rows.residual[best.rows.pixel] ** 2)))
+            return verdict(Status.NOT_EXPLAINED, rms_mm=rms, times=float(np.sqrt(misfit / limits.misfit)))
+        if nuisance > limits.nuisance:
+            return verdict(Status.LARGE_ERROR_FIELD, times=float(np.sqrt(nuisance / limits.nuisance)))
+        if not best.frame.coloured and behind > limits.behind:
+            return verdict(Status.BEHIND_BODY, percent=100.0 * behind)
+    for i in np.flatnonzero(~best.rows.pixel):
+        gap = float(-best.rows.residual[i])
+        if gap < -OVERLAP * float(best.rows.std[i]) and not any(is_rigid(model, c) for c in best.contacts):
+            return verdict(Status.OVERLAP, overlap_mm=-1e3 * gap)
+    try:
+        off = marker_rows(model.sensor, best.frame.index, best.state, 0).residual
+    except DataError:
+        return None
+    rms = float(np.sqrt((off**2).sum() / (len(off) / 3)))
+    if rms > max(MARKERS_OFF * model.sensor.calibration.rms_m, MARKERS_FAR * model.sensor.size):
+        return verdict(Status.MARKER_MISMATCH, off_mm=1e3 * rms)
+    return None
+
+
+def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:
+    """Return the least principal stretch of the elements that have one of some nodes [1]; negative where one is inside out, 1 without nodes.
+
+    Arguments:
+        mesh: at rest.
+        positions: of its nodes [m], shape (n, 3).
+        carrying: nodes that carry contacts, shape (k,).
+    """
+    tets = mesh.tets[np.isin(mesh.tets, carrying).any(axis=1), :4]
+    if not len(tets):
+        return 1.0
+    rest, now = (np.swapaxes(x[tets[:, 1:]] - x[tets[:, :1]], 1, 2) for x in (mesh.nodes, positions))
+    gradient = now @ np.linalg.inv(rest)
+    return float((np.linalg.svd(gradient, compute_uv=False)[:, 2] * np.sign(np.linalg.det(gradient))).min())
+
+
+def _std_along(best: Fit, i: int) -> float:
+    force = best.forces[i]
+    along = force / max(float(np.linalg.norm(force)), 1e-12)
+    return float(np.sqrt(max(float(along @ best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ along), 0.0)))

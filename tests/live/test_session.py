@@ -1,0 +1,164 @@
+"""A whole session: calibrated on the fly, sensed, recorded, replayed, zeroed, killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_block import write_watched_block
+from streams import within
+
+from femsense.calib.calibrate import calibrate
+from femsense.calib.files import read_calibration, write_calibration
+from femsense.core.errors import DataError, InputError
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.live.calibrating import CoverageLimits
+from femsense.live.feed import CameraFeed, FeedOptions
+from femsense.live.figures import Snapshot
+from femsense.live.growing import make_scratch, remove_scratch
+from femsense.live.recorder import session_run
+from femsense.live.senser import Answer
+from femsense.live.session import Phase, Session, SessionOptions
+from femsense.sensing.pipeline import estimate
+from femsense.sensing.run_files import read_run
+from femsense.sensing.types import Run
+
+FAST = FeedOptions(as_fast_as_possible=True)
+WAITS = CoverageLimits(frames=8, wait_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return write_watched_block(tmp_path_factory.mktemp("block"), free=12, touched=3)
+
+
+@pytest.fixture(scope="module")
+def calibration(block: tuple[Path, Path]) -> Path:
+    found = calibrate(load_robot(block[0]), load_recording(block[1]), frames=range(12))
+    return write_calibration(found, block[0].parent / "calibration.json")
+
+
+def run_session(robot: Path, camera: str, options: SessionOptions, feed: FeedOptions = FAST, act=lambda _session: None):
+    """Run a session to its end; `act(session)` is called before each step. Return its answers and its last snapshot."""
+    answers: list[Answer] = []
+    scratch = make_scratch()
+    try:
+        with CameraFeed(camera, feed) as source:
+            session = Session(load_robot(robot), source, scratch, options=options, on_answer=lambda a, _taken: answers.append(a))
+            try:
+                while not source.is_over:
+                    act(session)
+                    session.step(0.1)
+            finally:
+                session.close()
+            return answers, session.snapshot()
+    finally:
+        remove_scratch(scratch)
+
+
+def rows(run: Run) -> list[tuple]:
+    """Return all numbers of a run but its times of computing."""
+    contacts = [
+        (c.frame, c.track, c.force_n, c.std_n, c.source, *c.position_m, *c.normal, *c.force_n_xyz, *c.force_std_n_xyz, c.radius_m)
+        for c in run.contacts
+    ]
+    return contacts + [(f.frame, f.time_s, f.status, f.contacts, f.matched, f.rms_before_m, f.rms_after_m) for f in run.frames]
+
+
+def test_a_session_calibrates_senses_and_replays_to_the_same_numbers(block: tuple[Path, Path], tmp_path: Path) -> None:
+    robot, recording = block
+    told: list[Snapshot] = []
+    folder = tmp_path / "session"
+    options = SessionOptions(folder=folder, coverage=WAITS)
+    answers, last = run_session(robot, str(recording), options, act=lambda session: told.append(session.snapshot()))
+    todo = " ".join(snapshot.todo for snapshot in told)
+    assert "move the cables, touch nothing: 7 of 8 frames missing" in todo and last.phase == Phase.ENDED
+    assert [answer.report.frame for answer in answers] == list(range(8, 15)) and last.used == 15
+    assert all(answer.is_ok for answer in answers) and [bool(a.contacts) for a in answers] == [False] * 4 + [True] * 3
+    assert answers[-1].contacts[0].force_n == pytest.approx(0.3, abs=0.1)
+    replayed = load_recording(folder)
+    assert replayed.free is not None and replayed.free.tolist() == [True] * 8 + [False] * 7
+    live = read_run(session_run(folder))
+    again = estimate(load_robot(robot), replayed, read_calibration(folder / "calibration.json"))
+    assert rows(live) == rows(again) and np.array_equal(live.states.nodes_m, again.states.nodes_m)
+
+
+def test_with_a_calibration_a_few_contact_free_frames_come_first_and_the_inputs_may_rest(
+    block: tuple[Path, Path], calibration: Path
+) -> None:
+    told: list[str] = []
+    options = SessionOptions(calibration=calibration, contact_free_frames=5)
+    answers, _ = run_session(block[0], str(block[1]), options, act=lambda session: told.append(session.snapshot().todo))
+    assert "touch nothing: 4 of 5 frames missing" in told and answers[0].report.frame == 5
+
+
+def test_a_tare_begins_a_part_of_its_own_that_replays_too(block: tuple[Path, Path], calibration: Path, tmp_path: Path) -> None:
+    robot, recording = block
+    folder = tmp_path / "session"
+    seen: list[int] = []
+
+    def act(session: Session) -> None:
+        answer = session.snapshot().answer
+        if answer is not None and answer.report.frame == 5 and not seen:
+            seen.append(5)
+            session.tare()
+
+    options = SessionOptions(calibration=calibration, folder=folder, contact_free_frames=4)
+    run_session(robot, str(recording), options, act=act)
+    first, second = load_recording(folder), load_recording(folder / "tare-1")
+    assert first.frame_numbers.tolist() == [0, 1, 2, 3, 4, 5] and second.frame_numbers.tolist() == list(range(6, 15))
+    live = read_run(session_run(folder / "tare-1"))
+    again = estimate(load_robot(robot), second, read_calibration(folder / "tare-1" / "calibration.json"))
+    assert rows(live) == rows(again) and max(c.force_n for c in live.contacts) == pytest.approx(0.3, abs=0.15)
+
+
+def test_a_calibration_that_never_suffices_says_what_is_known(block: tuple[Path, Path]) -> None:
+    hopeless = SessionOptions(coverage=replace(WAITS, frames=3, position_m=1e-9))
+    with pytest.raises(DataError, match=r"no calibration after \d+ contact-free frames: the camera is known to"):
+        run_session(block[0], f"software:{block[1]}", hopeless, FeedOptions())
+
+
+def test_a_camera_without_inputs_needs_an_actuation(block: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "clouds").mkdir()
+    (tmp_path / "clouds" / "000000.ply").write_bytes(b"ply")
+    time.sleep(0.05)
+
+    def act(_session: Session) -> None:
+        for number in range(1, 200):
+            if not (tmp_path / "clouds" / f"{number:06d}.ply").exists():
+                (tmp_path / "clouds" / f"{number:06d}.ply").write_bytes(b"ply")
+                return
+
+    with pytest.raises(InputError, match="--actuation SOURCE"):
+        run_session(block[0], str(tmp_path), SessionOptions(), FeedOptions(), act)
+
+
+def test_a_session_that_is_killed_is_a_recording_and_a_run(block: tuple[Path, Path], calibration: Path, tmp_path: Path) -> None:
+    robot, recording = block
+    folder = tmp_path / "session"
+    words = ["live", str(robot), "--camera", f"software:{recording}?usb2=0+600", "-c", str(calibration)]
+    words += ["--contact-free", "4", "-o", str(folder), "--no-page"]
+    process = subprocess.Popen([sys.executable, "-m", "femsense", *words], stderr=subprocess.DEVNULL)
+    journal = folder / "run" / "journal.jsonl"
+    try:
+        assert within(60.0, lambda: journal.is_file() and journal.read_bytes().count(b"\n") > 8)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert within(60.0, lambda: (folder / "run" / "run.json").is_file() and not journal.exists())
+    found, run = load_recording(folder), read_run(folder / "run")
+    assert found.frame_count >= len(run.frames) > 8 and len(run.states.nodes_m) == len(run.frames)
+    assert json.loads((folder / "session.json").read_text())["link"] == "USB 2.1"
+    again = estimate(load_robot(robot), found, read_calibration(folder / "calibration.json"))
+    count = len(run.frames)
+    assert [f.rms_after_m for f in again.frames[:count]] == [f.rms_after_m for f in run.frames]
+    assert [c.force_n for c in again.contacts if c.frame <= run.frames[-1].frame] == [c.force_n for c in run.contacts]
