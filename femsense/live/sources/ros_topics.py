@@ -10,8 +10,8 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from femsense.io.importers.pictures import FINE_UNIT, depth_of_metres, write_cloud_file
-from femsense.io.importers.ros_messages import DEPTH, cloud_of, lens_of, raw_image, red_first, stamp_of
+from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres, write_cloud_file
+from femsense.io.importers.ros.messages import DEPTH, cloud_of, lens_of, raw_image, red_first, stamp_of
 from femsense.live.frames import Image, ImageKind, RawFrame, png_of
 from femsense.model.camera import Camera
 
