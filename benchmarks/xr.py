@@ -33,6 +33,8 @@ from femsense.rig.sensors import SensorTable, sensor_readings
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.labelled import Labelled, joined
+from femsense.xr.proprioception.learn import errors_on
+from femsense.xr.proprioception.linear import train_ridge
 from femsense.xr.proprioception.memory import with_memory
 from femsense.xr.proprioception.model import bones_from_numbers
 from femsense.xr.proprioception.selection import marker_rms
@@ -113,7 +115,7 @@ def tip_only(data: Labelled) -> Labelled:
 def arm(folder: Path, keep: Path | None, pieces: list[str]) -> None:
     """Print the tables of the real arm, piece after piece."""
     print("tip, first 70 % of apr_5 to its last 30 % [mm]")
-    print("sensors      linear (README)  chosen       error (95 %)          ridge  radial  network  mlp     outside")
+    print("sensors      linear (README)  chosen   held out        last 30 % (95 %)       within the interval   outside")
     work: dict[str, Callable[[], None]] = {name: partial(sensors, name, folder) for name in SENSORS}
     work |= {"january": partial(january, folder), "days": partial(other_days, folder), "inside": partial(inside, folder)}
     for name, step in work.items():
@@ -141,36 +143,52 @@ def sensors(name: str, folder: Path) -> None:
     data = tip_only(read_arm("apr_5_1", SENSORS[name], folder))
     cut = int(0.7 * len(data))
     report = fs.learn(data.select(np.arange(cut)), test=data.select(np.arange(cut, len(data)))).report
-    each = "  ".join(f"{report['compared'][kind]['error_mm']:6.2f}" for kind in report["compared"])
-    low, high = report["error_ci_mm"]
+    test = report["test"]
+    low, high = test["error_ci_mm"]
     print(
-        f"{name:<12} {README_MM[name]:7.1f}          {report['kind']:<9} {report['error_mm']:6.2f} ({low:.2f} … {high:.2f})"
-        f"     {each}   {100 * report['test_outside']:.0f} %"
+        f"{name:<12} {README_MM[name]:7.1f}          {report['kind']:<9} {report['error_mm']:6.2f}       {test['error_mm']:6.2f} ({low:.2f} … {high:.2f})"
+        f"     {100 * test['coverage']:8.0f} %             {100 * test['outside']:.0f} %"
     )
 
 
 def january(folder: Path) -> None:
     one, two, three = (tip_only(read_arm(f"Jan_10-2_{k}", SENSORS["both"], folder)) for k in (1, 2, 3))
     report = fs.learn(joined([one, two]), test=three).report
-    low, high = report["error_ci_mm"]
+    test = report["test"]
+    low, high = test["error_ci_mm"]
     print(
-        f"Jan_10-2_1 + 2 to 3, both: {report['kind']} {report['error_mm']:.2f} mm ({low:.2f} … {high:.2f}); linear (README) 1.4"
+        f"Jan_10-2_1 + 2 to 3, both: {report['kind']} {test['error_mm']:.2f} mm ({low:.2f} … {high:.2f}), {100 * test['coverage']:.0f} % within the "
+        "interval; linear (README) 1.4"
     )
+    print("one or two sessions to the others, middle and tip, draw wires")
+    days = [read_arm(f"Jan_10-2_{k}", ENCODERS, folder) for k in (1, 2, 3)]
+    for learnt, others in (((0,), (1, 2)), ((0, 1), (2,)), ((1, 2), (0,))):
+        model = fs.learn(joined([days[k] for k in learnt]))
+        for k in others:
+            found = errors_on(model, days[k], model.report["error_mm"])
+            print(
+                f"   {' + '.join(f'Jan_10-2_{i + 1}' for i in learnt)} to {k + 1}: {model.report['kind']} held out {model.report['error_mm']:.2f} mm, there "
+                f"{found['error_mm']:.2f} mm, {100 * found['coverage']:.0f} % within the interval"
+            )
 
 
 def other_days(folder: Path) -> None:
     print(f"\nanother day: learnt on apr_5, middle and tip, draw wires; corrected by {FEW} labelled frames")
     model = fs.learn(read_arm("apr_5_1", ENCODERS, folder))
     print(f"on apr_5 itself, held-out blocks: {model.report['error_mm']:.2f} mm")
-    for name in ("apr_4_1", "apr_4_2"):
+    for name in ("apr_4_1", "apr_4_2", "Jan_10-2_1"):
         day = read_arm(name, ENCODERS, folder)
         few = np.zeros(len(day), dtype=bool)
         few[np.linspace(0, len(day) - 1, FEW).astype(int)] = True
         mended = adapt(model, day.select(few))
         left = day.select(~few)
-        error = 1e3 * marker_rms(mended.network(left.inputs(mended.memory_s)) - left.targets)
+        found = errors_on(mended, left, model.report["error_mm"])
+        line = train_ridge(day.select(few).readings, day.select(few).targets, penalty=1e-4)
         print(f"{name}: {drift(model, day).text}")
-        print(f"   corrected by {mended.report['adapted']['by']}: {error:.2f} mm on the {len(left)} other frames")
+        print(
+            f"   corrected by {mended.report['adapted']['by']}: {found['error_mm']:.2f} mm on the {len(left)} other frames, "
+            f"{100 * found['coverage']:.0f} % within the interval; a linear map of them {1e3 * marker_rms(line(left.readings) - left.targets):.2f} mm"
+        )
 
 
 def inside(folder: Path) -> None:

@@ -246,9 +246,11 @@ def script_plan(
     from femsense.rig.camera import pose_of
     from femsense.rig.force_map import force_map
     from femsense.rig.force_map_files import check_force_map, force_document, force_text, write_force_map
+    from femsense.rig.scene_checks import warn_of_script
     from femsense.rig.script import read_script
 
     body, table = load_robot(robot), read_script(script)
+    warn_of_script(table, body, Path(script))
     if folder is not None:
         check_force_map(folder)
     identifiability = identifiability_of_script(body, table, Path(script), noise=noise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from femsense.app.inspection.results import (
 )
 from femsense.app.inspection.robots import inspect_mesh, inspect_robot, inspect_scene, inspect_surface
 from femsense.app.inspection.text import bullet, section_lines
-from femsense.core.errors import InputError
+from femsense.core.errors import FemsenseError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import check_no_pipe, plain
@@ -36,7 +37,9 @@ from femsense.io.meshing.cad import CAD_READ
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot, robot_names
 from femsense.io.tables import read_toml
+from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
+from femsense.model.robot import Robot
 
 MESH_ENDINGS = (
     ".vtu",
@@ -100,6 +103,22 @@ def _compare(target: Path, report: Report, robot: str | Path) -> None:
     warn_of_pictures(body, loaded)
     warn_of_markers(body, loaded)
     report["robot"] = body.name
+    report["force_resolution"] = _resolution(body, loaded)
+
+
+def _resolution(robot: Robot, recording: Recording) -> Report:
+    """Return the forces that the recording resolves; the camera's pose is found first."""
+    from femsense.app.force_resolution import force_resolution
+    from femsense.calib.calibrate import calibrate
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # calibrate says them itself
+        try:
+            calibration = calibrate(robot, recording)
+        except FemsenseError as error:
+            return {"unknown": f"the camera's pose was not found: {' '.join(str(error).split())}"}
+        document, text = force_resolution(robot, recording, calibration)
+    return document | {"text": text}
 
 
 def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None = None) -> Report:
@@ -132,8 +151,11 @@ def describe(report: Mapping[str, Any]) -> str:
 
         return "\n".join([*lines, accuracy_text(report["accuracy"])])
     lines += section_lines(
-        {key: value for key, value in report.items() if key not in ("path", "kind", "problems", "warnings")}, 2
+        {key: value for key, value in report.items() if key not in ("path", "kind", "force_resolution", "problems", "warnings")},
+        2,
     )
+    if forces := report.get("force_resolution"):
+        lines += ["", forces.get("text") or f"forces that this camera resolves: not known. {forces['unknown']}"]
     for title in ("problems", "warnings"):
         texts = report.get(title, [])
         if texts:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,14 +17,18 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.model import ProprioceptiveModel
 
 Pair = tuple[Path, Path]
+HELD = 0.9
+"""Share of the positions of another recording that lie within their 95 % intervals, from which on these hold."""
+POOR = 0.5
+"""A held-out error above this share of how the markers move says that the sensors say little of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class LearnFiles:
     """What is learnt from."""
 
-    sensors: Path
-    markers: Path
+    pairs: tuple[Pair, ...]
+    """SENSORS.csv and MARKERS.csv of each recording."""
     test: Pair | None = None
     """Two more files, of another recording: the error is stated on them, that of a corrected model too."""
     adapt: Path | None = None
@@ -37,14 +41,28 @@ class LearnFiles:
     def all(self) -> list[Path]:
         """Every file that is read."""
         more = [file for file in (self.adapt, self.calibration) if file is not None]
-        return [self.sensors, self.markers, *(self.test or ()), *more]
+        return [*(file for pair in self.pairs for file in pair), *(self.test or ()), *more]
 
     def read(self) -> tuple[Labelled, Labelled | None]:
-        """Return the recording, and that of the test. Raises InputError."""
+        """Return the recordings as one, and that of the test. Raises InputError."""
         from femsense.xr.proprioception.files import read_labelled
+        from femsense.xr.proprioception.labelled import joined
 
         read = partial(read_labelled, calibration=self.calibration, in_robot_frame=self.in_robot_frame)
-        return read(self.sensors, self.markers), None if self.test is None else read(*self.test)
+        data = joined([read(*pair) for pair in self.pairs]) if len(self.pairs) > 1 else read(*self.pairs[0])
+        return data, None if self.test is None else read(*self.test)
+
+
+def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
+    """Return SENSORS MARKERS SENSORS MARKERS … two by two. Raises InputError where one is left over."""
+    if not files or len(files) % 2:
+        raise InputError(
+            "files of a recording come in pairs",
+            where="SENSORS.csv MARKERS.csv …",
+            found=f"{len(files)} files",
+            expected="SENSORS.csv and MARKERS.csv of each recording",
+        )
+    return tuple(zip(files[::2], files[1::2]))
 
 
 def learn_into(
@@ -92,12 +110,18 @@ def learn_into(
             tested = _tested(model, other)
             document["test"] = tested
             text += f"\non {test[0] if test else ''}: {_each_text(tested)}"
+        if model.spread is not None:
+            text += f"\n95 % interval: {_radius_text(model, data)} (median)"
     else:
         options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
         model = learn(data, test=other, options=options, progress=progress)
         text, document = report_text(model.report), {}
         if model.chain is not None:
             text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
+            if len(model.marker_names) == 2:
+                text += "\n  two markers say nothing of how the body bends between them: its bones lie on a straight line for lack of data"
+        if other is not None and test is not None:
+            text += f"\n\n{test_text(model, other, test[0])}"
     save_model(model, output)
     return {
         "path": str(output),
@@ -128,8 +152,52 @@ def report_text(report: dict[str, Any]) -> str:
             lines.append(f"  {words}: {', '.join(report[key])}")
     if report.get("bones_mm") is not None:
         lines.append(f"  bones straight from the readings: {report['bones_mm']:.2f} mm")
+    lines += interval_text(report)
+    if report["error_mm"] > POOR * report["motion_mm"]:
+        lines.append(f"  the markers themselves move by {report['motion_mm']:.2f} mm (rms): these sensors say little of them")
     if report["test_outside"] > 0.02:
         lines.append(f"  {100 * report['test_outside']:.0f} % of the held-out rows are outside what was learnt")
+    return "\n".join(lines)
+
+
+def interval_text(report: dict[str, Any]) -> list[str]:
+    """Return what is said of the intervals of a model, as lines."""
+    interval, sessions = report["interval"], report["sessions"]
+    radii = ", ".join(f"{name} {radius:.2f} mm" for name, radius in interval["radius_mm"].items())
+    lines = [
+        f"  95 % interval: {radii} (median radius); {100 * interval['coverage']:.0f} % of the held-out positions lie within it"
+    ]
+    if sessions > 1:
+        lines.append(f"  it holds what differs between the {sessions} recordings: each was predicted from the others")
+    else:
+        lines.append(
+            "  drifts: interval holds within a session only. Predicted from what came before, the end of this one is off by "
+            f"{interval['growth']:.2f} times as much as its middle; further recordings, or --test, measure other sessions"
+        )
+    return lines
+
+
+def test_text(model: ProprioceptiveModel, data: Labelled, name: Path) -> str:
+    """Return how far a model is off on another recording, whether its intervals hold there, and why it is far off where it is."""
+    from femsense.xr.proprioception.drift import drift
+
+    found = model.report["test"]
+    low, high = found["error_ci_mm"]
+    lines = [
+        f"on {name}: {found['error_mm']:.2f} mm on {found['rows']} rows (95 % interval {low:.2f} … {high:.2f}), "
+        f"{found['growth']:.1f} times the held-out error",
+        f"  of the markers: {_each_text(found['marker_error_mm'])}",
+    ]
+    if found["coverage"] >= HELD:
+        lines.append(f"  the interval holds there: {100 * found['coverage']:.0f} % of the positions lie within it")
+    else:
+        lines.append(
+            f"  drifts: interval holds within a session only. Here {100 * found['coverage']:.0f} % of the positions lie within it, "
+            f"and the error has grown {found['growth']:.1f} times"
+        )
+    why = drift(model, data)
+    if why.verdict != "holds":
+        lines += [f"  {line}" for line in why.text.splitlines()]
     return "\n".join(lines)
 
 
@@ -151,6 +219,17 @@ def _tested(model: ProprioceptiveModel, data: Labelled) -> dict[str, float]:
     return marker_errors_mm(model.network(model_inputs(model, data)) - data.targets, model.marker_names)
 
 
+def _radius_text(model: ProprioceptiveModel, data: Labelled) -> str:
+    """Return the median radius of the interval of each marker."""
+    import numpy as np
+
+    from femsense.xr.proprioception.drift import model_inputs
+
+    assert model.spread is not None
+    radii = np.median(model.spread.radius(model.network, model_inputs(model, data)), axis=0)
+    return _each_text(dict(zip(model.marker_names, (1e3 * radii).tolist())))
+
+
 def _each_text(errors_mm: dict[str, float]) -> str:
     return ", ".join(f"{name} {error:.2f} mm" for name, error in errors_mm.items())
 
@@ -170,6 +249,7 @@ def _correction_text(by: str) -> str:
         "channel": "another zero of one channel",
         "zeros": "other zeros of the sensors",
         "line": "a linear map",
+        "afresh": "learning afresh: a linear map of these frames alone predicts better than any correction",
     }
     return " and ".join(words[part.split()[0]] for part in by.split(","))
 

@@ -155,6 +155,7 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
 def robot_document(robot: Robot, *, effects: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
     """Return the robot as the plain tables of robot.toml; see `save_robot`."""
     document = copy.deepcopy(robot.document) if robot.document is not None else _declared(robot)
+    document["name"] = robot.name
     if effects is not None:
         document["effects"] = [plain(dict(entry), nonfinite=True) for entry in effects]
     if not document.get("effects"):

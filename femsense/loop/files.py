@@ -48,7 +48,7 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     check_loop_folder(folder, loop.declared)
     with results_folder(folder, "loop.json") as part:
         declared = (loop.declared.document or {}).get("effects", [])
-        handed_back = replace(loop.declared, correction=loop.robot.correction)
+        handed_back = replace(loop.declared, name=loop.robot.name, correction=loop.robot.correction)
         save_robot(handed_back, part, effects=[*declared, *loop.entries])
         write_json(part / "loop.json", {**loop.document(), "inputs": inputs or {}, "versions": versions()})
     return Path(folder)

@@ -14,6 +14,7 @@ from femsense.calib.files import read_calibration
 from femsense.report import words
 from femsense.report.drawing import AFTER, as_image, marker_bars, name_axes, new_axes, whole_numbers
 from femsense.report.page import Chapter, render
+from femsense.report.text import has_unknown_inputs
 
 
 def calibration_chapter(file: Path, title: str) -> Chapter:
@@ -26,7 +27,7 @@ def calibration_chapter(file: Path, title: str) -> Chapter:
             _input(c.cable_tension_n, c.tension_std_n, name, "N"),
             _input(c.cable_displacement_m, c.displacement_std_m, name, "m"),
         )
-        for name in names
+        for name in (names if has_unknown_inputs(c) else ())
     ]
     bars = marker_bars(c.marker_rms_m, "Residual of each marker", most=40, axis="rms residual [mm]")
     body = render("calibration.html", c=c, poses=_poses(c), inputs=inputs, pictures=[bars, _history_panel(c)])

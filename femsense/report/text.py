@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.sensing.run_arrays import count_of, sensed
+from femsense.sensing.run_arrays import count_of, sensed, undetermined, undetermined_text
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run
@@ -48,7 +48,7 @@ def calibration_text(calibration: Calibration) -> str:
         worst = max(c.marker_rms_m, key=lambda name: c.marker_rms_m[name], default=None)
         rows += [] if worst is None else [["worst marker", f"{worst}, {1e3 * c.marker_rms_m[worst]:.3f} mm rms"]]
         rows += [["error of the model", said]] if (said := model_error(c)) else []
-    for name, tension in c.cable_tension_n.items():
+    for name, tension in c.cable_tension_n.items() if has_unknown_inputs(c) else ():
         rows.append(
             [
                 f"cable {name}",
@@ -60,6 +60,11 @@ def calibration_text(calibration: Calibration) -> str:
     for name, pressure in c.chamber_pressure_pa.items():
         rows.append([f"chamber {name}", f"{pressure:.0f} Pa{_std(c.pressure_std_pa.get(name), 1.0, 'Pa')} at the start"])
     return "calibration\n" + columns(rows)
+
+
+def has_unknown_inputs(c: Calibration) -> bool:
+    """Whether initial inputs of cables were estimated: absolute ones are known, and have no deviation."""
+    return any(std is None or std > 0 for table in (c.tension_std_n, c.displacement_std_m) for std in table.values())
 
 
 def model_error(c: Calibration) -> str:
@@ -86,6 +91,9 @@ def run_document(run: Run) -> dict[str, Any]:
         "contacts": count_of(run),
         "contacts_in_frames": len(felt),
         "frames_with_contact": len(feels),
+        "undetermined": [
+            {"frame": c.frame, "contact": c.contact, "force_n": c.force_n, "std_n": c.std_n} for c in undetermined(run.contacts)
+        ],
         "largest_force_n": None if strongest is None else strongest.force_n,
         "rms_before_m": _median([frame.rms_before_m for frame in touched]),
         "rms_after_m": _median([frame.rms_after_m for frame in touched]),
@@ -110,7 +118,15 @@ def run_text(run: Run) -> str:
     rows = [["frames", f"{facts['frames_ok']} of {facts['frames']} ok"]]
     touched = f"{facts['contacts']} in {facts['frames_with_contact']} frames" if facts["contacts"] else "none"
     doubted = len({c.frame for c in sensed(run.contacts)} - {frame.frame for frame in run.frames if frame.status == "ok"})
+    weak = undetermined(run.contacts)
+    if weak:
+        count = len({c.frame for c in weak})
+        touched = f"{touched}; a contact whose size is not determined in {count} frame{'s' if count > 1 else ''}".removeprefix(
+            "none; "
+        )
     rows.append(["contacts", f"{touched}, {doubted} of them not ok" if doubted else touched])
+    rows += [[f"frame {c.frame}", undetermined_text(c.force_n, c.std_n)] for c in weak[:LISTED]]
+    rows += [["", f"{len(weak) - LISTED} more: see frames.csv"]] if len(weak) > LISTED else []
     if facts["rms_after_m"] is not None:
         rows.append(
             [

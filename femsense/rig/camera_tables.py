@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -11,6 +12,9 @@ from femsense.io.tables import Schema
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+LENSES = {"D415": (1280, 720, 65.0)}
+"""Pixels and horizontal field of view [°] of the depth image of a camera (Grunnet-Jepsen, Sweetser and Woodfill, *Tuning depth
+cameras for best performance*, Intel)."""
 LIKE: dict[str, dict[str, Any]] = {
     "D415": {
         "subpixel_px": 0.08,
@@ -35,7 +39,9 @@ class NoiseTable(Schema):
     """What depths are off by: active stereo, time of flight, or nothing."""
 
     kind: Literal["stereo", "time-of-flight", "perfect"] = Field("stereo", description='"stereo", "time-of-flight" or "perfect"')
-    like: Literal["D415"] | None = Field(None, description='stereo: "D415" sets what stands below as that camera has it')
+    like: Literal["D415"] | None = Field(
+        None, description='stereo: "D415" sets what stands below as that camera has it, and its pixels and lens'
+    )
     subpixel_px: NotNegative = Field(0.08, description="stereo: error of the disparity [px], ≥ 0")
     baseline_m: Positive = Field(0.055, description="stereo: distance of the two imagers [m], > 0")
     focal_px: Positive | None = Field(None, description="stereo: focal length of the imagers [px]; by default fx")
@@ -87,6 +93,9 @@ class NoiseTable(Schema):
 class ViewTable(Schema):
     """A camera and where it stands."""
 
+    like: Literal["D415"] | None = Field(
+        None, description='"D415" sets width, height, fx and noise as that camera has them; keys that are given go before these'
+    )
     width: Annotated[int, Field(gt=0)] = Field(424, description="pixels, > 0")
     height: Annotated[int, Field(gt=0)] = Field(240, description="pixels, > 0")
     fx: Positive = Field(306.0, description="focal length in pixels, > 0")
@@ -107,6 +116,23 @@ class ViewTable(Schema):
     declare_pose: bool = Field(False, description="true: the recording says where the camera stands")
     declare_noise: bool = Field(False, description="true: the recording says how large the noise of a depth is")
     noise: NoiseTable | None = Field(None, description="a table [camera.noise]; without it depth is exact")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_that_camera(cls, given: Any) -> Any:
+        """Fill in what `like` stands for: of the camera also where only its noise names it."""
+        if not isinstance(given, dict):
+            return given
+        noise = given.get("noise")
+        like = given.get("like", noise.get("like") if isinstance(noise, dict) else None)
+        if not isinstance(like, str) or like not in LENSES:
+            return given
+        width, height, field = LENSES[like]
+        width = given.get("width", width)
+        own: dict[str, Any] = {"width": width, "height": height}
+        if isinstance(width, int | float) and width > 0:
+            own["fx"] = 0.5 * width / math.tan(math.radians(0.5 * field))
+        return {**own, **({"noise": {"like": like}} if "like" in given else {}), **given}
 
     @model_validator(mode="after")
     def _one_pose(self) -> ViewTable:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
@@ -60,6 +61,18 @@ class Unknowns:
     """Of the modulus, relative."""
     force_n: float = 2.0
     """Of each component of a force [N]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Measured:
+    """What cameras measure of a state, to first order about it; r rows, n nodes, v cameras."""
+
+    operator: sp.csr_array
+    """Maps displacements of the nodes to the rows, shape (r, 3 n)."""
+    by_pose: FloatArray
+    """How the rows move with (rotation about the body's middle [rad], shift [m]) of each camera, shape (r, 6 v)."""
+    std: FloatArray
+    """Standard deviation of each row; rows that err together are counted as fewer [m], shape (r,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,25 +123,49 @@ def force_map(
     """
     how, views = unknowns or Unknowns(), views_of(script, robot)
     state = _state(robot, script, where, frame)
-    surface = body_surface(robot.body.mesh)
     rows, std = _rows(robot, script, views, state)
-    tangent = tangent_at(robot.body, state)
     nodes = spread_features(robot.body, how.places)
+    surface = body_surface(robot.body.mesh)
     normals = vertex_normals(state.positions, surface.triangles)[nodes]
-    N = _nuisance(robot, rows, tangent, state, how, len(views)) / std[:, None]
+    return force_bound(
+        robot,
+        state,
+        Measured(rows.operator(len(state.positions)), rows.by_pose(robot.body.mesh.nodes.mean(axis=0), len(views)), std),
+        nodes,
+        _seen(views, state, surface.triangles, nodes, normals),
+        unknowns=how,
+    )
+
+
+def force_bound(
+    robot: Robot, state: Equilibrium, measured: Measured, nodes: IntArray, visible: BoolArray, *, unknowns: Unknowns
+) -> ForceMap:
+    """Return the bound (see the equation at the top of this file) for forces at some nodes of a state.
+
+    Arguments:
+        robot: whose body it is.
+        state: about which a small force acts.
+        measured: the rows.
+        nodes: surface nodes at which a force may act, shape (p,).
+        visible: whether a camera sees each of them, shape (p,).
+        unknowns: prior standard deviations of what is estimated with the force.
+    """
+    surface, count = body_surface(robot.body.mesh), len(state.positions)
+    normals = vertex_normals(state.positions, surface.triangles)[nodes]
+    tangent, std = tangent_at(robot.body, state), measured.std
+    N = _nuisance(robot, measured, tangent, state, unknowns) / std[:, None]
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]))
-    move = rows.operator(len(state.positions))
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     normal_std, tangent_std = [], []
     for start in range(0, len(nodes), BATCH):
         here = nodes[start : start + BATCH]
         patches = [patch_at(surface, state.positions, state.positions[i], RADIUS * size, robot.body.clamped) for i in here]
-        loads = np.array([patch.spread(axis, len(state.positions)) for patch in patches for axis in np.eye(3)])
-        A = np.asarray(move @ tangent.respond(loads).reshape(len(loads), -1).T) / std[:, None]
+        loads = np.array([patch.spread(axis, count) for patch in patches for axis in np.eye(3)])
+        A = np.asarray(measured.operator @ tangent.respond(loads).reshape(len(loads), -1).T) / std[:, None]
         NA = N.T @ A
         for i, normal in enumerate(normals[start : start + BATCH]):
             own = slice(3 * i, 3 * i + 3)
-            information = A[:, own].T @ A[:, own] - NA[:, own].T @ inner @ NA[:, own] + np.eye(3) / how.force_n**2
+            information = A[:, own].T @ A[:, own] - NA[:, own].T @ inner @ NA[:, own] + np.eye(3) / unknowns.force_n**2
             covariance = np.linalg.inv(information)
             across = np.linalg.svd(normal[None])[2][1:]
             normal_std.append(float(np.sqrt(normal @ covariance @ normal)))
@@ -140,8 +177,8 @@ def force_map(
         freeze(robot.body.mesh.nodes[nodes]),
         freeze(normal_std),
         freeze(tangent_std),
-        _seen(views, state, surface.triangles, nodes, normals),
-        len(rows.residual),
+        visible,
+        len(std),
     )
 
 
@@ -202,13 +239,12 @@ def _noise_of(view: View, robot: Robot) -> CameraNoise:
     return CameraNoise("tof", floor=view.camera.depth_unit / np.sqrt(12.0)) if known is None else known
 
 
-def _nuisance(robot: Robot, rows: RayRows, tangent: Tangent, state: Equilibrium, how: Unknowns, view_count: int) -> FloatArray:
+def _nuisance(robot: Robot, measured: Measured, tangent: Tangent, state: Equilibrium, how: Unknowns) -> FloatArray:
     """Return how the rows move with one standard deviation of each pose and of the modulus [m], shape (r, 6 v + 1)."""
-    pose = rows.by_pose(robot.body.mesh.nodes.mean(axis=0), view_count) * np.tile(
-        np.repeat([how.turn_rad, how.shift_m], 3), view_count
-    )
+    views = measured.by_pose.shape[1] // 6
+    pose = measured.by_pose * np.tile(np.repeat([how.turn_rad, how.shift_m], 3), views)
     sag = tangent.respond(internal(robot.body, state.positions, tangent=False).forces[None])
-    stiffer = rows.operator(len(state.positions)) @ sag.reshape(1, -1).T
+    stiffer = measured.operator @ sag.reshape(1, -1).T
     return np.hstack([pose, how.modulus * np.asarray(stiffer)])
 
 

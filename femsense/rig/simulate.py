@@ -20,6 +20,7 @@ from femsense.rig.experiment import Experiment, View, cloud_frames, rng_of, view
 from femsense.rig.plan import Plan, plan_script
 from femsense.rig.recorded import chosen_markers, recording_of, with_placement
 from femsense.rig.scene import frame_shapes
+from femsense.rig.scene_checks import warn_of_experiment, warn_of_script
 from femsense.rig.script import ScriptTable, check_script, read_script
 from femsense.rig.sensors import sensor_readings, write_sensors
 from femsense.rig.true_path import Course, true_course
@@ -87,6 +88,7 @@ def run_experiment(
     """
     plan = plan_script(script, robot, where)
     views = views_of(script, robot)
+    warn_of_script(script, robot, where)
     real = with_placement(true_robot(robot, script.truth, script.effects), script)
     course = _course(real, plan, script, where.parent, progress, checkpoint or Checkpoint(None))
     numbers = np.array([k for k, _ in course.frames], dtype=np.int64)
@@ -109,6 +111,7 @@ def run_experiment(
             expected="markers, or [clouds]",
             hint="another eye_m; scene.floor_z_m below the robot; or markers.occlusion = false",
         )
+    warn_of_experiment(draft, where)
     return draft
 
 

@@ -71,7 +71,7 @@ def camera_status(
     if seen and _gain_of_poses(sensor, k, scan, fit) < limit:
         return status
     moved = moved_cameras(sensor, k, scan, fit, free, before)
-    if moved is None:
+    if moved is None or not any(_farthest(sensor, moved)[1:]):
         return status
     better = moved.cost < fit.cost + moved.stood - SURE
     if unseen and moved.cost < fit.cost + moved.stood + SURE:
@@ -223,11 +223,17 @@ def _explained(A: FloatArray, b: FloatArray) -> float:
 
 def _in_words(sensor: Sensor, moved: Moved) -> str:
     """Return which camera moved farthest and how far, as sure as the background tells."""
-    steps = moved.step.reshape(-1, 6)
-    farthest = int(np.argmax(np.linalg.norm(steps / np.repeat([1.0, sensor.size], 3), axis=1)))
-    turn, shift = np.degrees(np.linalg.norm(steps[farthest, :3])), 1e3 * np.linalg.norm(steps[farthest, 3:])
+    farthest, shift, turn = _farthest(sensor, moved)
     name, far = sensor.recording.camera_names[farthest], f"{shift:.1f} mm and {turn:.1f}°"
     who = f"camera {name}" if name else "the camera"
     if moved.beside < moved.stood - SURE:
         return f"{who} seems to have moved by {far}, since the background did: that explains"
     return f"{who} or the robot's base may have moved by {far}: that would explain"
+
+
+def _farthest(sensor: Sensor, moved: Moved) -> tuple[int, float, float]:
+    """Return which camera moved farthest, how far [mm] and by how much it turned [°], both to the tenth that a status states."""
+    steps = moved.step.reshape(-1, 6)
+    farthest = int(np.argmax(np.linalg.norm(steps / np.repeat([1.0, sensor.size], 3), axis=1)))
+    turn, shift = np.degrees(np.linalg.norm(steps[farthest, :3])), 1e3 * np.linalg.norm(steps[farthest, 3:])
+    return farthest, round(float(shift), 1), round(float(turn), 1)

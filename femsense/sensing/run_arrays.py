@@ -42,6 +42,18 @@ def sensed(contacts: Iterable[Any]) -> list[Any]:
     return [c for c in contacts if more_than_noise(c.force_n, c.std_n, c.force_n_xyz, c.force_std_n_xyz)]
 
 
+def undetermined(contacts: Iterable[Any]) -> list[Any]:
+    """Return the contacts that a camera saw and whose force is not more than noise may make."""
+    contacts = list(contacts)
+    felt = {id(c) for c in sensed(contacts)}
+    return [c for c in contacts if c.source == "cloud" and id(c) not in felt]
+
+
+def undetermined_text(force_n: float, std_n: float) -> str:
+    """Return what is said of such a contact."""
+    return f"contact, size not determined ({force_n:.2g} ± {std_n:.2g} N)"
+
+
 def more_than_noise(size_n: npt.ArrayLike, std_n: npt.ArrayLike, force_n: FloatArray, force_std_n: FloatArray) -> BoolArray:
     """Return whether forces are away from zero by NOISE deviations: their sizes (k,), or one of their components (k, 3).
 

@@ -23,7 +23,7 @@ from femsense.io.own_files import RUN
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
 from femsense.io.result_folder import RUN_FILES, check_folder, read_document, results_folder, table_of
 from femsense.io.tables import read_csv
-from femsense.sensing.run_arrays import count_of
+from femsense.sensing.run_arrays import count_of, undetermined, undetermined_text
 from femsense.sensing.types import SensingOptions
 
 if TYPE_CHECKING:
@@ -60,6 +60,8 @@ MORE_CONTACT_COLUMNS = (
     "fy_std_n",
     "fz_std_n",
 )
+NOTE_COLUMN = "note"
+"""Last column of frames.csv where a run has such: a contact that was seen and whose size is not determined."""
 FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before_m", "rms_after_m", "ms")
 
 
@@ -125,7 +127,9 @@ def write_run(
         )
         cables, chambers = run.robot.body.cable_names, run.robot.body.chamber_names
         columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables), *(f"pressure_{name}_pa" for name in chambers)]
-        write_csv(part / "frames.csv", columns, [_frame_row(frame, cables, chambers) for frame in run.frames])
+        notes = _notes(run)
+        rows = [[*_frame_row(frame, cables, chambers), *([notes.get(frame.frame, "")] if notes else [])] for frame in run.frames]
+        write_csv(part / "frames.csv", [*columns, *([NOTE_COLUMN] if notes else [])], rows)
         _write_states(run.states, part / "states.npz")
         write_json(part / "run.json", _run_document(run, inputs, seconds))
     return Path(folder)
@@ -198,6 +202,14 @@ def _contact_row(contact: ContactForce) -> list[object]:
 def _frame_row(frame: FrameReport, cables: Sequence[str], chambers: Sequence[str]) -> list[object]:
     drives = [*(frame.tension_n.get(name) for name in cables), *(frame.pressure_pa.get(name) for name in chambers)]
     return [*(getattr(frame, name) for name in FRAME_COLUMNS), *drives]
+
+
+def _notes(run: Run) -> dict[int, str]:
+    """Return what frames.csv adds to a frame, by its number."""
+    notes: dict[int, list[str]] = {}
+    for contact in undetermined(run.contacts):
+        notes.setdefault(contact.frame, []).append(undetermined_text(contact.force_n, contact.std_n))
+    return {frame: "; ".join(texts) for frame, texts in notes.items()}
 
 
 def _write_states(states: States, path: Path) -> None:
@@ -284,7 +296,7 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
 def _read_frames(file: Path) -> tuple[FrameReport, ...]:
     from femsense.sensing.types import FrameReport
 
-    table = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
+    table = read_csv(file, required=FRAME_COLUMNS, optional=(NOTE_COLUMN,), prefixes=("tension_", "pressure_"))
     tensions = [c for c in table.columns if c.startswith("tension_") and c.endswith("_n")]
     pressures = [c for c in table.columns if c.startswith("pressure_") and c.endswith("_pa")]
     cables = [c.removeprefix("tension_").removesuffix("_n") for c in tensions]

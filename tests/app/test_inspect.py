@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from femsense.app.inspect import describe, inspect_path
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
+from femsense.io.importers.guess import open_source
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot, robot_names
 
@@ -49,6 +50,32 @@ def test_a_robot(tmp_path: Path) -> None:
     np.testing.assert_allclose(top["bends_deg"], np.degrees(np.arctan2(10, 50)))
     assert side["max_tension_n"] is None and top["max_tension_n"] == 5.0
     np.testing.assert_allclose([marker["outside_mm"] for marker in report["markers"]], [0, 0, 20], atol=1e-6)
+
+
+def test_a_robot_that_lacks_or_guesses_something_is_not_said_to_be_right(tmp_path: Path) -> None:
+    whole = write_block_robot(tmp_path / "whole", mesh__element="tet10")
+    assert describe(inspect(whole)).endswith("nothing is wrong with it")
+    bare = write_block_robot(tmp_path / "bare", cables=[], markers=[])
+    report = inspect(bare)
+    assert any("neither [[cables]] nor [[chambers]]" in text for text in report["warnings"])
+    assert any("no [[markers]]" in text for text in report["warnings"]) and report["problems"] == []
+    assert "nothing is wrong" not in describe(report)
+    toml = whole / "robot.toml"
+    toml.write_text(
+        toml.read_text(encoding="utf-8").replace("[[fixed]]", "# GUESSED: the lowest slab.\n[[fixed]]"), encoding="utf-8"
+    )
+    (text,) = inspect(whole)["warnings"]
+    assert "still marked GUESSED: fixed" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "tool"), [("take.svo2", "svo_export.py"), ("take.zdf", "Zivid Studio"), ("take.mp4", "no depth")]
+)
+def test_captures_of_other_programs_say_how_they_are_exported(name: str, tool: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"\x00\x01")
+    assert tool in inspect(tmp_path / name)["problems"][0]
+    with pytest.raises(InputError, match=tool):
+        open_source(tmp_path / name)
 
 
 def test_all_problems_of_the_tables_are_named_with_the_texts_of_the_errors(tmp_path: Path) -> None:

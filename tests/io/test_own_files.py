@@ -114,7 +114,7 @@ def test_nothing_is_made_from_what_it_replaces(run: Path, tmp_path: Path) -> Non
     for name in ("s.csv", "m.csv"):
         (tmp_path / name).write_text(OTHER)
         with pytest.raises(InputError, match="would replace what it is made from"):
-            learn_into(LearnFiles(tmp_path / "s.csv", tmp_path / "m.csv"), tmp_path / name)
+            learn_into(LearnFiles(((tmp_path / "s.csv", tmp_path / "m.csv"),)), tmp_path / name)
 
 
 def test_a_pipe_is_no_file_of_femsense(tmp_path: Path) -> None:

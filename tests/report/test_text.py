@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from femsense.io.robot_toml import load_robot
 from femsense.loop.files import saved_loop
 from femsense.report.loop.text import loop_text
 from femsense.report.text import calibration_text, known_part, run_text
+from femsense.report.write import write_report
+from femsense.sensing.run_files import read_run, write_run
 from femsense.sensing.types import ContactForce
 
 
@@ -22,6 +25,15 @@ from femsense.sensing.types import ContactForce
 def test_a_residual_far_above_the_noise_is_said_to_be_an_error_of_the_model(noise_m: float, said: bool) -> None:
     text = calibration_text(make_calibration(rms_m=2.5e-2, noise_m=noise_m))
     assert ("error of the model  24.998 mm of it: markers repeat to 0.300 mm" in text) == said
+
+
+def test_inputs_that_are_absolute_have_nothing_at_the_start() -> None:
+    known = {"tension_std_n": {"top": 0.0}, "displacement_std_m": {"top": 0.0}}
+    text = calibration_text(make_calibration(cable_tension_n={"top": 0.0}, cable_displacement_m={"top": -5.9e-4}, **known))
+    assert "cable top" not in text and "at the start" not in text
+    unknown = {"tension_std_n": {"top": 0.02}, "displacement_std_m": {"top": 1e-4}}
+    text = calibration_text(make_calibration(cable_tension_n={"top": 0.4}, cable_displacement_m={"top": 2e-3}, **unknown))
+    assert "0.400 N ± 0.02 N, 2.00 mm ± 0.1 mm at the start" in text
 
 
 def test_a_loop_says_how_large_the_error_of_the_model_is() -> None:
@@ -62,10 +74,40 @@ def test_other_forces_are_told_whole(force: list[float], std: list[float]) -> No
     assert known_part(contact(force, std)) == ""
 
 
+def test_terminal_and_report_name_the_same_largest_force(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    good = next(frame.frame for frame in run.frames if frame.status == "ok")
+    weak, sure = (
+        replace(run.contacts[0], frame=good, contact=i, track=i, force_n=f, std_n=s)
+        for i, (f, s) in enumerate(((0.9, 0.5), (0.2, 0.01)))
+    )
+    both = replace(run, contacts=(weak, sure))
+    folder = write_run(both, tmp_path / "run", inputs={"robot": {"path": None}, "recording": {"path": None}})
+    assert "largest force        0.200 ± 0.010 N" in run_text(both)
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert "largest force 0.200 ± 0.010 N" in page.replace("\u202f", " ").replace("\u00a0", " ")
+
+
 def test_a_run_whose_forces_noise_may_make_has_no_contact(tmp_path: Path) -> None:
     run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
     felt = run_text(run)
     assert "the frames with contact" in felt and "largest force" in felt
     weak = run_text(replace(run, contacts=tuple(replace(one, std_n=one.force_n) for one in run.contacts)))
     assert "median of all frames" in weak and "largest force" not in weak
-    assert any(line.split() == ["contacts", "none"] for line in weak.splitlines())
+    assert any(line.split() == ["contacts", "none"] for line in run_text(replace(run, contacts=())).splitlines())
+
+
+def test_a_contact_that_was_seen_and_whose_size_is_not_determined_is_reported_as_one(tmp_path: Path) -> None:
+    run = make_run(load_robot(write_block_robot(tmp_path / "robot")))
+    weak = replace(run, contacts=tuple(replace(one, force_n=0.48, std_n=0.26, source="cloud") for one in run.contacts[:1]))
+    text = run_text(weak)
+    assert "contacts none" not in " ".join(text.split())
+    assert "a contact whose size is not determined in 1 frame" in text
+    assert "contact, size not determined (0.48 ± 0.26 N)" in text and "largest force" not in text
+    folder = write_run(weak, tmp_path / "run", inputs={"robot": {"path": None}, "recording": {"path": None}})
+    notes = [row["note"] for row in csv.DictReader((folder / "frames.csv").open(encoding="utf-8"))]
+    assert notes.count("contact, size not determined (0.48 ± 0.26 N)") == 1 and notes.count("") == len(notes) - 1
+    assert len(read_run(folder, robot=run.robot).frames) == len(run.frames)
+    assert "contact, size not determined (0.48 ± 0.26 N)" in write_report(folder).read_text(encoding="utf-8")
+    inferred = replace(weak, contacts=tuple(replace(one, source="shape") for one in weak.contacts))
+    assert any(line.split() == ["contacts", "none"] for line in run_text(inferred).splitlines())

@@ -53,7 +53,10 @@ def test_the_files_of_a_run_are_those_of_the_contract(tmp_path: Path, robot: Rob
     assert [row[13] for row in rows[1:]] == ["0.1", "", "0.3"]
     with (folder / "frames.csv").open(newline="") as stream:
         rows = list(csv.reader(stream))
-    assert ",".join(rows[0]) == "frame,time_s,status,contacts,matched,rms_before_m,rms_after_m,ms,tension_top_n,tension_side_n"
+    columns = "frame,time_s,status,contacts,matched,rms_before_m,rms_after_m,ms,tension_top_n,tension_side_n"
+    assert ",".join(rows[0]) == columns + ",note"  # one contact was seen, and its size is not determined
+    without = write_run(replace(make_run(robot), contacts=()), tmp_path / "without", inputs=run_inputs(robot, recording, None))
+    assert (without / "frames.csv").read_text(encoding="utf-8").splitlines()[0] == columns
     with np.load(folder / "states.npz") as states:
         assert set(states.files) == {"time_s", "nodes_m", "tets", "rest_nodes_m"} and states["nodes_m"].dtype == np.float32
     document = strict_json(folder / "run.json")

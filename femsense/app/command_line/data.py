@@ -24,7 +24,7 @@ def import_(
     map_: Annotated[
         list[str] | None, option("--map", "NAME=TARGET", "Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.")
     ] = None,
-    unit: Annotated[str | None, option("--unit", "m|cm|mm", "Of lengths.")] = None,
+    unit: Annotated[str | None, option("--unit", "m|cm|mm|in|ft", "Of lengths.")] = None,
     up: Annotated[str | None, option("--up", "x|y|z", "The vertical axis; it is turned to z.")] = None,
     clock: Annotated[str, option("--clock", "auto|header|record", "Which time stamps of a bag.")] = "auto",
     rate: Annotated[float | None, option("--rate", "HZ", "Where the source has no times.")] = None,

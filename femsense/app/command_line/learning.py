@@ -10,11 +10,16 @@ from femsense.app.command_line.parameters import Json, argument, filled, option
 
 
 def learn(
-    sensors: Annotated[Path, argument("SENSORS.csv", "time_s, and a column for each sensor.")],
-    markers: Annotated[Path, argument("MARKERS.csv", "frame,marker,x_m,y_m,z_m.")],
+    files: Annotated[
+        list[Path],
+        argument(
+            "SENSORS.csv MARKERS.csv …",
+            "time_s and a column for each sensor; frame,marker,x_m,y_m,z_m. Two files a recording.",
+        ),
+    ],
     output: Annotated[Path, option("-o --output", "MODEL", "The ONNX file.")],
     test: Annotated[
-        tuple[Path, Path] | None, option("--test", "SENSORS MARKERS", "State the error on another recording.")
+        tuple[Path, Path] | None, option("--test", "SENSORS MARKERS", "State the error on another recording, too.")
     ] = None,
     adapt: Annotated[
         Path | None, option("--adapt", "MODEL", "Correct this model by a few labelled frames of another day.")
@@ -29,11 +34,11 @@ def learn(
     json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
-    from femsense.app.learn_command import LearnFiles, learn_into
+    from femsense.app.learn_command import LearnFiles, learn_into, pairs_of
 
     with progress_bar("learn") as progress:
         document, text = learn_into(
-            filled(LearnFiles, locals(), in_robot_frame=robot_frame),
+            filled(LearnFiles, locals(), pairs=pairs_of(files), in_robot_frame=robot_frame),
             output,
             end_to_end=end_to_end,
             bones=bones,

@@ -24,7 +24,7 @@ def export(
     rerun: Annotated[Path | None, option("--rerun", "FILE", "Write a recording for the Rerun viewer instead.")] = None,
     bones: Annotated[int | None, option("--bones", help="How many bones; chosen by itself if not given.", min=1, max=255)] = None,
     skin: Annotated[Path | None, option("--skin", "FILE", "A surface of your own: STL, OBJ, PLY or glTF.")] = None,
-    skin_unit: Annotated[str | None, option("--skin-unit", "UNIT", "Of its coordinates: m, cm or mm.")] = None,
+    skin_unit: Annotated[str | None, option("--skin-unit", "m|cm|mm", "Of its coordinates.")] = None,
     vertices: Annotated[int, option("--vertices", help="Of --skin at most; more are decimated.", min=100)] = 100_000,
     arrows: Annotated[bool, option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,
     json: Json = False,

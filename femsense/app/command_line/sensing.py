@@ -36,6 +36,7 @@ def calibrate(
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
+    from femsense.app.force_resolution import force_resolution
     from femsense.app.input_checks import warn_of_pictures
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.calib.files import calibration_document, write_calibration
@@ -57,8 +58,9 @@ def calibrate(
         text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"
         return Answer({"path": None, **calibration_document(calibration)}, text, exit_status=1)
     write_calibration(calibration, output)
-    text = calibration_text(calibration) + f"\n\nwritten: {output}"
-    return Answer({"path": str(output), **calibration_document(calibration)}, text)
+    resolved, said = force_resolution(body, frames, calibration)
+    text = f"{calibration_text(calibration)}\n\n{said}\n\nwritten: {output}"
+    return Answer({"path": str(output), **calibration_document(calibration), "force_resolution": resolved}, text)
 
 
 def estimate(
@@ -90,6 +92,9 @@ def estimate(
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into
+    from femsense.app.force_resolution import force_resolution
+    from femsense.calib.files import read_calibration
+    from femsense.io.recording_folder import load_recording
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
@@ -115,8 +120,10 @@ def estimate(
             say=say,
             progress=progress,
         )
+    resolved, said = force_resolution(run.robot, load_recording(recording), read_calibration(output))
     return Answer(
-        {"run": str(output), **run_document(run)}, f"{run_text(run)}\n\nwritten: {output}\nlook at it: femsense view {output}"
+        {"run": str(output), **run_document(run), "force_resolution": resolved},
+        f"{run_text(run)}\n\n{said}\n\nwritten: {output}\nlook at it: femsense view {output}",
     )
 
 

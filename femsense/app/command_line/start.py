@@ -37,6 +37,8 @@ def inspect(
         with progress_bar("accuracy") as progress:
             report = inspect_accuracy(path, progress=progress)
     else:
+        if robot is not None:
+            say("comparing with the robot, and finding the camera's pose to state the forces that it resolves")
         report = inspect_path(path, robot=robot)
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
 

@@ -15,6 +15,7 @@ from femsense.app.inspection.robots import inspect_robot
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
 from femsense.io.checkpoint import UNFINISHED
+from femsense.io.importers.foreign import export_hint
 from femsense.io.meshing.robot_from_line import line_report
 from femsense.rig.script import read_script
 
@@ -180,6 +181,7 @@ def inspect_unknown(file: Path, report: Report, problems: list[str]) -> None:
                 where=file,
                 found=file.suffix or "no ending",
                 expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
+                hint=export_hint(file),
             )
         )
     )

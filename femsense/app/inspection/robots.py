@@ -46,8 +46,43 @@ def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
         report.update({"mesh": _mesh_report(mesh, 1e3)} if mesh is not None else {})
         return
     report.update(_robot_report(loaded, document))
+    _warn_of_gaps(loaded, file)
     if document.get("effects"):
         attempt(lambda: load_robot(file), problems)
+
+
+def _warn_of_gaps(robot: Robot, file: Path) -> None:
+    """Warn of what a robot needs before it can be calibrated, and of values that `femsense mesh` guessed and nobody has confirmed."""
+    guessed = guessed_tables(file.read_text(encoding="utf-8-sig"))
+    if guessed:
+        warnings.warn(
+            f"{file.name}: still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word",
+            stacklevel=3,
+        )
+    if not robot.body.cables and not robot.body.chambers:
+        warnings.warn(
+            f"{file.name}: neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it "
+            "at rest alone, and improve has no inputs to compare with",
+            stacklevel=3,
+        )
+    if not robot.marker_names:
+        warnings.warn(
+            f"{file.name}: no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
+            "(docs/calibration.md), and there are no forces without clouds",
+            stacklevel=3,
+        )
+
+
+def guessed_tables(text: str) -> list[str]:
+    """Return the tables of a robot.toml whose comment still says GUESSED, in their order."""
+    found, pending = [], False
+    for line in text.splitlines():
+        pending = pending or line.startswith("# GUESSED")
+        name = line.strip().strip("[]")
+        if pending and line.startswith("["):
+            found.append(name)
+            pending = False
+    return found
 
 
 def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
+from femsense.io.importers.foreign import export_hint
 from femsense.io.importers.formats import FORMATS, Format, contents_of, format_of
 from femsense.io.importers.frames import Options, Source
 from femsense.io.importers.images.folders import PAIRS, folder_kind
@@ -73,7 +74,7 @@ def _format(source: Path, said: Options) -> Format:
         where=source,
         found=said.format or source.suffix or "no ending",
         expected="--format " + "|".join(FORMATS),
-        hint=UNPACK if packed else did_you_mean(said.format, FORMATS) if said.format else None,
+        hint=UNPACK if packed else did_you_mean(said.format, FORMATS) if said.format else export_hint(source),
     )
 
 

@@ -18,6 +18,7 @@ from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.calibration import Ready, calibrated_pose, fitted_again, matched
 from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import hinted, select_next
+from femsense.loop.search.richer_forms import with_all_parts
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
 from femsense.loop.search.swaps import instead_of_offsets, predicting_best, swapped
@@ -108,7 +109,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
     refits = [*refits, *at_step(tried, len(history))]
     course.refits = refits
     if next_one is None:
-        course.over = True
+        _tell_parts_apart(course, say)
         return
     course.earlier = data
     winner = next_one.fitted
@@ -118,6 +119,15 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
     last = history[-1][1]
     data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if anew else data, last)
     course.data, course.history, course.refits, course.fitted = data, history, refits, last
+
+
+def _tell_parts_apart(course: SearchProgress, say: Progress) -> None:
+    """Give named effects a value for each cable where these have evidence, and go on; where none has, the search is over."""
+    assert course.noise is not None
+    fitted, records = with_all_parts(course.data, course.fitted, course.noise, course.n_effective, say)
+    course.refits = [*course.refits, *at_step(records, len(course.history))]
+    course.over = fitted is course.fitted
+    course.fitted, course.history = fitted, [*course.history[:-1], (course.history[-1][0], fitted)]
 
 
 def _screened(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -78,6 +79,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     correction, learned = judged_correction(data, back) if correct else (None, None)
     robot = _handed_back(data, entries)
     robot = robot if robot.correction is learned else replace(robot, correction=learned)
+    robot = replace(robot, name=improved_name(robot.name)) if entries or learned is not None else robot
     only_held = bool(surprise) and not tests.significant and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
     budget = model_error(data, excess, noise, measured)
@@ -111,6 +113,15 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         residuals=residual_table(data, before, back),
         evidence=gather(data, search, back, shown, tests, rng),
     )
+
+
+def improved_name(name: str) -> str:
+    """Return the name of the robot that is returned, so that its runs are told from those of the declared one: finger becomes
+    finger-improved, and that finger-improved-2."""
+    begin, found, count = name.partition("-improved")
+    if not found or not (count == "" or re.fullmatch(r"-\d+", count)):
+        return f"{name}-improved"
+    return f"{begin}-improved-{int(count[1:] or 1) + 1}"
 
 
 def _handed_back(data: Data, entries: Sequence[Entry]) -> Robot:

@@ -45,6 +45,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
         facts=facts,
         count=_count(facts, contacts),
         touched=None if contacts is None else len(set(contacts.frame[contacts.sensed].tolist())),
+        undetermined="" if contacts is None else _undetermined(contacts),
         residual=None if frames is None or not len(frames) else _residual(frames),
         forces=force_pictures(contacts, frames, folder),
         load_error=load_error(facts.known_loads),
@@ -74,11 +75,18 @@ def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable
         base += f", {doubted} of them not to be trusted"
     strongest = strongest_contact(contacts, frames)
     if contacts is None or strongest is None:
-        return f"{base}."
+        weak = "" if contacts is None else _undetermined(contacts)
+        return f"{base}; {weak}." if weak else f"{base}."
     return (
         f"{base}; largest force {force_text(contacts.size_n[strongest], contacts.std_n[strongest])} in frame "
         f"{contacts.frame[strongest]}."
     )
+
+
+def _undetermined(contacts: ContactTable) -> str:
+    """Return in how many frames a contact was seen whose size is not determined; nothing where there is none."""
+    count = len(set(contacts.frame[contacts.undetermined].tolist()))
+    return f"size not determined in {words.counted(count, 'frame')}" if count else ""
 
 
 def _count(facts: RunFacts, contacts: ContactTable | None) -> int:

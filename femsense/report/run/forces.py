@@ -29,7 +29,7 @@ from femsense.report.drawing import (
     skin,
 )
 from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
-from femsense.sensing.run_arrays import NOISE
+from femsense.sensing.run_arrays import NOISE, undetermined_text
 from femsense.sensing.run_files import read_states
 
 ROWS = 150
@@ -54,16 +54,18 @@ def force_pictures(contacts: ContactTable | None, frames: FrameTable | None, fol
     times = contacts.time_s if frames is None or not len(frames) else frames.time_s
     more = len(set(contacts.contact.tolist())) - len(numbers)
     rest = f" The {len(numbers)} strongest of {len(numbers) + more}." if more > 0 else ""
-    strongest = strongest_contact(contacts, frames) or 0
+    strongest = strongest_contact(contacts, frames)
+    largest = (
+        "none of them above the noise"
+        if strongest is None
+        else f"the largest {force_text(contacts.size_n[strongest], contacts.std_n[strongest])}"
+    )
     over_time = as_image(
         _force_figure(contacts, frames, numbers, (float(times.min()), float(times.max()))),
-        alt=(
-            f"Force of {words.counted(len(numbers), 'contact')} over time; the largest "
-            f"{force_text(contacts.size_n[strongest], contacts.std_n[strongest])}."
-        ),
+        alt=f"Force of {words.counted(len(numbers), 'contact')} over time; {largest}.",
         caption=f"Size of each force; the bands are ± 1 and ± 2 standard deviations.{rest}",
     )
-    return [over_time, _force_on_body(contacts, frames, folder, contacts.frame[strongest])]
+    return [over_time, None if strongest is None else _force_on_body(contacts, frames, folder, contacts.frame[strongest])]
 
 
 def _largest_series(contacts: ContactTable) -> list[int]:
@@ -174,22 +176,26 @@ class ListedContacts:
 
 
 def listed_contacts(contacts: ContactTable) -> ListedContacts | None:
-    """Return the contacts one by one, the first of many; forces that noise may make are counted. None where there are none."""
-    if not contacts.sensed.any():
+    """Return the contacts one by one, the first of many, also those that were seen and whose size is not determined.
+
+    Other forces that noise may make are counted. None where there are none.
+    """
+    if not (contacts.sensed | contacts.undetermined).any():
         return None
-    felt = np.flatnonzero(contacts.sensed)
+    felt = np.flatnonzero(contacts.sensed | contacts.undetermined)
     factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
     rows = [
         (
             str(contacts.frame[i]),
             words.number(float(contacts.time_s[i])),
             str(contacts.contact[i]),
-            words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i])),
+            undetermined_text(contacts.size_n[i], contacts.std_n[i]) if contacts.undetermined[i] else size,
             _vector(factor * contacts.force_n[i]),
             _vector(1e3 * contacts.place_m[i], 1),
             contacts.source[i] or words.NOTHING,
         )
         for i in felt[:ROWS]
+        for size in [words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i]))]
     ]
     note = first_of(len(felt), ROWS, "contacts.csv")
     if len(felt) < len(contacts):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.io.tables import Table, read_csv
 from femsense.sensing.run_arrays import more_than_noise
-from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS
+from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS, NOTE_COLUMN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,6 +36,11 @@ class ContactTable:
     def sensed(self) -> npt.NDArray[np.bool_]:
         """Whose force is more than noise may make."""
         return more_than_noise(self.size_n, self.std_n, self.force_n, self.force_std_n)
+
+    @property
+    def undetermined(self) -> npt.NDArray[np.bool_]:
+        """Which a camera saw and whose force is not more than noise may make."""
+        return np.array([source == "cloud" for source in self.source], dtype=bool) & ~self.sensed
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -92,7 +97,7 @@ def _identities(table_: Table, frames: IntArray) -> IntArray:
 
 def read_frames(file: Path) -> FrameTable:
     """Return frames.csv. Raises InputError."""
-    table_ = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
+    table_ = read_csv(file, required=FRAME_COLUMNS, optional=(NOTE_COLUMN,), prefixes=("tension_", "pressure_"))
     cables = [c for c in table_.columns if c.startswith("tension_")]
     chambers = [c for c in table_.columns if c.startswith("pressure_")]
     values = table_.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *cables, *chambers), empty_is_nan=True)
@@ -113,11 +118,11 @@ def read_frames(file: Path) -> FrameTable:
 
 
 def strongest_contact(contacts: ContactTable | None, frames: FrameTable | None) -> int | None:
-    """Return the row of the largest force of the frames that are ok; None where there is none."""
+    """Return the row of the largest force above the noise in the frames that are ok, as the terminal names it; None where there is none."""
     if contacts is None:
         return None
     bad = [] if frames is None else frames.frame[~frames.good].tolist()
-    size = np.where(np.isin(contacts.frame, bad), np.nan, contacts.size_n)
+    size = np.where(np.isin(contacts.frame, bad) | ~contacts.sensed, np.nan, contacts.size_n)
     return None if not np.isfinite(size).any() else int(np.nanargmax(size))
 
 

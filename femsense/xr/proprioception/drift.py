@@ -12,12 +12,23 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.model.marker_units import check_marker_sizes
-from femsense.xr.proprioception.corrections import Frames, corrected, explain, is_better, rigid_motion, shift_of, shifts_of
+from femsense.xr.proprioception.corrections import (
+    AFRESH,
+    Frames,
+    corrected,
+    explain,
+    is_better,
+    rigid_motion,
+    shift_of,
+    shifts_of,
+)
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.learn import error_interval
 from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel
+from femsense.xr.proprioception.selection import marker_rms
+from femsense.xr.proprioception.spread import make_spread
 
 AS_BEFORE = 1.5
 """Times the error that was stated at which a model still holds."""
@@ -115,7 +126,8 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
         report["adapted"] |= {"channel": model.channels[found.channel], "channel_shift": found.by}
         domain = replace(domain, low=domain.low + moved, high=domain.high + moved, centre=domain.centre + moved)
     network = corrected(frames, chosen)
-    return replace(model, network=network, bones=None, domain=_wider(domain, few.readings), report=report)
+    spread = make_spread(network, frames.inputs, frames.held_out(chosen))
+    return replace(model, network=network, bones=None, domain=_wider(domain, few.readings), report=report, spread=spread)
 
 
 def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
@@ -123,12 +135,12 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
 
     Raises InputError, DataError where channels, markers, frames or units differ.
     """
-    same = (data.channels, data.marker_names) == (model.channels, model.marker_names)
-    if not same:
-        raise DataError(
-            f"other channels or markers: {data.channels}, {data.marker_names}; the model knows {model.channels}, "
-            f"{model.marker_names}"
-        )
+    for kind, here, known in (
+        ("channels", data.channels, model.channels),
+        ("markers", data.marker_names, model.marker_names),
+    ):
+        if here != known:
+            raise DataError(_other_names(kind, here, known))
     check_frame(model.frame, data.frame)
     if len(data) < FEWEST:
         raise DataError(f"{len(data)} rows have readings and all markers; at least {FEWEST} are needed")
@@ -142,6 +154,15 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
     return inputs
 
 
+def _other_names(kind: str, here: tuple[str, ...], known: tuple[str, ...]) -> str:
+    """Return in words how names differ from those that a model knows."""
+    missing, new = [n for n in known if n not in here], [n for n in here if n not in known]
+    if not missing and not new:
+        return f"the {kind} stand in another order than when the model was learnt: {', '.join(here)}, not {', '.join(known)}"
+    parts = [f"without {', '.join(missing)}"] * bool(missing) + [f"with {', '.join(new)}, which it does not know"] * bool(new)
+    return f"other {kind} than the model's: {', and '.join(parts)}; it knows {', '.join(known)}"
+
+
 def _frames(model: ProprioceptiveModel, data: Labelled) -> Frames:
     return Frames(model.network, model_inputs(model, data), data.targets, model.domain.high - model.domain.low)
 
@@ -152,14 +173,21 @@ def _verdict(frames: Frames, chosen: str, stated: float) -> str:
     More is what lies above with its whole 95 % interval: a few rows outside of what was learnt are no change.
     """
     errors = frames.errors("none")
-    if 1e3 * error_interval(errors)[0] <= AS_BEFORE * stated:
+    motion = marker_rms(frames.targets - frames.targets.mean(axis=0))
+    if 1e3 * error_interval(errors)[0] <= AS_BEFORE * stated and marker_rms(errors) < motion:
         return "holds"
     said = []
     if "channel" in chosen:
         said.append("one channel shifted")
     if "base" in chosen and is_better(frames.errors("base"), errors):
         said.append("base moved")
-    if not said or "zeros" in chosen or "line" in chosen or 1e3 * error_interval(frames.errors(chosen))[0] > AS_BEFORE * stated:
+    if (
+        not said
+        or "zeros" in chosen
+        or "line" in chosen
+        or AFRESH in chosen
+        or 1e3 * error_interval(frames.errors(chosen))[0] > AS_BEFORE * stated
+    ):
         said.append("map changed")
     return " and ".join(said)
 

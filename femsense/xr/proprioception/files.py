@@ -1,8 +1,9 @@
 """SENSORS.csv and MARKERS.csv.
 
 SENSORS.csv: `time_s`, optionally `frame`, and one column a channel, with any name and in any unit.
-MARKERS.csv: `frame,marker[,camera],x_m,y_m,z_m`, as in a recording; a hidden marker has no row. Frames are those of SENSORS.csv, there the
-rows from 0 where it has no such column.
+MARKERS.csv: `frame,marker[,camera],x_m,y_m,z_m[,qw,qx,qy,qz]`, as in a recording; a hidden marker has no row. Frames are those of
+SENSORS.csv, there the rows from 0 where it has no such column. With a quaternion a marker is a rigid body: points before and behind it
+along the body become markers, too, so that bones take its direction.
 """
 
 from __future__ import annotations
@@ -24,6 +25,11 @@ from femsense.xr.proprioception.labelled import AS_MEASURED, ROBOT, Labelled, la
 
 NOT_CHANNELS = ("frame", "time_s")
 AXES = ("x_m", "y_m", "z_m")
+TURN = ("qw", "qx", "qy", "qz")
+UNIT = 0.01
+"""By how much the length of a quaternion may differ from 1."""
+DIRECTED = 0.25
+"""Distance of the points that a rigid body adds, in mean distances of rigid bodies."""
 
 
 def read_labelled(
@@ -44,7 +50,9 @@ def read_labelled(
         raise InputError("markers in the robot's frame need no calibration", where="in_robot_frame", found=calibration)
     poses = {} if in_robot_frame else camera_poses(Path(markers), calibration)
     frames, time_s, channels, readings = read_sensors(sensors)
-    names, places = _read_markers(Path(markers), frames, poses)
+    names, places, turns = _read_markers(Path(markers), frames, poses)
+    if turns is not None:
+        names, places = with_directions(names, places, turns, Path(markers))
     frame = ROBOT if poses or in_robot_frame else AS_MEASURED
     return labelled(time_s, readings, places, channels=channels, marker_names=names, frame=frame)
 
@@ -86,12 +94,54 @@ def read_sensors(path: str | Path) -> tuple[IntArray, FloatArray, tuple[str, ...
     return frames, table.numbers(("time_s",))[:, 0], channels, table.numbers(channels, empty_is_nan=True)
 
 
-def _read_markers(path: Path, frames: IntArray, poses: dict[str, FloatArray]) -> tuple[tuple[str, ...], FloatArray]:
-    """Return names in the order in which they first come, and places (n, m, 3), nan where a marker is hidden.
+def with_directions(
+    names: tuple[str, ...], places: FloatArray, turns: FloatArray, where: Path
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return rigid bodies with points `DIRECTED` of their mean distance before and behind each along the body, as further markers.
 
-    Places are taken through the poses of their cameras, where there are any; of several cameras their mean is taken.
+    The direction of the body is that of the line through the rigid bodies at rest (the first frame with all of them), and turns with each.
+
+    Arguments:
+        names: of the m rigid bodies, from base to tip.
+        places: [m], shape (n, m, 3).
+        turns: their rotations, shape (n, m, 3, 3), nan where one is hidden.
+        where: what messages name.
+
+    Returns:
+        names, and places of shape (n, 3 m − 2, 3).
+
+    Raises:
+        InputError: one rigid body, or no frame with all of them.
     """
-    table = read_csv(path, required=("frame", "marker", *AXES), optional=("camera",))
+    whole = np.flatnonzero(np.isfinite(turns).all(axis=(1, 2, 3)) & np.isfinite(places).all(axis=(1, 2)))
+    if len(names) < 2 or not len(whole):
+        raise InputError(
+            "directions need two rigid bodies in one frame", where=where, found=f"{len(names)} named", expected="two or more"
+        )
+    rest = places[whole[0]]
+    line = np.gradient(rest, axis=0)
+    own = np.einsum("mji,mj->mi", turns[whole[0]], line / np.linalg.norm(line, axis=1, keepdims=True))
+    reach = DIRECTED * float(np.linalg.norm(np.diff(rest, axis=0), axis=1).mean())
+    along = reach * np.einsum("nmij,mj->nmi", turns, own)
+    labels, points = list[str](), list[FloatArray]()
+    for i, name in enumerate(names):
+        for mark, sign in (("-", -1.0), ("", 0.0), ("+", 1.0)):
+            if (i, mark) not in ((0, "-"), (len(names) - 1, "+")):
+                labels.append(name + mark)
+                points.append(places[:, i] + sign * along[:, i])
+    return tuple(labels), np.stack(points, axis=1)
+
+
+def _read_markers(
+    path: Path, frames: IntArray, poses: dict[str, FloatArray]
+) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
+    """Return names in the order in which they first come, places (n, m, 3), nan where a marker is hidden, and rotations
+    (n, m, 3, 3) of rigid bodies; None where there are only points.
+
+    Places are taken through the poses of their cameras, where there are any; of several cameras their mean is taken, and the rotation
+    that the last one saw.
+    """
+    table = read_csv(path, required=("frame", "marker", *AXES), optional=("camera", *TURN))
     labels, numbers = table.text("marker"), table.integers("frame")
     names = tuple(dict.fromkeys(labels))
     if not names or "" in names:
@@ -108,12 +158,39 @@ def _read_markers(path: Path, frames: IntArray, poses: dict[str, FloatArray]) ->
             hint=hint,
         )
     total, seen = np.zeros((len(frames), len(names), 3)), np.zeros((len(frames), len(names), 1))
-    for label, number, place in zip(labels, numbers, _moved(table, poses, path)):
+    turned = _turned(table, poses, path)
+    turns = None if turned is None else np.full((len(frames), len(names), 3, 3), np.nan)
+    for i, (label, number, place) in enumerate(zip(labels, numbers, _moved(table, poses, path))):
         if int(number) in row_of:
             at = row_of[int(number)], names.index(label)
             total[at] += place
             seen[at] += 1.0
-    return names, np.divide(total, seen, out=np.full_like(total, np.nan), where=seen > 0)
+            if turns is not None and turned is not None:
+                turns[at] = turned[i]
+    return names, np.divide(total, seen, out=np.full_like(total, np.nan), where=seen > 0), turns
+
+
+def _turned(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray | None:
+    """Return the rotation of each row, shape (k, 3, 3), through the pose of its camera; None without quaternions. Raises InputError."""
+    given = [name for name in TURN if name in table.columns]
+    if not given:
+        return None
+    if len(given) < len(TURN):
+        raise InputError("not a whole quaternion", where=f"{path}, header", found=", ".join(given), expected=", ".join(TURN))
+    numbers = table.numbers(TURN)
+    size = np.linalg.norm(numbers, axis=1)
+    if (np.abs(size - 1.0) > UNIT).any():
+        row = int(np.argmax(np.abs(size - 1.0)))
+        raise InputError(
+            "not a unit quaternion", where=f"{path}, row {row + 1}", found=f"length {size[row]:.3g}", expected="length 1"
+        )
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_quat(numbers[:, [1, 2, 3, 0]]).as_matrix()
+    cameras = table.text("camera") if "camera" in table.columns else [""] * len(table)
+    alone = next(iter(poses.values())) if len(poses) == 1 else None
+    frames = [poses.get(name, np.eye(4)) if alone is None else alone for name in cameras]
+    return np.asarray(np.stack([T[:3, :3] for T in frames]) @ turns) if frames else np.asarray(turns)
 
 
 def _moved(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray:

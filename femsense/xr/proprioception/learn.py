@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -20,6 +20,7 @@ from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
 from femsense.xr.proprioception.selection import (
     MEMORIES,
+    MOST_ROWS,
     Progress,
     compare_plans,
     marker_rms,
@@ -28,6 +29,7 @@ from femsense.xr.proprioception.selection import (
     thinned_rows,
     train,
 )
+from femsense.xr.proprioception.spread import coverage, growth, held_out, make_spread
 
 KINDS = ("ridge", "radial", "network", "mlp")
 """In the order of simplicity."""
@@ -69,11 +71,11 @@ def learn(
     """Return a model of readings.
 
     The kind of map, its memory and its channels are those with the smallest error on blocks in time that were held out. The
-    error that the report states is on rows that neither training nor choice saw.
+    error that the report states is on three blocks of twenty that neither training nor choice saw.
 
     Arguments:
-        data: readings with markers.
-        test: rows for the stated error, of another recording; default: three blocks of twenty of `data`.
+        data: readings with markers, of one recording or several (`joined`).
+        test: another recording: the report states the error there as well, in `test`.
         options: which maps are tried, and the bones.
         progress: called with what is done and how much there is.
 
@@ -83,8 +85,8 @@ def learn(
     options = options or LearnOptions()
     _check(data, options)
     check_frame(data.frame, data.frame if test is None else test.frame)
-    held = rows_kept(len(data)) if test is None else np.zeros(len(data), dtype=bool)
-    work, test = data.select(~held), data.select(held) if test is None else test
+    held = rows_kept(len(data))
+    work, kept = data.select(~held), data.select(held)
     kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
     memories = tuple(taus for taus in options.memories if data.spacing_s <= longest_gap(taus)) or ((),)
     compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
@@ -97,7 +99,7 @@ def learn(
     }
     table = {}
     for item in compared:
-        errors = networks[item.plan.kind](test.inputs(item.plan.memory_s)) - test.targets
+        errors = networks[item.plan.kind](kept.inputs(item.plan.memory_s)) - kept.targets
         table[item.plan.kind] = _row(errors) | {
             "blocks_mm": 1e3 * item.rms,
             "median_block_mm": 1e3 * item.typical,
@@ -105,15 +107,27 @@ def learn(
             "channels": int(item.plan.used.sum()),
         }
     network, plan = networks[chosen.plan.kind], chosen.plan
-    inputs = test.inputs(plan.memory_s)
-    report = {
+    inputs = kept.inputs(plan.memory_s)
+    some = thinned_rows(len(work), MOST_ROWS)
+    out = held_out(
+        lambda x, y: train(plan, x, y, options.seed), work.inputs(plan.memory_s)[some], work.targets[some], work.part[some]
+    )
+    spread = make_spread(network, work.inputs(plan.memory_s)[rows], out)
+    report: dict[str, Any] = {
         "kind": plan.kind,
         **{key: table[plan.kind][key] for key in ("error_mm", "error_ci_mm")},
-        "marker_error_mm": marker_errors_mm(network(inputs) - test.targets, data.marker_names),
+        "marker_error_mm": marker_errors_mm(network(inputs) - kept.targets, data.marker_names),
         "rows": len(work),
-        "test_rows": len(test),
+        "test_rows": len(kept),
+        "motion_mm": 1e3 * marker_rms(data.targets - data.targets.mean(axis=0)),
+        "sessions": len(np.unique(data.part)),
+        "interval": {
+            "radius_mm": dict(zip(data.marker_names, (1e3 * np.median(spread.radius(network, inputs), axis=0)).tolist())),
+            "coverage": coverage(spread, network, inputs, kept.targets),
+            "growth": growth(out),
+        },
         "compared": table,
-        "importance_mm": importance(network, inputs, test.targets, data.channels, len(plan.memory_s)),
+        "importance_mm": importance(network, inputs, kept.targets, data.channels, len(plan.memory_s)),
         "unused": [name for name, used in zip(data.channels, plan.used) if not used],
         "dead": dead_channels(data.readings, data.channels),
         "saturated": saturated_channels(data.readings, data.channels),
@@ -123,10 +137,32 @@ def learn(
         some = thinned_rows(len(work), BONE_ROWS)
         wanted = np.array([bone_numbers(chain(markers)) for markers in work.markers[some]])
         bones = train_bayesian(work.inputs(plan.memory_s)[some], wanted, rng=np.random.default_rng(options.seed))
-        report["bones_mm"] = _bone_error(bones(inputs), chain, test)
+        report["bones_mm"] = _bone_error(bones(inputs), chain, kept)
     domain = learn_domain(work.readings)
-    report["test_outside"] = float(1.0 - domain.inside(test.readings).mean())
-    return ProprioceptiveModel(data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report, data.frame)
+    report["test_outside"] = float(1.0 - domain.inside(kept.readings).mean())
+    model = ProprioceptiveModel(
+        data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report, data.frame, spread
+    )
+    return model if test is None else replace(model, report={**report, "test": errors_on(model, test, report["error_mm"])})
+
+
+def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> dict[str, Any]:
+    """Return the errors of a model on data that it was not made from, and whether its intervals hold there, as plain tables.
+
+    `growth` is the error there over the stated one.
+    """
+    inputs = data.inputs(model.memory_s)
+    errors = model.network(inputs) - data.targets
+    table = {
+        **_row(errors),
+        "marker_error_mm": marker_errors_mm(errors, model.marker_names),
+        "rows": len(data),
+        "outside": float(1.0 - model.domain.inside(data.readings).mean()),
+        "growth": 1e3 * marker_rms(errors) / max(stated_mm, 1e-9),
+    }
+    if model.spread is not None:
+        table["coverage"] = coverage(model.spread, model.network, inputs, data.targets)
+    return table
 
 
 def error_interval(errors: FloatArray, *, seed: int = 0) -> tuple[float, float]:

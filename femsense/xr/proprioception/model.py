@@ -15,6 +15,7 @@ from femsense.xr.proprioception.domain import Domain, Outside
 from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.memory import longest_gap, step_memory, with_memory
 from femsense.xr.proprioception.network import Network
+from femsense.xr.proprioception.spread import Spread
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,6 +39,8 @@ class ProprioceptiveModel:
     """How it was learnt, and its errors on what was held out."""
     frame: str = AS_MEASURED
     """Of reference of markers and bones: "robot", or "markers", that in which they were measured."""
+    spread: Spread | None = None
+    """Of its intervals; None in files of older versions."""
 
     def __repr__(self) -> str:
         error = self.report.get("error_mm")
@@ -60,6 +63,21 @@ class ProprioceptiveModel:
         x, single = self._rows(rows)
         y = self.network(self._inputs(x, single, time_s)).reshape(len(x), -1, 3)
         return np.asarray(y[0] if single else y)
+
+    def interval(self, rows: npt.ArrayLike, time_s: npt.ArrayLike | None = None) -> FloatArray:
+        """Return the radius of the 95 % interval of each marker [m], shape (m,) for one row, or (n, m).
+
+        It holds the predictive variance of the map and what the sessions that were learnt from drift, but not what another day may
+        change. Arguments and errors as of `markers`.
+
+        Raises:
+            InputError: also where the model is of an older version, without intervals.
+        """
+        if self.spread is None:
+            raise InputError("a model of an older version has no intervals", where="model", hint="learn it again: femsense learn")
+        x, single = self._rows(rows)
+        radius = self.spread.radius(self.network, self._inputs(x, single, time_s))
+        return np.asarray(radius[0] if single else radius)
 
     def armature(self, row: npt.ArrayLike) -> BonePoses:
         """Return the bones of one steady row of readings, shape (c,).
@@ -139,6 +157,8 @@ class LivePose:
     """None where the model has no chain."""
     outside: tuple[Outside, ...]
     """Channels that read what was never learnt."""
+    interval: FloatArray | None = None
+    """Radius of the 95 % interval of each marker [m], shape (m,); None where the model has none, or no pose."""
 
 
 class LiveModel:
@@ -175,7 +195,7 @@ class LiveModel:
         bones = None
         if model.chain is not None:
             bones = model.chain(markers) if model.bones is None else model.bones_of(inputs)
-        return LivePose(markers, bones, outside)
+        return LivePose(markers, bones, outside, None if model.spread is None else model.spread.radius(model.network, inputs)[0])
 
 
 def bone_numbers(poses: BonePoses) -> FloatArray:

@@ -6,6 +6,7 @@ Inputs of the graph: `readings` (rows, c) and, where the model has a memory, `fi
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import KINDS, Network
 from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, read_onnx, write_onnx
+from femsense.xr.proprioception.spread import Spread
 
 FORMAT = "femsense-proprioception-1"
 KEY = "femsense"
@@ -87,6 +89,7 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
         _network("bones", document["networks"]["bones"], numbers) if "bones" in document["networks"] else None,
         document["report"],
         document.get("frame", AS_MEASURED),
+        _spread(document.get("spread")),
     )
 
 
@@ -127,7 +130,22 @@ def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[
         if chain is None
         else {key: getattr(chain, key) for key in CHAIN} | {"planar": chain.planar, "inextensible": chain.inextensible},
         "report": model.report,
+        "spread": None if model.spread is None else _spread_table(model.spread),
     }
+
+
+def _spread_table(spread: Spread) -> dict[str, Any]:
+    """Return a spread as plain tables; its matrix as float32 in base64, which JSON's digits would make four times as long."""
+    root = base64.b64encode(spread.root.astype("<f4").tobytes()).decode("ascii")
+    return {"root": root, "kappa": spread.kappa, "quantile_m": spread.quantile}
+
+
+def _spread(table: dict[str, Any] | None) -> Spread | None:
+    if table is None:
+        return None
+    root = np.frombuffer(base64.b64decode(table["root"]), dtype="<f4").astype(np.float64)
+    side = round(len(root) ** 0.5)
+    return Spread(freeze(root.reshape(side, side)), float(table["kappa"]), freeze(table["quantile_m"]))
 
 
 def _stored(network: Network) -> dict[str, npt.NDArray[np.float32]]:

@@ -30,7 +30,10 @@ GAIN = 0.05
 MEMORIES: tuple[tuple[float, ...], ...] = ((), (0.1,), (0.3,), (1.0,), (0.3, 1.0, 3.0))
 PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2)
 LENGTHS, NOISES = (1.0, 2.0), (1e-3, 1e-2)
-MLP_UNITS = 32
+MLP_UNITS, MLP_MEMBERS = 10, 5
+"""Units of each small network, and how many networks make a committee."""
+MLP_DECAY = 1.0
+"""Weight decay, as scikit-learn counts it."""
 CHEAP = {"ridge", "radial"}
 Progress = Callable[[int, int], None]
 """Called with what is done, and how much there is."""
@@ -146,18 +149,29 @@ def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Net
 
 
 def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
-    """Return a small network of rectified units on what ridge leaves, trained by scikit-learn (Adam, stopped early)."""
+    """Return the mean of a committee of small networks on what ridge leaves, as one network.
+
+    Each has `MLP_UNITS` rectified units, as many as the paper's, and starts from other weights; scikit-learn trains it (L-BFGS). One
+    alone depends on its start by half its error.
+    """
     from sklearn.neural_network import MLPRegressor
 
     line = train_ridge(x, y, penalty=PENALTIES[1])
-    left = y - line(x)
+    z, left = line.normalised(x), y - line(x)
     size = max(float(left.std()), 1e-12)
-    learner = MLPRegressor(hidden_layer_sizes=(MLP_UNITS,), alpha=1e-2, learning_rate_init=5e-3, max_iter=300, random_state=seed)
+    members = [
+        MLPRegressor(hidden_layer_sizes=(MLP_UNITS,), solver="lbfgs", alpha=MLP_DECAY, max_iter=300, random_state=seed + i)
+        for i in range(MLP_MEMBERS)
+    ]
     with warnings.catch_warnings():  # that it has not converged is the rule with so few steps, and held-out blocks decide
         warnings.simplefilter("ignore")
-        learner.fit(line.normalised(x), left / size if left.shape[1] > 1 else left[:, 0] / size)
-    (first, second), (b, d) = learner.coefs_, learner.intercepts_
-    return Network("relu", line.centre, line.scale, first.T, b, size * second.T, line.C, line.d + size * d)
+        for member in members:
+            member.fit(z, left / size if left.shape[1] > 1 else left[:, 0] / size)
+    first, b = (np.concatenate([getattr(m, name)[0].T for m in members]) for name in ("coefs_", "intercepts_"))
+    second = np.concatenate([m.coefs_[1].T.reshape(y.shape[1], -1) for m in members], axis=1)
+    d = np.mean([m.intercepts_[1] for m in members], axis=0)
+    share = size / MLP_MEMBERS
+    return Network("relu", line.centre, line.scale, first, b, share * second, line.C, line.d + size * d)
 
 
 def marker_rms(errors: FloatArray) -> float:

@@ -1,0 +1,25 @@
+"""The forces that a recording's camera resolves on a robot, said by `inspect`, `calibrate` and `estimate`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from femsense.calib.calibration import Calibration
+from femsense.core.errors import FemsenseError
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+
+
+def force_resolution(robot: Robot, recording: Recording, calibration: Calibration) -> tuple[dict[str, Any], str]:
+    """Return what `recorded_forces` finds, as plain tables and as text; where it finds nothing, the reason in both.
+
+    A result that was asked for does not fail because its resolution is not known.
+    """
+    from femsense.rig.recorded_forces import recorded_forces, resolution_document, resolution_text
+
+    try:
+        found = recorded_forces(robot, recording, calibration)
+    except FemsenseError as error:
+        reason = " ".join(str(error).split())
+        return {"unknown": reason}, f"forces that this camera resolves: not known. {reason}"
+    return resolution_document(found), resolution_text(found)

@@ -1,0 +1,99 @@
+"""Named effects with a value for each cable or chamber, once nothing else passes.
+
+A form with one value, or with the value of one cable, costs least and is named first. What tells the values of the others
+may be covered then by what is still missing. So the richer form of each named effect is fitted again in the whole model, and
+replaces the simple one where its further parameters have evidence and held-out data are predicted no worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
+from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import RefitRecord
+from femsense.loop.search.refit import evidence, within
+from femsense.loop.search.search_state import Progress, no_equilibrium
+from femsense.model.effects import FORMS, Effect, Entry, Parameter
+
+Term = tuple[Effect, Entry, tuple[Parameter, ...]]
+
+
+def with_all_parts(
+    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress
+) -> tuple[FittedModel, list[RefitRecord]]:
+    """Return the model with the richer forms that have evidence, and what became of each that was fitted."""
+    records: list[RefitRecord] = []
+    for i, term in enumerate(fitted.fit.hypothesis.terms):
+        for richer in _richer_terms(data, term):
+            say(f"trying {term[0].name} with {len(richer[2])} parameters")
+            price = (len(richer[2]) - len(term[2])) * float(np.log(n_effective)) + data.thresholds.evidence
+            record = RefitRecord(term[0].name, term[1])
+            try:
+                made = _fitted_with(data, fitted, i, richer, noise, price)
+            except FemsenseError as error:
+                records.append(replace(record, verdict=no_equilibrium(error)))
+                continue
+            gain = evidence(fitted.fit, made.fit)
+            worse = made.held_rms > fitted.held_rms
+            better = gain > price and not worse
+            verdict = (
+                "named with a value for each"
+                if better
+                else "the values of each are not distinguished"
+                if gain <= price
+                else "values of each predict the held-out data worse"
+            )
+            score = gain - price + data.thresholds.evidence
+            records.append(replace(record, verdict=verdict, dchi2=gain, dbic=score, validation_rms_m=made.held_rms))
+            fitted = made if better else fitted
+    return fitted, records
+
+
+def _richer_terms(data: Data, term: Term) -> Iterator[Term]:
+    """Yield the forms of a term that have a value for each part where it has one for all, or for some of them."""
+    effect, seed, own = term
+    parts = {p.part for p in own}
+    for form in FORMS:
+        if form.name != effect.name or form.places_markers:
+            continue
+        every = form.parameters(data.robot, data.control)
+        named = all(isinstance(p.part, str) for p in every)
+        if (
+            len(every) > len(own)
+            and named
+            and {p.key for p in every} == {p.key for p in own}
+            and parts <= {None, *(p.part for p in every)}
+        ):
+            yield form, seed, every
+
+
+def _fitted_with(data: Data, fitted: FittedModel, i: int, richer: Term, noise: Noise, price: float) -> FittedModel:
+    """Return the model with another form of its i-th term, started from the values that it has; a part without one starts from
+    their mean. Raises DataError."""
+    fit, terms = fitted.fit, fitted.fit.hypothesis.terms
+    first = sum(len(parameters) for _, _, parameters in terms[:i])
+    last = first + len(terms[i][2])
+    found = {p.part: float(v) for p, v in zip(terms[i][2], fit.coordinates[first:last])}
+    usual = found.get(None, float(np.mean(list(found.values()))))
+    own = [found.get(p.part, usual) for p in richer[2]]
+    prior = fit.prior
+    return fit_model(
+        data,
+        replace(fit.hypothesis, terms=(*terms[:i], richer, *terms[i + 1 :])),
+        Prior(
+            np.concatenate([prior.mean[:first], [p.null for p in richer[2]], prior.mean[last:]]),
+            np.concatenate([prior.std[:first], [p.known for p in richer[2]], prior.std[last:]]),
+        ),
+        noise,
+        np.concatenate([fit.coordinates[:first], own, fit.coordinates[last:]]),
+        own=own_of(fitted),
+        max_iterations=10,
+        worth=within(fit, price),
+    )
