@@ -401,7 +401,9 @@ def test_any_recording_round_trips(tmp_path_factory: pytest.TempPathFactory, dat
 @st.composite
 def recordings(draw: st.DrawFn) -> Recording:
     F = draw(st.integers(1, 5))
-    names = draw(st.lists(st.text("abcÄ-_ 1", min_size=1, max_size=4).map(lambda s: f"m{s}".strip()), unique=True, max_size=3))
+    names = draw(
+        st.lists(st.text("abcÄ-_ 1", min_size=1, max_size=4).map(lambda s: " ".join(f"m{s}".split())), unique=True, max_size=3)
+    )
     seen = [(f, m) for f in range(F) for m in range(len(names)) if draw(st.booleans())]
     used = list(dict.fromkeys(m for _, m in seen))
     cables = draw(st.integers(0, 2))
