@@ -14,7 +14,7 @@ from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.judge import OK, trusted
+from femsense.sensing.judge import OK
 from femsense.sensing.pipeline import sense_frame
 from femsense.sensing.prepare import prepare
 from femsense.sensing.types import ContactForce, FrameReport, SensedFrame
@@ -84,7 +84,7 @@ class Senser:
             return Answer(self._without_result(recording, k, error), (), self._positions)
         contacts = tuple(self._tracked(contact) for contact in frame.contacts)
         self._positions = frame.state.positions
-        self._previous = replace(frame, contacts=contacts) if trusted(frame) else _without_contacts(frame)
+        self._previous = replace(frame, contacts=contacts) if frame.trusted else _without_contacts(frame)
         return Answer(frame.report, contacts, self._positions)
 
     def _tracked(self, contact: ContactForce) -> ContactForce:

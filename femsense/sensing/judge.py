@@ -14,7 +14,7 @@ from femsense.sensing.measurement_rows import rows_at, seen_through
 from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess
 from femsense.sensing.places import away_from_scenery
 from femsense.sensing.responses import response_at
-from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
+from femsense.sensing.types import Fit, Sensor, Touch
 
 OK = "ok"
 SURE = 16.3
@@ -224,9 +224,9 @@ def limit_of(sensor: Sensor, fit: Fit) -> float:
     return sensor.knowledge.misfit_limit if fit.rows.of_clouds else FAR_OFF
 
 
-def trusted(frame: SensedFrame) -> bool:
+def trusted(status: str) -> bool:
     """Return whether a frame may be the start of the next one: also where the force of one object beside sure ones is not known."""
-    return frame.report.status == OK or frame.report.status.startswith((UNKNOWN, "contact, size not determined"))
+    return status == OK or status.startswith(UNKNOWN)
 
 
 def _std_along(fit: Fit, i: int) -> float:

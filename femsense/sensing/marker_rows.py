@@ -5,21 +5,14 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from femsense.calib.calibration import Calibration
-from femsense.calib.checks import true_labels
-from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.rows import Rows
 from femsense.model.camera_frame import in_robot_frame
+from femsense.sensing.measurement_rows import as_labelled, marker_std, pose_columns
 from femsense.sensing.types import Sensor
-
-LEAST_STD, UNKNOWN_STD = 2e-5, 5e-4
-"""Noise of a marker at least, and where the calibration had none [m]."""
 
 
 def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Rows:
@@ -40,14 +33,14 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
         raise DataError("no marker is seen in this frame")
     view = recording.marker_view[rows]
     measured = in_robot_frame(recording.marker_xyz[rows], view, calibration.poses, robot.observation)
-    marker = _with_true_labels(sensor, k, state, measured, marker, view)
+    marker = as_labelled(sensor, k, state, measured, marker, view)
     tie, rest = robot.markers[marker], robot.marker_points[marker]
     way = np.linalg.norm(measured - rest, axis=1)
     noise = sensor.options.marker_std_m or marker_std(calibration)
     std = np.hypot(noise, np.hypot(sensor.options.marker_model_std * way, sensor.correction_std[rows]))
     # A placement that rest.csv measured moves with the pose: only the motion since then turns.
     placed = np.array([robot.marker_names[m] in calibration.placements_m for m in marker])
-    turned = _pose_derivative(measured, sensor.pivot) - placed[:, None, None] * _pose_derivative(rest, sensor.pivot)
+    turned = pose_columns(measured, sensor.pivot) - placed[:, None, None] * pose_columns(rest, sensor.pivot)
     by_pose = np.zeros((len(rows), 3, len(calibration.poses), 6))
     by_pose[np.arange(len(rows)), :, view] = turned
     r = 3 * len(rows)
@@ -65,34 +58,3 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
         rest=np.repeat(rest, 3, axis=0),
         pixel=np.zeros(r, dtype=np.bool_),
     )
-
-
-def marker_std(calibration: Calibration) -> float:
-    """Return the noise of a marker along each axis [m]: the residual of the calibration."""
-    return max(calibration.rms_m / np.sqrt(3.0), LEAST_STD) if np.isfinite(calibration.rms_m) else UNKNOWN_STD
-
-
-def _with_true_labels(
-    sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray
-) -> IntArray:
-    """Return which markers were seen, shape (r,), with swapped labels corrected and a warning about them."""
-    places, best = sensor.robot.markers.positions(state.positions), marker.copy()
-    for v in np.unique(view):
-        mine = view == v
-        best[mine] = true_labels(places, measured[mine], marker[mine], noise=marker_std(sensor.calibration))
-    if (best != marker).any():
-        names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
-        number = int(sensor.recording.frame_numbers[k])
-        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are swapped, corrected", stacklevel=4)
-    return best
-
-
-def _pose_derivative(points: FloatArray, pivot: FloatArray) -> FloatArray:
-    """Return how points move with (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
-    arm = points - pivot
-    J = np.zeros((len(points), 3, 6))
-    J[:, 0, 1], J[:, 0, 2] = arm[:, 2], -arm[:, 1]
-    J[:, 1, 0], J[:, 1, 2] = -arm[:, 2], arm[:, 0]
-    J[:, 2, 0], J[:, 2, 1] = arm[:, 1], -arm[:, 0]
-    J[:, :, 3:] = np.eye(3)
-    return J

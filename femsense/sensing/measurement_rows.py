@@ -112,19 +112,19 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
         raise DataError("no marker is seen in this frame")
     view = recording.marker_view[rows]
     measured = in_robot_frame(recording.marker_xyz[rows], view, sensor.calibration.poses, robot.observation)
-    marker = _as_seen(sensor, k, state, measured, marker, view)
+    marker = as_labelled(sensor, k, state, measured, marker, view)
     tie = robot.markers[marker]
     residual = measured - tie.positions(state.positions)
     way = np.linalg.norm(
         measured - robot.marker_points[marker], axis=1
     )  # of the marker, so that a state that runs away gains nothing
-    noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
+    noise = sensor.options.marker_std_m or marker_std(sensor.calibration)
     beyond = np.hypot(sensor.options.marker_model_std * way, sensor.correction_std[rows])
     std = np.repeat(np.hypot(noise, beyond), 3)
     placed = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
     # a placement that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
-    turned = _pose_columns(measured, sensor.pivot)
-    turned = turned - placed[:, None, None] * _pose_columns(robot.marker_points[marker], sensor.pivot)
+    turned = pose_columns(measured, sensor.pivot)
+    turned = turned - placed[:, None, None] * pose_columns(robot.marker_points[marker], sensor.pivot)
     by_pose = np.zeros((len(rows), 3, len(sensor.calibration.poses), 6))
     by_pose[np.arange(len(rows)), :, view] = turned
 
@@ -143,12 +143,12 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     )
 
 
-def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
+def as_labelled(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
     """Return which markers were seen, shape (r,): as named, or put right where labels are swapped, with a warning."""
     places, best = sensor.robot.markers.positions(state.positions), marker.copy()
     for v in np.unique(view):
         mine = view == v
-        best[mine] = true_labels(places, measured[mine], marker[mine], noise=_marker_std(sensor.calibration))
+        best[mine] = true_labels(places, measured[mine], marker[mine], noise=marker_std(sensor.calibration))
     if (best != marker).any():
         names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
         number = int(sensor.recording.frame_numbers[k])
@@ -156,12 +156,12 @@ def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, m
     return best
 
 
-def _marker_std(calibration: Calibration) -> float:
+def marker_std(calibration: Calibration) -> float:
     """Return the noise of a marker along each axis [m]: what the calibration left, or half a millimetre where it had none."""
     return max(calibration.rms_m / np.sqrt(3.0), 2e-5) if np.isfinite(calibration.rms_m) else 5e-4
 
 
-def _pose_columns(points: FloatArray, pivot: FloatArray) -> FloatArray:
+def pose_columns(points: FloatArray, pivot: FloatArray) -> FloatArray:
     """Return how points move with (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
     arm = points - pivot
     J = np.zeros((len(points), 3, 6))

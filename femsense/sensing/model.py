@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -233,8 +233,3 @@ class Limits:
     misfit: float
     nuisance: float
     behind: float
-
-
-def with_state(start: Equilibrium, positions: FloatArray) -> Equilibrium:
-    """Return a state as a start at other node positions."""
-    return replace(start, positions=positions)

@@ -185,7 +185,9 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         clock.stages,
     )
     sure = sure_forces(fit)
-    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts, sure, fit.response, free.response)
+    return SensedFrame(
+        fit.touches, fit.state, fit.forces, alone, report, contacts, sure, fit.response, free.response, trusted=trusted(status)
+    )
 
 
 class _Clock:
@@ -214,7 +216,7 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
         done.contacts.extend(_named(done, frame.contacts))
         done.states.append(frame.state.positions)
         named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
-        done.last = replace(frame, contacts=named) if frame.trusted and trusted(frame) else _under_inputs(frame)
+        done.last = replace(frame, contacts=named) if frame.trusted else _under_inputs(frame)
     except (FemsenseError, np.linalg.LinAlgError) as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)

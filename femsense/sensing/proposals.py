@@ -215,7 +215,7 @@ def linearised_evidence(
     N, residual = best.N[thin], z[thin] * part.std
     if best.contacts:
         axes = axes_at(model, best.contacts, best.state)
-        J = contact_columns(model, replace_rows(best, part), axes, best.linearised)
+        J = contact_columns(model, replace(best, rows=part), axes, best.linearised)
         kept = np.ones(J.shape[1], dtype=bool)
         if without is not None:
             own = slice(5 * without, 5 * without + 3)
@@ -255,10 +255,6 @@ def linearised_evidence(
         better = np.where(f[:, 0] < 0.0, own, -np.inf) > gain
         gain[better], force[better] = own[better], f[better]
     return gain, np.einsum("ci,cij->cj", force, R)
-
-
-def replace_rows(best: Fit, rows: object) -> Fit:
-    return replace(best, rows=rows)  # type: ignore[arg-type]
 
 
 def _free_ways(contact: Touch, force: FloatArray) -> FloatArray:

@@ -7,16 +7,13 @@ from enum import Enum
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.fem.mesh import TetMesh
 from femsense.sensing.contact_free import check_values
+from femsense.sensing.judge import SQUEEZED, least_stretch
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_rigid
 
-SQUEEZED = 0.6
-"""Least principal stretch of the elements under a contact at which law and mesh hold [1]."""
 MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
 """Markers disagree with the cloud where they are off by more than so many times the residual of the calibration, and this share of the diagonal."""
 MARKERS_MISFIT = 9.0
@@ -48,8 +45,6 @@ class Status(Enum):
     CAMERA_MAY_HAVE_MOVED = (
         "{who} or the robot's base may have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°: that fits the frame as well"
     )
-    PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
-    FAILED = "{what}"
 
 
 TRUSTED = (Status.OK, Status.UNDETERMINED)
@@ -123,22 +118,6 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
     if rms > max(MARKERS_OFF * model.sensor.calibration.rms_m, MARKERS_FAR * model.sensor.size):
         return verdict(Status.MARKER_MISMATCH, off_mm=1e3 * rms)
     return None
-
-
-def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:
-    """Return the least principal stretch of the elements that have one of some nodes [1]; negative where one is inside out, 1 without nodes.
-
-    Arguments:
-        mesh: at rest.
-        positions: of its nodes [m], shape (n, 3).
-        carrying: nodes that carry contacts, shape (k,).
-    """
-    tets = mesh.tets[np.isin(mesh.tets, carrying).any(axis=1), :4]
-    if not len(tets):
-        return 1.0
-    rest, now = (np.swapaxes(x[tets[:, 1:]] - x[tets[:, :1]], 1, 2) for x in (mesh.nodes, positions))
-    gradient = now @ np.linalg.inv(rest)
-    return float((np.linalg.svd(gradient, compute_uv=False)[:, 2] * np.sign(np.linalg.det(gradient))).min())
 
 
 def _std_along(best: Fit, i: int) -> float:
