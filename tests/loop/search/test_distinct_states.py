@@ -68,7 +68,7 @@ def test_a_hidden_gain_is_found_with_few_equilibria() -> None:
     loop, work, _ = improved(0.8)
     assert [e.name for e in loop.effects] == ["cable_gain"]
     assert loop.after.validation_rms_m < 1.1 * np.sqrt(3) * 1e-4
-    assert work.equilibria < 50 * FRAMES  # friction is fitted to the end beside it
+    assert work.equilibria < 60 * FRAMES  # friction, and a gain of each cable, are fitted to the end beside it
 
 
 def test_linear_elements_suffice_only_where_they_leave_plainly_less() -> None:
