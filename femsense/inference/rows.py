@@ -7,7 +7,7 @@ coordinate along d_j, so that a displacement u of the nodes changes it by −d_j
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,44 @@ class Rows:
         return Rows(*(getattr(self, name)[index] for name in Rows.__slots__))
 
 
+    def averaged(self, weight: FloatArray) -> Averaged:
+        """Return the rows with the pixels of each triangle averaged under weights (r,), for what hardly changes over a triangle."""
+        others = np.flatnonzero(~self.pixel)
+        label = np.full(len(self), -1, dtype=np.int64)
+        size = int(self.nodes.max(initial=0)) + 1
+        own = self.nodes[self.pixel][:, :3].astype(np.int64)
+        key = (own[:, 0] * size + own[:, 1]) * size + own[:, 2]
+        label[self.pixel] = np.unique(key, return_inverse=True)[1]
+        label[others] = int(label.max(initial=-1)) + 1 + np.arange(len(others))
+        count = int(label.max(initial=-1)) + 1
+        first = np.zeros(count, dtype=np.int64)
+        first[label[::-1]] = np.arange(len(self))[::-1]
+        total = np.bincount(label, weight, minlength=count)
+        share = weight / np.maximum(total, 1e-300)[label]
+        mean = Averaged(self.some(first), total, label, share)
+        means = {name: mean.of_rows(getattr(self, name)) for name in ("weights", "direction")}
+        return replace(mean, rows=replace(mean.rows, **means))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Averaged:
+    """Rows of which some are means of others."""
+
+    rows: Rows
+    weight: FloatArray
+    """Sum of the weights of each, shape (a,)."""
+    label: IntArray
+    """To which of them each row belongs, shape (r,)."""
+    share: FloatArray
+    """Share of each row in its mean, shape (r,)."""
+
+    def of_rows(self, values: FloatArray) -> FloatArray:
+        """Return the means of values (r, k) of the rows, shape (a, k)."""
+        result = np.zeros((len(self.weight), values.shape[1]))
+        _add_up(self.label, self.share, np.ascontiguousarray(values), result)
+        return result
+
+
 def stacked(blocks: Sequence[Rows]) -> Rows:
     """Return the rows of several blocks, points with fewer nodes padded with weight 0."""
     if len(blocks) == 1:
@@ -75,6 +113,13 @@ def stacked(blocks: Sequence[Rows]) -> Rows:
         parts = [getattr(block, name) for block in blocks]
         columns.append(np.concatenate([padded(part) for part in parts] if name in ("nodes", "weights") else parts))
     return Rows(*columns)
+
+
+@njit(cache=True)
+def _add_up(label, share, values, result):  # type: ignore[no-untyped-def]
+    for j in range(len(label)):
+        for k in range(values.shape[1]):
+            result[label[j], k] += share[j] * values[j, k]
 
 
 @njit(cache=True, fastmath=True)

@@ -183,6 +183,15 @@ def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArra
     return shape if shape.kind != "points" else _raw(points, std)
 
 
+def same_object(first: Shape, second: Shape) -> bool:
+    """Return whether two shapes are of one object: their points lie in the same place."""
+    if first.points is second.points:
+        return True
+    apart = float(np.linalg.norm(first.points.mean(axis=0) - second.points.mean(axis=0)))
+    extent = min(float(np.linalg.norm(np.ptp(one.points, axis=0))) for one in (first, second))
+    return apart < 0.5 * extent
+
+
 def is_edge(gap: FloatArray, edge: FloatArray | float) -> bool:
     """Return whether points that lie so far from a body's surface [m], shape (k,), are what a camera shows of its edge, up to `edge` off [m]."""
     return bool((np.abs(gap) > edge).mean() < OUTLIERS)

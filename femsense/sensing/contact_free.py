@@ -23,7 +23,7 @@ from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Limits, Model
 from femsense.sensing.odds import INFERRED
 from femsense.sensing.prepare import pose_covariance, scan_of
-from femsense.sensing.proposals import inferred
+from femsense.sensing.proposals import inferred_gain
 from femsense.sensing.types import Sensor
 
 MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
@@ -160,7 +160,7 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
         alone = fit(others, one.frame, (), np.zeros((0, 3)), one.frame.predicted)
         assert alone is not None
         if len(frames) >= SEVERAL:
-            gains.append(max(inferred(others, alone)[0], 0.0))
+            gains.append(max(inferred_gain(others, alone), 0.0))
         checks.append(check_values(others, alone))
     odds = max(INFERRED, max(gains) + 3.0 * float(np.std(gains))) if gains else INFERRED
     noises = tuple(

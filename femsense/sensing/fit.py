@@ -173,14 +173,14 @@ def _latent_columns(model: Model, frame: Frame, rows: Rows, state: Equilibrium, 
 def axes_at(model: Model, contacts: Sequence[Touch], state: Equilibrium) -> FloatArray:
     """Return axes of the force of each contact: outward normal and two tangents, or upward and two horizontals where a weight hangs; shape (m, 3, 3)."""
     normals = [model.upward if c.pulls else touch_normal(model.sensor, c, state) for c in contacts]
-    return np.array([axes_of(normal) for normal in normals]).reshape(-1, 3, 3)
+    return axes_of(np.array(normals).reshape(-1, 3))
 
 
-def axes_of(normal: FloatArray) -> FloatArray:
-    """Return rows: a unit normal and two tangents, shape (3, 3)."""
-    across = np.cross(normal, [1.0, 0.0, 0.0] if abs(normal[0]) < 0.8 else [0.0, 1.0, 0.0])
-    across /= np.linalg.norm(across)
-    return np.stack([normal, across, np.cross(normal, across)])
+def axes_of(normals: FloatArray) -> FloatArray:
+    """Return rows for each unit normal (m, 3): the normal and two tangents, shape (m, 3, 3)."""
+    across = np.cross(normals, np.eye(3)[np.where(np.abs(normals[:, 0]) < 0.8, 0, 1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([normals, across, np.cross(normals, across)], axis=1)
 
 
 def force_scale(tau: float, across: float = ACROSS) -> FloatArray:

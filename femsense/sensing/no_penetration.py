@@ -20,7 +20,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.inference.pixels import rows_on
 from femsense.inference.rows import Rows
-from femsense.pointcloud.primitives import Shape
+from femsense.pointcloud.primitives import Shape, same_object
 from femsense.sensing.model import Frame, Model
 from femsense.sensing.places import NEAR
 from femsense.sensing.types import Touch
@@ -55,7 +55,8 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
             if at is not None:
                 rows.append(_row(model, frame, shape, *at, positions, odds=_density(model, contact)[1]))
     for own in frame.objects:
-        if _is_known(model, own) and not any(is_with(contact, own) for contact in contacts):
+        stands = any(same_object(own, one) for one in model.sensor.overlapping)
+        if _is_known(model, own) and not stands and not any(is_with(contact, own) for contact in contacts):
             shape = own.towards(positions[model.sensor.surface.nodes])
             at = _closest(model, shape, positions, None)
             if at is not None and at[2] < 0.0 and shape.behind_m == 0.0:
@@ -64,15 +65,8 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
 
 
 def is_with(contact: Touch, shape: Shape | None) -> bool:
-    """Return whether a contact is with an object, whichever of its sides touches: the pixels of the two lie in the same place."""
-    if contact.shape is None or shape is None:
-        return False
-    if contact.shape.points is shape.points:
-        return True
-    first, second = contact.shape.points, shape.points
-    apart = float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)))
-    extent = min(float(np.linalg.norm(np.ptp(points, axis=0))) for points in (first, second))
-    return apart < 0.5 * extent
+    """Return whether a contact is with an object, whichever of its sides touches."""
+    return contact.shape is not None and shape is not None and same_object(contact.shape, shape)
 
 
 def is_rigid(model: Model, contact: Touch) -> bool:

@@ -143,8 +143,7 @@ def first_sensor(
         Answers(),
         correction_std,
     )
-    sensor = replace(sensor, scenery=_scenery(sensor))
-    return sensor
+    return _with_scenery(sensor)
 
 
 def prepare(
@@ -287,8 +286,8 @@ def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
         return []
 
 
-def _scenery(sensor: Sensor) -> FloatArray:
-    """Return where something seems to touch in the first free frame with a cloud, on the body at rest [m], shape (s, 3)."""
+def _with_scenery(sensor: Sensor) -> Sensor:
+    """Return the sensor with what seems to touch or overlap the body in the first free frame with a cloud."""
     for k, state in free_path(sensor.driven, free_clouds(sensor.recording)[:1]):
         try:
             scan = scan_of(sensor, k, state)
@@ -298,8 +297,11 @@ def _scenery(sensor: Sensor) -> FloatArray:
             shapes = [] if scan is None else objects_near(sensor, scan, state)
         except FemsenseError:
             continue
-        return np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
-    return np.zeros((0, 3))
+        corners = state.positions[sensor.surface.nodes]
+        inside = [one for one in shapes if one.kind != "points" and one.towards(corners).distance(corners).min() < 0.0]
+        touching = np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
+        return replace(sensor, scenery=touching, overlapping=tuple(inside))
+    return sensor
 
 
 def _taught(knowledge: Knowledge, frames: Collection[FreeFrame]) -> Knowledge:

@@ -406,4 +406,6 @@ class Sensor:
     """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""
     scenery: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""
+    overlapping: tuple[Shape, ...] = ()
+    """Completed objects that overlap the body in a free frame: a floor that is said to pass through it."""
     background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it
