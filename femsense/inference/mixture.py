@@ -69,7 +69,7 @@ class Width:
 
 
 def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) -> Width:
-    """Return κ at the start of a fit: nine in ten pixels lie within 1.65 κ, and every other row.
+    """Return κ at the start of a fit: nine in ten pixels lie within 1.65 κ, and nine in ten of the other rows, or all where they are few.
 
     Arguments:
         z: whitened residuals, shape (r,).
@@ -79,5 +79,6 @@ def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) ->
     kappa = np.abs(z) / 1.65
     common = float(np.quantile(kappa[pixel], 0.9)) if pixel.any() else 1.0
     common = common if coloured else min(common, most)
-    others = float(kappa[~pixel].max(initial=1.0)) if pixel.any() else 1.0
+    rest = kappa[~pixel]
+    others = float(np.quantile(rest, 0.9, method="higher")) if pixel.any() and len(rest) else 1.0
     return Width(*(value if value > 1.5 else 1.0 for value in (common, others)))

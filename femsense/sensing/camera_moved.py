@@ -6,6 +6,7 @@ stands around the robot is part of both hypotheses: its pixels keep their place 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,13 +19,15 @@ from femsense.inference.mixture import misfit
 from femsense.inference.nuisance import root_of
 from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Model
-from femsense.sensing.pose_rows import background_rows, far, pose_gain
+from femsense.sensing.pose_rows import background_rows, cost_of_moving, far, pose_gain
 from femsense.sensing.status import Status, Verdict, verdict
 
 MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
 EQUAL = 16.3
 """Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
+CLEAR = 2.0
+"""A moved camera whose J is higher to first order by more than so many times EQUAL is not fitted."""
 STEPS, FIRST, STILL = 8, 1, 1e-3
 """Steps of the pose at most, steps before a search may be given up, and the share of FAR below which a step is the last."""
 
@@ -47,9 +50,9 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
     """
     if best.frame.pixels is None or len(model.sensor.places):
         return found
-    inferred = any(contact.source == "shape" for contact in best.contacts)
+    inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
     failed = found.status in (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP)
-    if not (inferred or failed) and pose_gain(model, best) < MOVED:
+    if not failed and _stands(model, best, inferred):
         return found
     try:
         stood = _stood(model, best)
@@ -64,6 +67,13 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
         return found
     shown = _misfit_of_background(model, best) - _misfit_of_background(_at(model, moved.step), best) > EQUAL
     return verdict(Status.CAMERA_MOVED if shown else Status.CAMERA_MAY_HAVE_MOVED, **numbers)
+
+
+def _stands(model: Model, best: Fit, inferred: Sequence[int]) -> bool:
+    """Return whether a camera that stands still explains a frame far better than one that has moved, to first order."""
+    if not inferred:
+        return pose_gain(model, best) < MOVED
+    return cost_of_moving(model, best, inferred) + MOVED - float(best.odds[inferred].sum()) > CLEAR * EQUAL
 
 
 def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | None:

@@ -38,7 +38,8 @@ CATCH = 3.0
 """κ at the start at most where colour does not separate the robot."""
 SIZINGS, SETTLED = 8, 0.02
 """Updates of τ in one linear problem at most, and the relative change below which one is the last."""
-STEPS, HALVINGS = 14, (1.0, 0.5, 0.2, 0.05)
+STEPS, LENGTHS = 14, (1.0, 0.3)
+"""Gauss–Newton steps at most, and lengths of a step that are tried. Shorter ones find nothing: pixels at the silhouette make Φ jump by a few units."""
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less."""
 LATENT = 0.2
@@ -115,7 +116,7 @@ def fit(
         phi += _prior(model, replace(here, tau=tau)) - _prior(model, here)
         here = replace(here, tau=tau)
         there = None
-        for length in HALVINGS:
+        for length in LENGTHS:
             there = _moved(model, frame, here, linear, length * step)
             if there is None:
                 continue

@@ -23,7 +23,7 @@ from femsense.sensing.types import Sensor, Touch
 
 ROBOT = 0.99
 """π of a pixel that has the robot's colour; 0.5 where colour does not separate it."""
-EXACT, ROUGH = 1e-9, 1e-6
+EXACT, ROUGH = 1e-9, 1e-5
 """Unbalanced force relative to all loads: of a result, and of a state on the way."""
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.inference.rows import Rows
+from femsense.inference.mixture import misfit
+from femsense.inference.nuisance import fit_nuisance
+from femsense.inference.rows import Rows, stacked
 from femsense.sensing.background import look, off_background
 from femsense.sensing.fit import contact_columns, whitened
 from femsense.sensing.model import Fit, Model
@@ -64,6 +68,36 @@ def pose_gain(model: Model, best: Fit) -> float:
         weight = background.share / np.maximum(1.0, np.abs(background.residual) / HUBER)
         gain += _lowered(B, B * weight[:, None], background.residual)
     return gain
+
+
+def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
+    """Return by how much −2 log evidence rises where poses are free to move and some contacts of a fit are removed, to first order in all parameters.
+
+    Pixels are reweighted: what a moved camera does not explain may pass for something else.
+    """
+    J = contact_columns(model, best, best.axes, best.linearised)
+    scale, at = whitened(model, best, trust=False)
+    kept = np.ones(len(scale), dtype=bool)
+    residual = best.left(model.nuisance) * best.rows.std + best.N @ best.eta
+    for i in removed:
+        kept[5 * i : 5 * i + 5] = False
+        own = slice(5 * i, 5 * i + 3)
+        residual = residual + J[:, own] @ (at[own] * scale[own])
+    J, at = J[:, kept] * scale[kept], at[kept]
+    P = best.C[:, : 6 * model.views] * far(model)
+    rows, A = best.rows, np.hstack([best.N, J, P])
+    start = np.concatenate([best.eta, at, np.zeros(P.shape[1])])
+    background = background_rows(model, best.frame.index)
+    before = best.evidence
+    if background is not None:
+        B = np.hstack([np.zeros((len(background), best.N.shape[1] + J.shape[1])), background.by_pose * far(model)])
+        before += misfit(background.residual / background.std, background.log_other, background.share)[0]
+        rows, A = stacked([rows, background]), np.vstack([A, B])
+        residual = np.append(residual + J @ at, background.residual)
+    else:
+        residual = residual + J @ at
+    _, phi, weight = fit_nuisance(rows, residual, A, start)
+    return phi + float(np.linalg.slogdet(np.eye(A.shape[1]) + (A * weight[:, None]).T @ A)[1]) - before
 
 
 def _lowered(A: FloatArray, WA: FloatArray, residual: FloatArray) -> float:
