@@ -11,11 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.calib.scan import OFF, Scan
+from femsense.calib.scan import OFF, Scan, pixel_of
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.model.camera import CameraNoise
 from femsense.pointcloud.rays import Surface, SurfaceHits
 
+STEEPEST = 4.0
+"""Surfaces are averaged whose depth changes by less than so many times the way along the image: 76° of incidence."""
 WHOLE = 6
 """A face with more points than this is parted in three, each around one of its corners."""
 
@@ -69,3 +71,38 @@ def _typical(distance: FloatArray, std: FloatArray, group: IntArray) -> IntArray
     number = np.diff(np.append(start, len(order)))
     middle = 0.5 * (distance[order[start + (number - 1) // 2]] + distance[order[start + number // 2]])
     return np.sort(order[np.abs(distance[order] - np.repeat(middle, number)) < OFF * std[order]])
+
+
+def in_blocks(scan: Scan, noises: Sequence[CameraNoise], most: int) -> Scan:
+    """Return the scan with neighbouring pixels of the robot averaged, about so many at most, where their depth is continuous.
+
+    Pixels are grouped in square blocks of the image of each camera. The mean of points of a plane is a point of the plane.
+
+    Arguments:
+        noises: of the cameras.
+        most: points with fewer stay as they are.
+    """
+    if len(scan.view) <= most:
+        return scan
+    rays = scan.camera_points[:, :2] / scan.camera_points[:, 2:]
+    pixel = np.array([pixel_of(scan, view) for view in range(len(noises))])[scan.view]
+    side = np.ceil(np.sqrt(len(scan.view) / most)) * np.maximum(pixel, 1e-9)
+    cell = np.floor(rays / side[:, None]).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = (scan.view * (int(cell[:, 0].max()) + 1) + cell[:, 0]) * (int(cell[:, 1].max()) + 1) + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    start = np.flatnonzero(np.diff(key[order], prepend=-1))
+    number = np.diff(np.append(start, len(order)))
+    z = scan.camera_points[order, 2]
+    deep = np.maximum.reduceat(z, start) - np.minimum.reduceat(z, start)
+    allowed = 6.0 * scan.ray_std(noises)[order][start] + STEEPEST * (side * scan.camera_points[:, 2])[order][start]
+    one = deep <= allowed
+    members = np.repeat(one, number)
+    middle = np.add.reduceat(scan.camera_points[order], start, axis=0)[one] / number[one, None]
+    alone = order[~members]
+    return replace(
+        scan,
+        camera_points=freeze(np.vstack([middle, scan.camera_points[alone]])),
+        view=freeze(np.concatenate([scan.view[order[start[one]]], scan.view[alone]]), np.int64),
+        count=freeze(np.concatenate([number[one].astype(np.float64), np.ones(len(alone))])),
+    )

@@ -29,6 +29,8 @@ AROUND = 9
 DIM = 0.5
 """Points so much darker than the robot's mostly are have no sure hue: they are of it where more than half of those around them are. Of a dark
 gray plate on a soft dome, every fortieth point had the dome's hue; they held its surface up, and the force came out a quarter too small."""
+SOME = 300
+"""Rays that tell the angle between neighbours."""
 MARGIN = 0.25
 """Points farther from the body than this share of its diagonal are left out."""
 
@@ -207,6 +209,19 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
         others=scan.camera_points[~mine],
         others_view=scan.view[~mine],
     )
+
+
+def pixel_of(scan: Scan, view: int) -> float:
+    """Return the angle between neighbouring rays of a camera [rad], from the robot's points; 0 where there are too few.
+
+    A cloud that was thinned has a larger one, and a wider halo in metres.
+    """
+    seen = scan.camera_points[scan.view == view]
+    if len(seen) < AROUND:
+        return 0.0
+    rays = seen[:, :2] / seen[:, 2:]
+    some = rays[:: max(1, len(rays) // SOME)]
+    return float(np.median(np.asarray(cKDTree(rays).query(some, k=2)[0])[:, 1]))
 
 
 def _of_robot(robot: Robot, cloud: PointCloud) -> BoolArray:

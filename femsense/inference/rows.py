@@ -60,7 +60,6 @@ class Rows:
         """Return some of the rows, index (s,)."""
         return Rows(*(getattr(self, name)[index] for name in Rows.__slots__))
 
-
     def averaged(self, weight: FloatArray) -> Averaged:
         """Return the rows with the pixels of each triangle averaged under weights (r,), for what hardly changes over a triangle."""
         others = np.flatnonzero(~self.pixel)

@@ -68,12 +68,20 @@ class Shape:
     """Of a known one, where it stands."""
     edge_m: float = 0.0
     """Where its points lie within this of a body's surface, a camera may have seen that body's edge [m]."""
+    covariance: FloatArray | None = field(default=None, repr=False)
+    """Of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
 
     def towards(self, body: FloatArray) -> Shape:
-        """Return the shape with the side that faces a body; places of its surface [m], shape (k, 3). Only a plate has two sides.
+        """Return the shape with the side that faces a body, and how well that side is known; places of the body's surface [m], shape (k, 3).
 
-        A camera sees the back of a plate that is pressed on a body from the camera's side. It is no thicker than it is wide.
+        A camera sees the back of a plate that is pressed on a body from the camera's side. It is no thicker than it is wide. The hidden side of a ball
+        is known as well as the sum of its centre and its radius, which the points of the side that is seen determine together.
         """
+        if self.covariance is not None:
+            away = body[np.argmin(self.distance(body))] - self.center
+            away = away - (away @ self.axes[0]) * self.axes[0] if self.kind == "cylinder" else away
+            by = np.append(away / max(float(np.linalg.norm(away)), 1e-12), 1.0)
+            return replace(self, std_m=min(float(np.sqrt(by @ self.covariance @ by)), ROUGH_STD))
         if self.kind != "plate":
             return self
         local = (body - self.center) @ self.axes.T
@@ -229,7 +237,9 @@ def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m:
 
 def _as_well_as_it_fits(cost: float, shape: Shape) -> Shape:
     """Return a shape whose surface is known as well as its own points scatter, `cost` times the variance of the noise that is stated."""
-    return replace(shape, std_m=min(float(np.sqrt(max(cost, LEAST_SCATTER))) * shape.std_m, ROUGH_STD))
+    scatter = max(cost, LEAST_SCATTER)
+    covariance = None if shape.covariance is None else scatter * shape.covariance
+    return replace(shape, std_m=min(float(np.sqrt(scatter)) * shape.std_m, ROUGH_STD), covariance=covariance)
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -261,7 +271,10 @@ def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float 
     seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - x[:3], ray) < 0))
     if size > LARGEST or seen_from_outside < 0.7:
         return np.inf, None
-    return typical_square(residual), Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points)
+    by = np.eye(4)[:, :k] * np.append(np.ones(3), size)[:k]
+    covariance = by @ np.linalg.pinv(curve) @ by.T
+    shape = Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points, covariance=covariance)
+    return typical_square(residual), shape
 
 
 def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
@@ -285,7 +298,11 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     low, high = np.quantile((points - center) @ axis, [0.01, 0.99])
     axes = np.vstack([axis, np.linalg.svd(axis[None])[2][1:]])
     half = np.array([0.5 * (high - low), size, size])
-    shape = Shape("cylinder", center + 0.5 * (low + high) * axis, axes, half, size, _spread(curve, 2), points)
+    by = np.zeros((4, 5))
+    by[:3, :2], by[3, 2] = frame[1:].T, size
+    covariance = by @ np.linalg.pinv(curve) @ by.T
+    middle = center + 0.5 * (low + high) * axis
+    shape = Shape("cylinder", middle, axes, half, size, _spread(curve, 2), points, covariance=covariance)
     return typical_square(residual), shape
 
 

@@ -20,9 +20,9 @@ from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
 from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
-from femsense.sensing.model import Fit, Frame, Limits, Model
+from femsense.sensing.model import Fit, Frame, Limits, Model, pixels_of
 from femsense.sensing.odds import INFERRED
-from femsense.sensing.prepare import pose_covariance, scan_of
+from femsense.sensing.prepare import pose_covariance
 from femsense.sensing.proposals import inferred_gain
 from femsense.sensing.types import Sensor
 
@@ -77,7 +77,7 @@ def _contact_free(model: Model) -> list[ContactFree]:
     result = []
     for k, state in free_path(model.sensor.driven, free_clouds(model.sensor.recording)):
         try:
-            scan = scan_of(model.sensor, k, state)
+            scan = pixels_of(model, k, state)
         except FemsenseError:
             continue
         if scan is None or len(scan.view) < 30:

@@ -19,10 +19,9 @@ from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.fit import TOLERANCE, fit
-from femsense.sensing.model import Fit, Frame, Model
+from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
-from femsense.sensing.prepare import scan_of
 from femsense.sensing.proposals import SAME, proposals
 from femsense.sensing.reported import contacts_of
 from femsense.sensing.run_arrays import sensed
@@ -192,7 +191,7 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
         raise DataError("no equilibrium under the inputs")
     clock.lap("equilibrium")
     expected = _expected(predicted, previous)
-    scan = scan_of(model.sensor, k, expected)
+    scan = pixels_of(model, k, expected)
     clock.lap("read")
     if scan is None:
         return Frame(k, None, None, predicted, tensions)

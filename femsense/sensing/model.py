@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from femsense.calib.condensed_scan import in_blocks
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal
@@ -18,11 +19,14 @@ from femsense.model.camera import CameraNoise
 from femsense.model.frame_state import solve_frame
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.marker_rows import marker_rows
+from femsense.sensing.prepare import scan_of
 from femsense.sensing.touches import nodal_forces
 from femsense.sensing.types import Sensor, Touch
 
 ROBOT = 0.99
 """π of a pixel that has the robot's colour; 0.5 where colour does not separate it."""
+PIXELS = 6000
+"""Neighbouring pixels of the robot are averaged beyond about so many a frame."""
 EXACT, ROUGH = 1e-9, 1e-5
 """Unbalanced force relative to all loads: of a result, and of a state on the way."""
 
@@ -80,7 +84,7 @@ class Model:
         """Return the pixels of a scan with their noise."""
         poses = self.sensor.calibration.poses
         share = np.full(len(scan.view), ROBOT if scan.segmented else 0.5)
-        std = self.scale * scan.ray_std(self.noises)
+        std = self.scale * scan.ray_std(self.noises) / np.sqrt(scan.measured)
         return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, share, 1.0 / self.overdispersion, scan.segmented)
 
     def rows(self, frame: Frame, state: Equilibrium) -> Rows:
@@ -130,6 +134,12 @@ class Model:
         if len(held):
             moves[1 + held] = (pulls[held] * np.diag(tangent.held_compliance))[:, None, None] * tangent.respond_to_held()
         return Linearised(state.positions, tangent, moves)
+
+
+def pixels_of(model: Model, k: int, state: Equilibrium) -> Scan | None:
+    """Return what the cameras see in frame k near a state, about PIXELS of the robot; None where the recording has no clouds. Raises FemsenseError."""
+    scan = scan_of(model.sensor, k, state)
+    return None if scan is None else in_blocks(scan, model.noises, PIXELS)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -8,9 +8,8 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
-from femsense.calib.scan import Scan
+from femsense.calib.scan import Scan, pixel_of
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
@@ -37,8 +36,6 @@ AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
 WINDOWED = 2.0
 """A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
-SOME = 300
-"""Rays that tell the angle between neighbours."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
 FLOOR_STD = 0.0007
@@ -101,25 +98,14 @@ def _edge_of(
     A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely.
     """
     cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
-    pixel = np.array([_pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
+    pixel = np.array([pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
     depth = np.linalg.norm(points - origins, axis=1)
     edge = np.asarray(BLEEDING * pixel[view] * depth)
     matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (sensor.knowledge.together > WINDOWED)
-    beside = body.beside_rays(points, origins)
-    return edge, np.asarray(matched & ((gap < edge) | ((beside > 0.0) & (beside < edge))))
-
-
-def _pixel_of(scan: Scan, view: int) -> float:
-    """Return the angle between neighbouring rays of a camera [rad], from the robot's points; 0 where there are too few.
-
-    A cloud that was thinned has a larger one, and a wider halo in metres.
-    """
-    seen = scan.camera_points[scan.view == view]
-    if len(seen) < FEWEST:
-        return 0.0
-    rays = seen[:, :2] / seen[:, 2:]
-    some = rays[:: max(1, len(rays) // SOME)]
-    return float(np.median(np.asarray(cKDTree(rays).query(some, k=2)[0])[:, 1]))
+    halo, off = matched & (gap < edge), np.flatnonzero(matched & (gap >= edge))
+    beside = body.beside_rays(points[off], origins[off])
+    halo[off] = (beside > 0.0) & (beside < edge[off])
+    return edge, np.asarray(halo)
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
