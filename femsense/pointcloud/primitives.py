@@ -71,6 +71,11 @@ class Shape:
     covariance: FloatArray | None = field(default=None, repr=False)
     """Of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
 
+    @property
+    def radius_std(self) -> float:
+        """Standard deviation of a radius that was fitted [m]; inf where none was."""
+        return np.inf if self.covariance is None else float(np.sqrt(self.covariance[3, 3]))
+
     def towards(self, body: FloatArray) -> Shape:
         """Return the shape with the side that faces a body, and how well that side is known; places of the body's surface [m], shape (k, 3).
 
@@ -212,6 +217,7 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
     if len(points) < FEWEST:
         return _raw(points, std)
     thin = slice(None, None, max(1, len(points) // MOST_POINTS))
+    share = len(points[thin]) / len(points)
     points, std, ray = points[thin], std[thin], ray[thin]
     tried = [_sphere(points, std, ray, None), _plate(points, std, ray), _cylinder(points, std, ray)]
     good = [(cost, shape) for cost, shape in tried if shape is not None and cost < FITS]
@@ -220,7 +226,7 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
     least = min(cost for cost, _ in good)
     order = ("plate", "sphere", "cylinder")
     fitting = [(cost, shape) for cost, shape in good if cost <= SIMPLER * least + 0.02]
-    return _as_well_as_it_fits(*min(fitting, key=lambda fit: order.index(fit[1].kind)))
+    return _as_well_as_it_fits(*min(fitting, key=lambda fit: order.index(fit[1].kind)), share)
 
 
 def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m: float) -> tuple[float, Shape | None]:
@@ -232,13 +238,16 @@ def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m:
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     thin = slice(None, None, max(1, len(points) // MOST_POINTS))
     cost, shape = _sphere(points[thin], std[thin], ray[thin], radius_m)
-    return cost, _as_well_as_it_fits(cost, shape) if shape is not None and cost < FITS else None
+    return cost, _as_well_as_it_fits(cost, shape, len(points[thin]) / len(points)) if shape is not None and cost < FITS else None
 
 
-def _as_well_as_it_fits(cost: float, shape: Shape) -> Shape:
-    """Return a shape whose surface is known as well as its own points scatter, `cost` times the variance of the noise that is stated."""
+def _as_well_as_it_fits(cost: float, shape: Shape, share: float) -> Shape:
+    """Return a shape whose surface is known as well as its own points scatter, `cost` times the variance of the noise that is stated.
+
+    share: of its points that were fitted.
+    """
     scatter = max(cost, LEAST_SCATTER)
-    covariance = None if shape.covariance is None else scatter * shape.covariance
+    covariance = None if shape.covariance is None else share * scatter * shape.covariance
     return replace(shape, std_m=min(float(np.sqrt(scatter)) * shape.std_m, ROUGH_STD), covariance=covariance)
 
 

@@ -71,7 +71,15 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     )
     state = replace(best.state, factor=None)
     return SensedFrame(
-        best.contacts, state, best.forces, best.frame.predicted, report, contacts, tau=best.tau, trusted=status.trusted
+        best.contacts,
+        state,
+        best.forces,
+        best.frame.predicted,
+        report,
+        contacts,
+        tau=best.tau,
+        trusted=status.trusted,
+        objects=best.frame.objects,
     )
 
 
@@ -135,7 +143,7 @@ def _with_objects(model: Model, best: Fit) -> Fit:
     pixels = best.rows.pixel
     other = ~inliers(best)[pixels] & (best.rows.residual[pixels] > 0.0)
     scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
-    seen = replace(frame, objects=tuple(objects_near(model.sensor, scan, best.state)))
+    seen = replace(frame, objects=tuple(objects_near(model.sensor, scan, best.state, frame.seen_before)))
     again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
     return best if again is None else again
 
@@ -200,10 +208,11 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
             f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
         )
     objects: list[Shape] = []
+    seen = () if previous is None else previous.objects
     if not len(model.sensor.places) and not said_free(model.sensor, k):
-        objects = objects_near(model.sensor, scan, expected)
+        objects = objects_near(model.sensor, scan, expected, seen)
     clock.lap("objects")
-    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects))
+    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects), seen_before=seen)
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:

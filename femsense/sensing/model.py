@@ -179,6 +179,8 @@ class Frame:
     """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
     objects: tuple[Shape, ...] = ()
     """Rigid objects seen or declared near the body, completed."""
+    seen_before: tuple[Shape, ...] = ()
+    """Objects of the frame before."""
     latent: tuple[Touch, ...] = ()
     """Objects in touch that are no contact of the best hypothesis: each may carry a small force along its normal, which left out would bias those of its
     neighbours and make their intervals too narrow. Empty while hypotheses are compared."""

@@ -38,6 +38,8 @@ WINDOWED = 2.0
 """A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
+AGAIN = 2.0
+"""A ball is the one of the frame before where its points are nearer than so many radii to where that one's centre was."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -57,8 +59,11 @@ def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) 
     return [] if scan is None or len(sensor.places) or said_free(sensor, k) else objects_near(sensor, scan, state)
 
 
-def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
-    """Return what a scan shows near the body in a state, completed."""
+def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[Shape] = ()) -> list[Shape]:
+    """Return what a scan shows near the body in a state, completed.
+
+    seen: objects of the frame before; a ball keeps its radius where that frame showed it better.
+    """
     poses = sensor.calibration.poses
     points = scan.surroundings(poses)
     if len(points) < 3:
@@ -84,7 +89,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
         origins,
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
-        fit=partial(fit_tool, tools) if tools else fit_shape,
+        fit=partial(fit_tool, tools) if tools else partial(fit_again, seen),
         edge=edge + 3.0 * std,
         halo=halo,
     )
@@ -106,6 +111,23 @@ def _edge_of(
     beside = body.beside_rays(points[off], origins[off])
     halo[off] = (beside > 0.0) & (beside < edge[off])
     return edge, np.asarray(halo)
+
+
+def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
+    """Return the shape of points, a ball with the radius that it had in the frame before where that is known better. Arguments as for `fit_tool`."""
+    shape = fit_shape(points, std, origins)
+    balls = [one for one in seen if one.kind == "sphere" and one.radius_std < shape.radius_std]
+    near = min(balls, key=lambda one: float(np.linalg.norm(one.center - points.mean(axis=0))), default=None)
+    if near is None or shape.kind == "plate" or np.linalg.norm(near.center - points.mean(axis=0)) > AGAIN * near.radius:
+        return shape
+    ball = fit_ball(points, std, origins, near.radius)[1]
+    if ball is None or ball.covariance is None:
+        return shape
+    look = (points - origins).mean(axis=0)
+    by_radius = np.append(
+        look / np.linalg.norm(look), 1.0
+    )  # what is seen stays where it is: a larger ball has its centre farther away
+    return replace(ball, covariance=ball.covariance + near.radius_std**2 * np.outer(by_radius, by_radius))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

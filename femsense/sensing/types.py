@@ -261,6 +261,8 @@ class SensedFrame:
     """Prior scale of each force [N], shape (m,); of the objective alone."""
     trusted: bool = True
     """Whether the next frame may start from this one."""
+    objects: tuple[Shape, ...] = ()
+    """What was seen near the body: a ball keeps its radius."""
 
 
 @dataclass(eq=False, slots=True)
