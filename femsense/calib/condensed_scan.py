@@ -1,8 +1,4 @@
-"""Points of one face as few: neighbours that say the same are averaged, and nothing that the rows could tell is lost.
-
-Within a face of the surface the rows of a scan are linear in the place that a ray meets (displacements, pose), or vary by little (errors that
-neighbours share). The mean of some points of one face is therefore worth as much as the points themselves.
-"""
+"""Dense clouds as fewer points: neighbouring pixels of one surface are averaged."""
 
 from __future__ import annotations
 
@@ -11,66 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.calib.scan import OFF, Scan, pixel_of
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.calib.scan import Scan, pixel_of
+from femsense.core.arrays import freeze
 from femsense.model.camera import CameraNoise
-from femsense.pointcloud.rays import Surface, SurfaceHits
 
 STEEPEST = 4.0
 """Surfaces are averaged whose depth changes by less than so many times the way along the image: 76° of incidence."""
-WHOLE = 6
-"""A face with more points than this is parted in three, each around one of its corners."""
-
-
-def condensed(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
-    """Return the scan with the robot's points averaged that lie on one part of one face; points that stand out stay alone.
-
-    Arguments:
-        scan: what was seen, the robot's points apart.
-        surface: the surface of a state near by.
-        poses, noises: of the cameras.
-        reach: see `Surface.cast` [m].
-    """
-    points = scan.points(poses)
-    hits = surface.cast(points, scan.origins(poses), reach=reach)
-    if not len(hits.index):
-        return scan
-    std = scan.ray_std(noises)[hits.index] * np.maximum(hits.cosine, 1e-3)
-    group = _parts(hits, scan.view[hits.index], len(surface.positions))
-    alone = np.ones(len(points), dtype=bool)
-    alone[hits.index[_typical(hits.distance, std, group)]] = False
-    own = np.flatnonzero(~alone[hits.index])
-    order = own[np.argsort(group[own], kind="stable")]
-    start = np.flatnonzero(np.diff(group[order], prepend=-1))
-    number = np.diff(np.append(start, len(order))).astype(np.float64)
-    members, rest = hits.index[order], np.flatnonzero(alone)
-    mean = np.add.reduceat(hits.distance[order], start) / number
-    inner = np.add.reduceat((hits.distance[order] - np.repeat(mean, number.astype(np.int64))) ** 2, start) / number
-    middle = np.add.reduceat(scan.camera_points[members], start, axis=0) / number[:, None]
-    return replace(
-        scan,
-        camera_points=freeze(np.vstack([middle, scan.camera_points[rest]])),
-        view=freeze(np.concatenate([scan.view[members[start]], scan.view[rest]]), np.int64),
-        count=freeze(np.concatenate([number, np.ones(len(rest))])),
-        scatter=freeze(np.concatenate([inner, np.zeros(len(rest))])),
-    )
-
-
-def _parts(hits: SurfaceHits, view: IntArray, nodes: int) -> IntArray:
-    """Return the part of a face that each hit lies on, of one camera: the whole face, or what is nearest to one of its corners."""
-    face = (view * nodes + hits.nodes[:, 0]) * nodes + hits.nodes[:, 1]
-    _, index, number = np.unique(face, return_inverse=True, return_counts=True)
-    index = index.ravel()
-    return np.asarray(3 * index + np.where(number[index] > WHOLE, np.argmax(hits.weights, axis=1), 0))
-
-
-def _typical(distance: FloatArray, std: FloatArray, group: IntArray) -> IntArray:
-    """Return which hits lie where most of their group do: flying pixels are not averaged."""
-    order = np.lexsort((distance, group))
-    start = np.flatnonzero(np.diff(group[order], prepend=-1))
-    number = np.diff(np.append(start, len(order)))
-    middle = 0.5 * (distance[order[start + (number - 1) // 2]] + distance[order[start + number // 2]])
-    return np.sort(order[np.abs(distance[order] - np.repeat(middle, number)) < OFF * std[order]])
 
 
 def in_blocks(scan: Scan, noises: Sequence[CameraNoise], most: int) -> Scan:

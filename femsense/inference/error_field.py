@@ -43,6 +43,12 @@ class ErrorField:
         return result
 
 
+def facing_of(corners: FloatArray) -> FloatArray:
+    """Return the unit normals of triangles (t, 3, 3), shape (t, 3)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
 def spread_field(places: FloatArray, facing: FloatArray, size: float) -> ErrorField:
     """Return a field whose centres are spread over a surface.
 

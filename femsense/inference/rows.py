@@ -72,11 +72,11 @@ class Rows:
         count = int(label.max(initial=-1)) + 1
         first = np.zeros(count, dtype=np.int64)
         first[label[::-1]] = np.arange(len(self))[::-1]
-        total = np.bincount(label, weight, minlength=count)
+        total = np.bincount(label, weight, minlength=count).astype(np.float64)
         share = weight / np.maximum(total, 1e-300)[label]
         mean = Averaged(self.some(first), total, label, share)
-        means = {name: mean.of_rows(getattr(self, name)) for name in ("weights", "direction")}
-        return replace(mean, rows=replace(mean.rows, **means))
+        rows = replace(mean.rows, weights=mean.of_rows(self.weights), direction=mean.of_rows(self.direction))
+        return replace(mean, rows=rows)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

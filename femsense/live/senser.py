@@ -13,10 +13,11 @@ from femsense.core.parallel import one_blas_thread
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.judge import OK
-from femsense.sensing.pipeline import sense_frame
-from femsense.sensing.prepare import prepare
+from femsense.sensing.contact_free import learn
+from femsense.sensing.estimate_frame import sense
+from femsense.sensing.pipeline import under_inputs
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.status import Status
 from femsense.sensing.types import ContactForce, FrameReport, SensedFrame
 
 NAN = float("nan")
@@ -35,7 +36,7 @@ class Answer:
     @property
     def is_ok(self) -> bool:
         """Whether nothing is wrong with it."""
-        return self.report.status == OK
+        return self.report.status == Status.OK.value
 
     @property
     def is_contact_free(self) -> bool:
@@ -53,7 +54,7 @@ class Senser:
     def __init__(self, robot: Robot, recording: Recording, calibration: Calibration) -> None:
         """Learn from the contact-free frames of a recording. Raises as `estimate`."""
         with one_blas_thread():
-            self._sensor = with_gains_of_free_frames(prepare(robot, recording, calibration))
+            self._model = learn(make_sensor(robot, recording, calibration))
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
         unknown = recording.actuation_zero == "unknown"
         self._initial = np.array([table[name] for name in robot.body.cable_names]) if unknown else None
@@ -71,20 +72,21 @@ class Senser:
         Returns:
             the answer; a frame without a result has a status that says why.
         """
-        robot = self._sensor.robot
+        robot = self._model.sensor.robot
         driven = DrivenRobot(robot, drive_of(robot, recording, initial=self._initial))
         uncorrected = np.zeros(len(recording.marker_frame))
-        self._sensor = replace(self._sensor, recording=recording, driven=driven, correction_std=uncorrected)
+        sensor = replace(self._model.sensor, recording=recording, driven=driven, correction_std=uncorrected)
+        self._model = replace(self._model, sensor=sensor)
         try:
             with one_blas_thread():
-                frame = sense_frame(self._sensor, k, self._previous)
+                frame = sense(self._model, k, self._previous)
         except (FemsenseError, np.linalg.LinAlgError) as error:
             if self._previous is not None:
                 self._positions = self._previous.free_state.positions
             return Answer(self._without_result(recording, k, error), (), self._positions)
         contacts = tuple(self._tracked(contact) for contact in frame.contacts)
         self._positions = frame.state.positions
-        self._previous = replace(frame, contacts=contacts) if frame.trusted else _without_contacts(frame)
+        self._previous = replace(frame, contacts=contacts) if frame.trusted else under_inputs(frame)
         return Answer(frame.report, contacts, self._positions)
 
     def _tracked(self, contact: ContactForce) -> ContactForce:
@@ -95,16 +97,9 @@ class Senser:
         return replace(contact, track=self._tracks - 1)
 
     def _without_result(self, recording: Recording, k: int, error: Exception) -> FrameReport:
-        body = self._sensor.robot.body
+        body = self._model.sensor.robot.body
         what = f"its equations have no solution: {error}" if isinstance(error, np.linalg.LinAlgError) else str(error)
         number, time_s = int(recording.frame_numbers[k]), float(recording.time_s[k])
         status = " ".join(what.split())
         tensions, pressures = dict.fromkeys(body.cable_names, NAN), dict.fromkeys(body.chamber_names, NAN)
         return FrameReport(number, time_s, status, 0, 0, NAN, NAN, NAN, tensions, pressures)
-
-
-def _without_contacts(frame: SensedFrame) -> SensedFrame:
-    """Return a frame under its inputs alone: the next one starts from it where its forces are not reliable."""
-    return replace(
-        frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), sure=(), response=frame.free_response
-    )

@@ -13,7 +13,6 @@ from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.model.camera_frame import undo_depth
 from femsense.pointcloud.local_planes import LocalPlanes, local_planes
 from femsense.pointcloud.rays import GRAZING
-from femsense.sensing.measurement_rows import depth_std
 from femsense.sensing.types import Sensor
 
 MANY, SOME = 8000, 600
@@ -83,7 +82,7 @@ def off_background(
     ray = points - np.array([T[:3, 3] for T in poses])[glance.view]
     depth = np.linalg.norm(ray, axis=1)
     slant = np.abs(np.einsum("gc,gc->g", ray, normal)) / depth
-    std = np.hypot(depth_std(sensor, depth, glance.view) * slant, background.rough[nearest])
+    std = np.hypot(sensor.knowledge.depth_std(depth, glance.view) * slant, background.rough[nearest])
     std[slant < GRAZING] = np.inf
     by_pose = np.zeros((len(points), len(poses), 6))
     by_pose[np.arange(len(points)), glance.view] = np.hstack([np.cross(points - sensor.pivot, normal), normal])

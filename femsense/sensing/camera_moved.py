@@ -72,8 +72,9 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
 def _stands(model: Model, best: Fit, inferred: Sequence[int]) -> bool:
     """Return whether a camera that stands still explains a frame far better than one that has moved, to first order."""
     if not inferred:
-        return pose_gain(model, best) < MOVED
-    return cost_of_moving(model, best, inferred) + MOVED - float(best.odds[inferred].sum()) > CLEAR * EQUAL
+        return bool(pose_gain(model, best) < MOVED)
+    odds = MOVED - float(best.odds[inferred].sum())
+    return bool(cost_of_moving(model, best, inferred) + odds > CLEAR * EQUAL)
 
 
 def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | None:

@@ -13,7 +13,7 @@ from femsense.calib.from_clouds import free_clouds
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
-from femsense.inference.error_field import spread_field
+from femsense.inference.error_field import facing_of
 from femsense.inference.nuisance import first_nuisance, fit_nuisance, gram_of, learnt, without_poses
 from femsense.inference.pixels import Skin
 from femsense.inference.rows import Rows
@@ -59,16 +59,12 @@ def learn(sensor: Sensor) -> Model:
 
 def _first_model(sensor: Sensor) -> Model:
     nodes, triangles = sensor.robot.body.mesh.nodes, sensor.surface.triangles
-    corners = nodes[triangles]
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
-    field = spread_field(corners.mean(axis=1), facing, sensor.size)
-    skin = Skin(triangles, nodes, freeze(facing), field, sensor.pivot, sensor.size)
+    skin = Skin(triangles, nodes, freeze(facing_of(nodes[triangles])), sensor.error_field, sensor.pivot, sensor.size)
     pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
     drives = len(sensor.robot.body.cables) + len(sensor.robot.body.chambers) if pulls else 0
     modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
     covariance = block_diag(pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives))
-    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(field))
+    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(sensor.error_field))
     return Model(sensor, skin, nuisance, sensor.knowledge.noises)
 
 

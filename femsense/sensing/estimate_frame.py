@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.rows import Rows
@@ -23,9 +23,10 @@ from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.proposals import SAME, proposals
-from femsense.sensing.reported import contacts_of
 from femsense.sensing.run_arrays import sensed
+from femsense.sensing.states import free_state
 from femsense.sensing.status import checked
+from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
@@ -55,7 +56,8 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     began = time.perf_counter()
     status = camera_verdict(model, best, checked(model, best))
     stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
-    contacts = contacts_of(model, best, previous)
+    covariances = [covariance_of(model, best, i) for i in range(len(best.contacts))]
+    contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, best.place_covariance, best.state, previous)
     report = FrameReport(
         int(sensor.recording.frame_numbers[k]),
         float(sensor.recording.time_s[k]),
@@ -105,6 +107,13 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     before = rms_of(model.rows(frame, frame.predicted), inliers(best))
     clock.lap("state")
     return Estimate(best, before, clock.stages)
+
+
+def covariance_of(model: Model, best: Fit, i: int) -> FloatArray:
+    """Return the covariance of the force of contact i [N²], shape (3, 3): of the fit, and of the model's compliance."""
+    force = best.forces[i]
+    own = best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+    return np.asarray(own + model.compliance_std**2 * np.outer(force, force))
 
 
 def inliers(best: Fit) -> BoolArray:
@@ -194,9 +203,7 @@ def _fits(model: Model, best: Fit) -> Iterator[Fit]:
 def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock) -> Frame:
     """Return the frame with its predicted state, its pixels, and the objects near the body."""
     tensions = previous.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
-    predicted = model.predict(k, None if previous is None else previous.free_state, tensions)
-    if predicted is None:
-        raise DataError("no equilibrium under the inputs")
+    predicted = free_state(model.sensor, k, None if previous is None else previous.free_state, tensions)
     clock.lap("equilibrium")
     expected = _expected(predicted, previous)
     scan = pixels_of(model, k, expected)
@@ -281,6 +288,11 @@ class Clock:
     def __init__(self) -> None:
         self.began = self.last = time.perf_counter()
         self.stages: dict[str, float] = {}
+
+    @property
+    def total_ms(self) -> float:
+        """Time since it began [ms]."""
+        return 1e3 * (time.perf_counter() - self.began)
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()

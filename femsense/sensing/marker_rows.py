@@ -5,13 +5,17 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
+from femsense.calib.calibration import Calibration
+from femsense.calib.checks import true_labels
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.rows import Rows
 from femsense.model.camera_frame import in_robot_frame
-from femsense.sensing.measurement_rows import as_labelled, marker_std, pose_columns
 from femsense.sensing.types import Sensor
 
 
@@ -58,3 +62,32 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
         rest=np.repeat(rest, 3, axis=0),
         pixel=np.zeros(r, dtype=np.bool_),
     )
+
+
+def as_labelled(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
+    """Return which markers were seen, shape (r,): as named, or put right where labels are swapped, with a warning."""
+    places, best = sensor.robot.markers.positions(state.positions), marker.copy()
+    for v in np.unique(view):
+        mine = view == v
+        best[mine] = true_labels(places, measured[mine], marker[mine], noise=marker_std(sensor.calibration))
+    if (best != marker).any():
+        names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
+        number = int(sensor.recording.frame_numbers[k])
+        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are swapped, put right", stacklevel=4)
+    return best
+
+
+def marker_std(calibration: Calibration) -> float:
+    """Return the noise of a marker along each axis [m]: what the calibration left, or half a millimetre where it had none."""
+    return max(calibration.rms_m / np.sqrt(3.0), 2e-5) if np.isfinite(calibration.rms_m) else 5e-4
+
+
+def pose_columns(points: FloatArray, pivot: FloatArray) -> FloatArray:
+    """Return how points move with (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
+    arm = points - pivot
+    J = np.zeros((len(points), 3, 6))
+    J[:, 0, 1], J[:, 0, 2] = arm[:, 2], -arm[:, 1]
+    J[:, 1, 0], J[:, 1, 2] = -arm[:, 2], arm[:, 0]
+    J[:, 2, 0], J[:, 2, 1] = arm[:, 1], -arm[:, 0]
+    J[:, :, 3:] = np.eye(3)
+    return J

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,24 +12,23 @@ from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
-from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.nuisance import Nuisance
 from femsense.inference.pixels import Pixels, Skin, pixel_rows
 from femsense.inference.rows import Rows, stacked
 from femsense.model.camera import CameraNoise
-from femsense.model.frame_state import solve_frame
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.prepare import scan_of
-from femsense.sensing.touches import nodal_forces
+from femsense.sensing.states import loaded_state
 from femsense.sensing.types import Sensor, Touch
 
 ROBOT = 0.99
 """π of a pixel that has the robot's colour; 0.5 where colour does not separate it."""
+STALE = 0.03
+"""Answers at the candidates serve while no node has moved farther than this share of the diagonal: they rank, and do not estimate."""
 PIXELS = 6000
 """Neighbouring pixels of the robot are averaged beyond about so many a frame."""
-EXACT, ROUGH = 1e-9, 1e-5
-"""Unbalanced force relative to all loads: of a result, and of a state on the way."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,26 +98,23 @@ class Model:
         return stacked([rows, *more])
 
     def solve(
-        self, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium | None, *, exact: bool = False
+        self, frame: Frame, contacts: Sequence[Touch], forces: FloatArray, start: Equilibrium, *, exact: bool = False
     ) -> Equilibrium | None:
         """Return the equilibrium under the inputs and contact forces (m, 3) [N]; None where there is none near the start."""
-        loads = None
-        if len(contacts) and start is not None:
-            loads = nodal_forces(contacts, forces, len(start.positions))
-        options = SolveOptions(
-            before=frame.previous_tensions,
-            reuse_factor=start is not None,
-            relative_tolerance=EXACT if exact else ROUGH,
-            rough=not exact,
-        )
-        state = solve_frame(self.sensor.driven, frame.index, start=start, nodal_forces=loads, options=options)
-        return state if state.converged else None
+        return loaded_state(self.sensor, frame.index, contacts, forces, start, frame.previous_tensions, exact=exact)
 
-    def predict(self, k: int, start: Equilibrium | None, tensions: tuple[FloatArray, ...] | None) -> Equilibrium | None:
-        """Return the equilibrium of frame k under its inputs without contact forces; None where there is none."""
-        options = SolveOptions(before=tensions, reuse_factor=start is not None, relative_tolerance=EXACT)
-        state = solve_frame(self.sensor.driven, k, start=start, options=options)
-        return state if state.converged else None
+    def answers_near(self, state: Equilibrium) -> FloatArray:
+        """Return the displacements by unit forces along x, y, z at each candidate [m/N], shape (n, 3, 3c), at this state or one near by."""
+        kept, nodes = self.candidates, self.sensor.candidates
+        if kept.state is None or np.abs(kept.state.positions - state.positions).max() > STALE * self.sensor.size:
+            kept.state, kept.answers = replace(state, factor=None), None
+        if kept.answers is None:
+            n = len(kept.state.positions)
+            loads = np.zeros((len(nodes), 3, n, 3))
+            loads[np.arange(len(nodes)), :, nodes] = np.eye(3)
+            moves = tangent_at(self.sensor.robot.body, kept.state).respond(loads.reshape(-1, n, 3))
+            kept.answers = np.ascontiguousarray(np.moveaxis(moves, 0, 2))
+        return kept.answers
 
     def linearised(self, state: Equilibrium) -> Linearised:
         """Return how the body answers to small forces, softness and pulls near a state."""
@@ -157,9 +154,9 @@ class Linearised:
 class Candidates:
     """Answers of the body to unit forces at the candidate nodes near one state, kept while the body stays near it."""
 
-    positions: FloatArray | None = None
+    state: Equilibrium | None = None
     answers: FloatArray | None = None
-    """[m/N], shape (n, 3, 3c)."""
+    """[m/N], shape (n, 3, 3c); None: not computed yet for the state."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,15 +1,11 @@
-"""Contacts and forces of a recording, frame by frame.
-
-scan ─ rays on the surface under the inputs ─► rows ─► what objects touch, what the shape betrays ─► places
-places ─► equilibrium ─ rays ─ compliance ─ QP, until the forces stop changing ─► judged ─► contacts with their tracks
-"""
+"""Contacts and forces of a recording, frame by frame: each starts from the one before where that is trusted."""
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,28 +21,14 @@ from femsense.model.drive import has_history
 from femsense.model.linear_elements import warn_of_linear_elements
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.sensing import estimate_frame
+from femsense.sensing.baseline.published_method import sense_as_published
 from femsense.sensing.contact_free import learn
-from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.judge import (
-    OK,
-    behind_body,
-    beside_markers,
-    objects_known,
-    seen_elsewhere,
-    status_of,
-    sure_forces,
-    trusted,
-)
-from femsense.sensing.moved_camera import camera_status
-from femsense.sensing.paper import sense_as_published
-from femsense.sensing.places import away_from_scenery, near_places, object_touches, seen_objects
-from femsense.sensing.prepare import first_sensor, prepare, scan_of
-from femsense.sensing.run_arrays import sensed
-from femsense.sensing.search import explain
-from femsense.sensing.separation import segmented
-from femsense.sensing.states import foretold, free_state
-from femsense.sensing.tracks import contacts_of, smoothed
+from femsense.sensing.estimate_frame import Clock, sense
+from femsense.sensing.model import Candidates
+from femsense.sensing.places import near_places
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.states import free_state
+from femsense.sensing.tracks import smoothed
 from femsense.sensing.types import (
     ContactForce,
     Done,
@@ -100,14 +82,15 @@ def estimate(
             stacklevel=2,
         )
     warn_of_linear_elements(robot.body, where=robot.name)
-    sense, sensor = _senser(robot, recording, calibration, at, options or SensingOptions())
-    count = len(recording.time_s)
+    method = _method(robot, recording, calibration, at, options or SensingOptions())
+    sensor, count = method.sensor, len(recording.time_s)
     with Checkpoint(keep) as checkpoint:
         done = checkpoint.kept(Done) or Done()
-        sensor.answers.state = done.answered_at
+        if done.reports:
+            method.candidates.state, method.candidates.answers = done.answered_at, None
         for k in range(len(done.reports), count):
-            _sense_into(done, sense, sensor, k)
-            done.answered_at = sensor.answers.state
+            _sense_into(done, method, k)
+            done.answered_at = method.candidates.state
             if progress is not None:
                 progress(k + 1, count)
             checkpoint.keep(done, every=keep_every_s)
@@ -125,107 +108,47 @@ def estimate(
     )
 
 
-def _senser(
+@dataclass(frozen=True, eq=False, slots=True)
+class _Method:
+    """How frames are sensed, and what stays the same over them."""
+
+    sensor: Sensor
+    sense: Callable[[int, SensedFrame | None], SensedFrame]
+    """(index of a frame, the frame before) → the frame. Raises FemsenseError."""
+    candidates: Candidates = field(default_factory=Candidates)
+
+
+def _method(
     robot: Robot, recording: Recording, calibration: Calibration, at: npt.ArrayLike | None, options: SensingOptions
-) -> tuple[Callable[[Sensor, int, SensedFrame | None], SensedFrame], Sensor]:
-    """Return what estimates one frame by the method that is asked for, and what stays the same over the frames."""
-    if options.method == "evidence":
-        model = learn(first_sensor(robot, recording, calibration, at=at, options=options))
-        return lambda _, k, previous: estimate_frame.sense(model, k, previous), model.sensor
-    prepared = prepare(robot, recording, calibration, at=at, options=options)
+) -> _Method:
+    sensor = make_sensor(robot, recording, calibration, at=at, options=options)
     if options.method == "paper":
-        return sense_as_published, prepared.sensor
-    return sense_frame, prepared.sensor if len(prepared.sensor.places) else with_gains_of_free_frames(prepared)
+        return _Method(sensor, partial(sense_as_published, sensor))
+    model = learn(sensor)
+    return _Method(model.sensor, partial(sense, model), model.candidates)
 
 
-def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedFrame:
-    """Return contacts and forces of frame k, starting from the frame before.
-
-    Raises:
-        FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
-    """
-    clock = _Clock()
-    before = previous.state.segment_tensions if previous is not None and has_history(sensor.robot) else None
-    alone = free_state(sensor, k, None if previous is None else previous.free_state, before)
-    clock.lap("equilibrium")
-    near = foretold(previous, alone)
-    whole = scan_of(sensor, k, near)
-    clock.lap("scan")
-    scan, free = segmented(sensor, k, whole, alone, previous, before)
-    clock.lap("rows")
-    shapes = seen_objects(sensor, k, scan, near)
-    clock.lap("places")
-    scan, fit, free = explain(sensor, k, whole, scan, shapes, free, previous, before)
-    clock.lap("forces")
-    contacts = contacts_of(sensor, k, fit, alone, previous)
-    number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
-    status = status_of(sensor, fit, free)
-    if scan is not None and not len(sensor.places):
-        status = camera_status(sensor, k, scan, fit, free, before, status)
-    if status == OK and scan is not None and not scan.segmented:
-        status = behind_body(sensor, scan, fit)
-    if status == OK and fit.rows.of_clouds:
-        status = beside_markers(sensor, k, fit)
-    if status == OK and not len(sensor.places):
-        all_seen = fit.touches and all(touch.source == "cloud" for touch in fit.touches)
-        seen = [] if all_seen else object_touches(sensor, [s for s in shapes if s.kind != "points"], fit.state)
-        touching = away_from_scenery(sensor, fit.touches or seen)
-        status = objects_known(fit, touching, seen_elsewhere(sensor, fit, seen))
-    report = FrameReport(
-        number,
-        stamp,
-        status,
-        len(sensed(contacts)),
-        fit.rows.count,
-        free.rows.rms,
-        fit.rows.rms,
-        clock.total(),
-        dict(fit.state.tension),
-        dict(fit.state.pressure),
-        clock.stages,
-    )
-    sure = sure_forces(fit)
-    return SensedFrame(
-        fit.touches, fit.state, fit.forces, alone, report, contacts, sure, fit.response, free.response, trusted=trusted(status)
-    )
-
-
-class _Clock:
-    """How long each stage takes."""
-
-    def __init__(self) -> None:
-        self.began = self.last = time.perf_counter()
-        self.stages: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.stages[name], self.last = 1e3 * (now - self.last), now
-
-    def total(self) -> float:
-        return 1e3 * (time.perf_counter() - self.began)
-
-
-def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k: int) -> None:
+def _sense_into(done: Done, method: _Method, k: int) -> None:
     """Add a frame to those that are done; a wrong state is not handed on as the start of the next one."""
+    sensor = method.sensor
     try:
         if not _is_measured(sensor, k):
             _predict_into(done, sensor, k)
             return
-        frame = sense(sensor, k, done.last)
+        frame = method.sense(k, done.last)
         done.reports.append(frame.report)
         done.contacts.extend(_named(done, frame.contacts))
         done.states.append(frame.state.positions)
         named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
-        done.last = replace(frame, contacts=named) if frame.trusted else _under_inputs(frame)
+        done.last = replace(frame, contacts=named) if frame.trusted else under_inputs(frame)
     except (FemsenseError, np.linalg.LinAlgError) as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)
 
 
-def _under_inputs(frame: SensedFrame) -> SensedFrame:
-    """Return a frame as the inputs alone have it: what the next one starts from where its forces are not trusted (friction remembers it)."""
-    forces, response = np.zeros((0, 3)), frame.free_response
-    return replace(frame, touches=(), state=frame.free_state, forces=forces, contacts=(), sure=(), response=response)
+def under_inputs(frame: SensedFrame) -> SensedFrame:
+    """Return a frame under its inputs alone: what the next one starts from where its forces are not trusted (friction remembers it)."""
+    return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), tau=np.zeros(0))
 
 
 PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
@@ -240,12 +163,12 @@ def _is_measured(sensor: Sensor, k: int) -> bool:
 
 def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
     """Add frame k as the model has it where nothing was measured."""
-    clock, last = _Clock(), done.last
+    clock, last = Clock(), done.last
     before = last.state.segment_tensions if last is not None and has_history(sensor.robot) else None
     state = free_state(sensor, k, None if last is None else last.free_state, before)
     number, stamp, nan = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k]), float("nan")
     done.reports.append(
-        FrameReport(number, stamp, PREDICTED, 0, 0, nan, nan, clock.total(), dict(state.tension), dict(state.pressure), {})
+        FrameReport(number, stamp, PREDICTED, 0, 0, nan, nan, clock.total_ms, dict(state.tension), dict(state.pressure), {})
     )
     done.states.append(state.positions)
 

@@ -16,7 +16,6 @@ from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
 from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape, is_edge
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.measurement_rows import depth_std
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
 
@@ -54,11 +53,6 @@ def said_free(sensor: Sensor, k: int) -> bool:
     return sensor.recording.free is not None and bool(sensor.recording.free[k])
 
 
-def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> list[Shape]:
-    """Return what is seen near the body in frame k, completed; nothing where the places are given or nothing is said to touch."""
-    return [] if scan is None or len(sensor.places) or said_free(sensor, k) else objects_near(sensor, scan, state)
-
-
 def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[Shape] = ()) -> list[Shape]:
     """Return what a scan shows near the body in a state, completed.
 
@@ -79,7 +73,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
         return []
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
-    std = depth_std(sensor, np.linalg.norm(points - origins, axis=1), view)
+    std = sensor.knowledge.depth_std(np.linalg.norm(points - origins, axis=1), view)
     edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
@@ -229,7 +223,7 @@ def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatA
     way = float(np.linalg.norm(state.positions[node] - sensor.robot.body.mesh.nodes[node]))
     shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way)
     least = max(0.5 * min(shape.std_m, FLOOR_STD), TILT)
-    return np.asarray(np.maximum(least, shared * np.minimum(1.0, apart / known.length)))
+    return np.asarray(np.maximum(least, shared * np.minimum(1.0, apart / sensor.error_field.length)))
 
 
 def _lattice(parts: int) -> FloatArray:

@@ -27,8 +27,6 @@ SIZES = (0.05, 0.2, 0.8)
 """Prior scales τ of a force for which the linearised evidence is taken [N]."""
 SAME = 0.08
 """Contacts within this share of the body's diagonal are one."""
-STALE = 0.03
-"""Answers at the candidates serve while no node has moved farther than this share of the diagonal: they rank, and do not estimate."""
 SHORT = 10.0
 """By how much the linearised gain of a contact at a seen object may fall short of the fitted one: it keeps the contact points."""
 SEARCHED, CLOSE = 2, 20.0
@@ -260,14 +258,8 @@ def at_candidates(near: Vicinity) -> AtCandidates:
     """Return what an inferred contact adds at each candidate next to a fit."""
     model, best = near.model, near.fit
     nodes, x = model.sensor.candidates, best.state.positions
-    kept = model.candidates
-    if kept.answers is None or kept.positions is None or np.abs(kept.positions - x).max() > STALE * model.sensor.size:
-        loads = np.zeros((len(nodes), 3, len(x), 3))
-        loads[np.arange(len(nodes)), :, nodes] = np.eye(3)
-        moves = best.linearised.tangent.respond(loads.reshape(-1, len(x), 3))
-        kept.positions, kept.answers = x, np.ascontiguousarray(np.moveaxis(moves, 0, 2))
     normals = vertex_normals(x, model.sensor.surface.triangles)[nodes]
-    return AtCandidates(near.sites(kept.answers), normals, in_sight(model, best.rows, model.skin.rest[nodes]))
+    return AtCandidates(near.sites(model.answers_near(best.state)), normals, in_sight(model, best.rows, model.skin.rest[nodes]))
 
 
 def _inferred(

@@ -11,7 +11,6 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
-from femsense.qp.friction_cone import FrictionCone
 from femsense.sensing.types import Sensor, Touch
 
 PATCH = 0.525
@@ -99,17 +98,6 @@ def ways_of(touch: Touch) -> tuple[FloatArray, FloatArray]:
     return np.stack([along / size, np.cross(touch.normal, along / size)]), stds
 
 
-def place_cost(touch: Touch) -> float:
-    """Return what a place costs beforehand: how far it is from the expected one, squared, in standard deviations."""
-    if touch.std_m == 0:
-        return 0.0
-    way = touch.place - touch.expected
-    if not touch.line.any():
-        return float(way @ way) / touch.std_m**2
-    along = float(way @ touch.line)
-    return along**2 / touch.std_m**2 + max(float(way @ way) - along**2, 0.0) / touch.across_m**2
-
-
 def moved_to(sensor: Sensor, touch: Touch, place: FloatArray) -> Touch:
     """Return a touch at the point of the surface at rest closest to another place [m], shape (3,); what is expected of it stays."""
     there = make_touch(sensor, place, source=touch.source, spread=touch.spread_m)
@@ -128,32 +116,3 @@ def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, for
         return np.zeros((n, 3))
     ahead, behind = (_patch(sensor, touch.place + s * step * tangent, touch.normal, touch.spread_m) for s in (1.0, -1.0))
     return np.asarray((ahead.spread(force, n) - behind.spread(force, n)) / (2.0 * step))
-
-
-def friction_cone(sensor: Sensor, touches: Sequence[Touch], normals: FloatArray) -> FrictionCone | None:
-    """Return the cone about normals (m, 3) that holds the forces; None where nothing does."""
-    if sensor.options.friction is None or any(_may_pull(sensor, touch) for touch in touches):
-        return None
-    return FrictionCone(normals=normals, mu=sensor.options.friction)
-
-
-def within_cones(sensor: Sensor, touches: Sequence[Touch], forces: FloatArray, state: Equilibrium) -> FloatArray:
-    """Return forces (m, 3) moved to the nearest ones within their friction cones, where there are any."""
-    mu, result = sensor.options.friction, np.array(forces, dtype=np.float64)
-    if mu is None:
-        return result
-    for i, touch in enumerate(touches):
-        inward = -touch_normal(sensor, touch, state)
-        along = float(result[i] @ inward)
-        across = result[i] - along * inward
-        size = float(np.linalg.norm(across))
-        if _may_pull(sensor, touch) or size <= mu * along:
-            continue
-        kept = max(along + mu * size, 0.0) / (1.0 + mu**2)
-        result[i] = kept * (inward + mu * across / max(size, 1e-12))
-    return result
-
-
-def _may_pull(sensor: Sensor, touch: Touch) -> bool:
-    """Return whether what acts there may pull, as a weight does that hangs from a given place."""
-    return touch.source == "given" and not sensor.options.push

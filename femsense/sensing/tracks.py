@@ -2,80 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.drive import has_history
-from femsense.sensing.judge import unspoken
-from femsense.sensing.law import law_std, response_std
 from femsense.sensing.touches import contact_radius, touch_normal
-from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor, Touch
+from femsense.sensing.types import ContactForce, SensedFrame, Sensor, Touch
 
 SAME = 0.15
 """A contact nearer than this share of the body's diagonal to one of the frame before is the same one: it slid."""
 
 
-def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
-    """Return the contacts of a fit, `free` the state without them; those that begin a track have track −1.
+def contacts_of(
+    sensor: Sensor,
+    k: int,
+    touches: Sequence[Touch],
+    forces: FloatArray,
+    covariances: Iterable[FloatArray],
+    place_covariances: Iterable[FloatArray],
+    state: Equilibrium,
+    previous: SensedFrame | None,
+) -> tuple[ContactForce, ...]:
+    """Return the contacts of frame k; those that begin a track have track −1, those at given places the number of their place.
 
-    A contact at a given place is that place's all along, whatever its force is.
+    Arguments:
+        forces: [N], shape (m, 3).
+        covariances: of each force [N²], shape (3, 3).
+        place_covariances: of each place [m²], shape (3, 3).
+        state: with the forces.
     """
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
-    contacts: list[ContactForce] = []
-    cloudy = fit.rows.of_clouds
-    response = response_std(sensor.knowledge, len(sensor.calibration.poses)) if cloudy else 0.0
-    before = previous.state.segment_tensions if previous is not None and has_history(sensor.robot) else None
-    law, shifted = (
-        law_std(sensor, k, fit, free, before) if cloudy else (np.zeros(len(fit.touches)), np.zeros((len(fit.touches), 3)))
-    )
-    shares = np.hypot(response, law)
-    for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
-        size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
-        if (size == 0.0 and touch.source != "given") or unspoken(fit, i):
+    found: list[ContactForce] = []
+    for touch, force, own, place in zip(touches, forces, covariances, place_covariances):
+        size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, state)
+        if size == 0.0 and touch.source != "given":
             continue
-        along = force / size if size > 0 else -normal
-        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + shares[i] ** 2 * np.outer(force, force)
-        contacts.append(
+        std = size_std(force, own) if size > 0.0 else float(np.sqrt(max(float(normal @ own @ normal), 0.0)))
+        found.append(
             ContactForce(
                 frame=number,
                 time_s=stamp,
-                contact=len(contacts),
-                position_m=touch.patch.mean(fit.state.positions),
+                contact=len(found),
+                position_m=touch.patch.mean(state.positions),
                 normal=normal,
                 force_n_xyz=force,
                 force_n=size,
-                std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
+                std_n=std,
                 source=touch.source,
                 track=place_of(sensor, touch) if touch.source == "given" else -1,
-                position_std_m=freeze(np.hypot(place_std(touch, fit.place_covariance[i]), shifted[i])),
+                position_std_m=freeze(np.sqrt(np.maximum(np.diag(place), 0.0))),
                 radius_m=contact_radius(sensor, touch.object_radius_m, size),
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
         )
-    return tuple(tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
+    return tuple(tracked(found, () if previous is None else previous.contacts, SAME * sensor.size))
 
 
 def place_of(sensor: Sensor, touch: Touch) -> int:
     """Return which of the given places a touch is at."""
     return int(np.linalg.norm(sensor.places - touch.place, axis=1).argmin())
-
-
-def place_std(touch: Touch, covariance: FloatArray) -> FloatArray:
-    """Return how well the place of a contact is known along each axis [m], shape (3,).
-
-    Where the fit held a place that is seen (its force was none in the frame before, so that the shape says nothing of it), it is known as it is seen.
-
-    Arguments:
-        touch: the contact.
-        covariance: of its place by the fit [m²], shape (3, 3).
-    """
-    held = touch.across_m if touch.source == "cloud" and touch.std_m == 0.0 else 0.0
-    along = held**2 * (1.0 - touch.normal**2)
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) + along))
 
 
 def size_std(force: FloatArray, covariance: FloatArray) -> float:

@@ -20,7 +20,6 @@ class SensingMethod(StrEnum):
 
     rays = "rays"
     paper = "paper"
-    evidence = "evidence"
 
 
 def calibrate(

@@ -6,10 +6,11 @@ Source: "Calibration and force sensing with an RGB-D camera", section V: segment
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, InputError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
@@ -19,17 +20,17 @@ from femsense.model.camera_frame import in_robot_frame
 from femsense.model.contact_patch import flat_nodes
 from femsense.model.robot import spread_features
 from femsense.pointcloud.cloud import PointCloud
-from femsense.pointcloud.contact import detect_contacts
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
-from femsense.pointcloud.matching import MatchingOptions, match_along_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions
+from femsense.sensing.baseline.contact_detection import detect_contacts
+from femsense.sensing.baseline.matching import MatchingOptions, match_along_normals
 from femsense.sensing.run_arrays import sensed
-from femsense.sensing.states import free_state, solve_with
+from femsense.sensing.states import free_state, loaded_state
 from femsense.sensing.touches import make_touch
 from femsense.sensing.tracks import contacts_of
-from femsense.sensing.types import Fit, FrameReport, Rows, SensedFrame, Sensor, Touch
+from femsense.sensing.types import FrameReport, SensedFrame, Sensor, Touch
 
 VOXEL = 0.01
 """Edge of the voxel grid, relative to the body's diagonal."""
@@ -49,17 +50,35 @@ def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> 
     rows = _matches(sensor, robot, free)
     touches = _touches(sensor, robot, others, free, k)
     forces, covariance = _one_step(sensor, rows, touches, free)
-    state = solve_with(sensor, k, touches, forces, free)
-    m = len(touches)
-    fit = Fit(tuple(touches), state, forces, covariance, np.zeros((m, 3, 3)), rows, 0.0)
-    contacts = contacts_of(sensor, k, fit, free, previous)
+    state = loaded_state(sensor, k, touches, forces, free, None, exact=True)
+    if state is None:
+        raise DataError("no equilibrium under the forces of one linear step")
+    own = [covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(touches))]
+    contacts = contacts_of(sensor, k, touches, forces, own, np.zeros((len(touches), 3, 3)), state, previous)
     after = _matches(sensor, robot, state)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     ms = 1e3 * (time.perf_counter() - began)
-    report = FrameReport(
-        number, stamp, "ok", len(sensed(contacts)), rows.count, rows.rms, after.rms, ms, dict(state.tension), dict(state.pressure)
-    )
-    return SensedFrame(fit.touches, fit.state, fit.forces, free, report, contacts)
+    tension, pressure = dict(state.tension), dict(state.pressure)
+    report = FrameReport(number, stamp, "ok", len(sensed(contacts)), len(rows.at), rows.rms, after.rms, ms, tension, pressure)
+    return SensedFrame(tuple(touches), state, forces, free, report, contacts)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Matches:
+    """Feature points found in the cloud."""
+
+    at: IntArray
+    """Their nodes, shape (r,)."""
+    normals: FloatArray
+    """Outward, shape (r, 3)."""
+    distance: FloatArray
+    """Along the normal [m], shape (r,)."""
+    std: FloatArray
+    """[m], shape (r,)."""
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt((self.distance**2).mean()))
 
 
 def _segmented(sensor: Sensor, k: int, state: Equilibrium) -> tuple[PointCloud, PointCloud]:
@@ -88,7 +107,7 @@ def _segmented(sensor: Sensor, k: int, state: Equilibrium) -> tuple[PointCloud, 
     return robot, others
 
 
-def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> Rows:
+def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> _Matches:
     """Return feature points matched along their normals (Algorithm 3)."""
     flat = flat_nodes(sensor.surface, sensor.robot.body.mesh.nodes)
     features = spread_features(sensor.robot.body, max(len(sensor.robot.features), 50), among=flat)
@@ -105,19 +124,7 @@ def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> Rows:
     use = matches.found & np.isfinite(matches.std)
     if use.sum() < 3:
         raise DataError(f"only {int(use.sum())} of {len(features)} feature points were found in the cloud")
-    at, n, distance = features[use], normals[use], matches.distance[use]
-    rest = sensor.robot.body.mesh.nodes[at]
-    rows = Rows(
-        functional=lambda u: np.einsum("krc,rc->rk", u[:, at], n),
-        residual=distance,
-        std=matches.std[use],
-        by_pose=np.zeros((len(at), 6 * len(sensor.calibration.poses))),
-        place=rest,
-        way=np.linalg.norm(state.positions[at] - rest, axis=1),
-        count=len(at),
-        rms=float(np.sqrt((distance**2).mean())),
-    )
-    return rows
+    return _Matches(features[use], normals[use], matches.distance[use], matches.std[use])
 
 
 def _touches(sensor: Sensor, robot: PointCloud, others: PointCloud, state: Equilibrium, k: int) -> list[Touch]:
@@ -140,7 +147,7 @@ def _touches(sensor: Sensor, robot: PointCloud, others: PointCloud, state: Equil
     return [make_touch(sensor, sensor.robot.body.mesh.nodes[node], source="cloud") for node in nearest]
 
 
-def _one_step(sensor: Sensor, rows: Rows, touches: list[Touch], state: Equilibrium) -> tuple[FloatArray, FloatArray]:
+def _one_step(sensor: Sensor, rows: _Matches, touches: list[Touch], state: Equilibrium) -> tuple[FloatArray, FloatArray]:
     """Return forces along the inward normals by one linear step (equation 12), and their covariance."""
     m, n = len(touches), len(state.positions)
     if not m:
@@ -148,9 +155,10 @@ def _one_step(sensor: Sensor, rows: Rows, touches: list[Touch], state: Equilibri
     inward = np.array([-t.patch.mean(vertex_normals(state.positions, sensor.surface.triangles)) for t in touches])
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     basis = np.array([t.patch.spread(d, n) for t, d in zip(touches, inward)])
-    W = rows.functional(tangent_at(sensor.robot.body, state).respond(basis))
+    moves = tangent_at(sensor.robot.body, state).respond(basis)
+    W = np.einsum("krc,rc->rk", moves[:, rows.at], rows.normals)
     estimate = estimate_forces(
-        W, None, np.zeros(len(W)), rows.residual, std=rows.std, options=ForceOptions(force_lower=np.zeros(m))
+        W, None, np.zeros(len(W)), rows.distance, std=rows.std, options=ForceOptions(force_lower=np.zeros(m))
     )
     if not np.isfinite(estimate.forces).all():
         raise DataError(f"the force problem has no answer: {estimate.status}")
