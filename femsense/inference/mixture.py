@@ -63,9 +63,13 @@ class Width:
         """Whether the noise has its own width."""
         return self.pixels == 1.0 and self.others == 1.0
 
-    def narrowed(self) -> Width:
-        """Return the next, narrower widths."""
-        return Width(*(max(1.0, kappa / 3.0) if kappa > 1.5 else 1.0 for kappa in (self.pixels, self.others)))
+    def narrowed(self, least: Width | None = None) -> Width:
+        """Return the next, narrower widths: a third, but no narrower than `least`, what is left still scatters."""
+        least = least or Width()
+        third = [kappa / 3.0 if kappa > 1.5 else 1.0 for kappa in (self.pixels, self.others)]
+        return Width(
+            *(max(1.0, t, min(k, m)) for t, k, m in zip(third, (self.pixels, self.others), (least.pixels, least.others)))
+        )
 
 
 def first_width(z: FloatArray, pixel: BoolArray, coloured: bool, most: float) -> Width:

@@ -38,8 +38,10 @@ CATCH = 3.0
 """κ at the start at most where colour does not separate the robot."""
 SIZINGS, SETTLED = 8, 0.02
 """Updates of τ in one linear problem at most, and the relative change below which one is the last."""
-STEPS, LENGTHS = 14, (1.0, 0.3)
-"""Gauss–Newton steps at most, and lengths of a step that are tried. Shorter ones find nothing: pixels at the silhouette make Φ jump by a few units."""
+STEPS, LENGTHS = 25, (1.0, 0.3, 0.1, 0.03)
+"""Gauss–Newton steps at most, and lengths of a step that are tried."""
+JUMP = 5.0
+"""Pixels at the silhouette make Φ jump by a few units: shorter steps are not tried for less."""
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less."""
 LATENT = 0.2
@@ -117,6 +119,8 @@ def fit(
         here = replace(here, tau=tau)
         there = None
         for length in LENGTHS:
+            if length < 1.0 and length * decrease < JUMP:
+                break
             there = _moved(model, frame, here, linear, length * step)
             if there is None:
                 continue
@@ -138,7 +142,8 @@ def fit(
         if kappa.narrow and phi - phi_there < TOLERANCE:
             converged = True
             break
-        kappa = kappa.narrowed()
+        left = (here.residual - here.N @ eta) / here.rows.std
+        kappa = kappa.narrowed(first_width(left, here.rows.pixel, frame.coloured, catch))
     return _in_cones(model, frame, _finished(model, frame, here, linear, eta, converged), here)
 
 

@@ -1,4 +1,4 @@
-"""Contacts and forces by one objective: `--method evidence`, from clouds and from markers."""
+"""Contacts and forces by one objective, from clouds and from markers."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
 from femsense.sensing.contact_free import learn
-from femsense.sensing.estimate_frame import estimate_frame
-from femsense.sensing.model import Model
+from femsense.sensing.estimate_frame import estimate_frame, sense
+from femsense.sensing.fit import fit
+from femsense.sensing.model import Candidates, Model
 from femsense.sensing.no_penetration import gap_rows, in_touch
 from femsense.sensing.odds import VISIBLE, odds_of
 from femsense.sensing.pipeline import estimate
-from femsense.sensing.prepare import first_sensor
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.proposals import proposals
 from femsense.sensing.status import Status, verdict
 from femsense.sensing.types import Run, SensingOptions
 
-EVIDENCE = SensingOptions(method="evidence")
 PUSH = np.array([0.0, 0.0, -0.15])
 
 
 def estimated(recording: Recording, **options: Any) -> Run:
-    chosen = replace(EVIDENCE, **options)
-    return estimate(arm(), recording, calibrate(arm(), recording), options=chosen)
+    return estimate(arm(), recording, calibrate(arm(), recording), options=SensingOptions(**options))
 
 
 def model_of(recording: Recording) -> Model:
-    return learn(first_sensor(arm(), recording, calibrate(arm(), recording), options=EVIDENCE))
+    return learn(make_sensor(arm(), recording, calibrate(arm(), recording)))
 
 
 def test_a_visible_contact_has_its_force_and_place_within_its_interval(tmp_path: Path):
@@ -69,7 +69,7 @@ def test_markers_alone_give_the_force_at_a_given_place():
     force = np.array([0.0, 0.1, -0.2])
     recording, _ = record(INPUTS, noise=1e-4, forces={3: (PLACE, force)})
     recording = replace(recording, free=np.array([True, True, True, False]))
-    run = estimate(arm(), recording, calibrate(arm(), recording), at=PLACE, options=EVIDENCE)
+    run = estimate(arm(), recording, calibrate(arm(), recording), at=PLACE)
     contact = run.contacts[-1]
     assert contact.source == "given" and np.linalg.norm((contact.force_n_xyz - force)[1:]) < 0.02
 
@@ -118,7 +118,40 @@ def test_contact_free_clouds_correct_the_pose_of_the_camera(tmp_path: Path):
         T_robot_camera=move_pose(calibration.T_robot_camera, step),
         joint_covariance=np.diag([1e-6] * 3 + [1e-6] * 3),
     )
-    found = learn(first_sensor(arm(), recording, off, options=EVIDENCE)).sensor.calibration.poses[0]
+    found = learn(make_sensor(arm(), recording, off)).sensor.calibration.poses[0]
     seen = transform_points(invert_pose(T_ROBOT_CAMERA), PLACE[None])
     after, before = (float(np.linalg.norm(transform_points(T, seen)[0] - PLACE)) for T in (found, off.poses[0]))
     assert before > 4e-4 and after < 0.3 * before
+
+
+def test_the_same_frame_again_has_the_same_force(tmp_path: Path):
+    model = model_of(touched(tmp_path, PUSH, ball=True))
+    frame = sense(model, 3, None)
+    again = sense(model, 3, frame)
+    assert len(frame.contacts) == 1 and again.report.status == "ok"
+    assert abs(again.contacts[0].force_n - frame.contacts[0].force_n) < 0.5 * frame.contacts[0].std_n
+
+
+def test_an_estimate_that_goes_on_searches_with_the_answers_it_had(tmp_path: Path):
+    model = model_of(touched(tmp_path, PUSH, ball=False))
+    best = estimate_frame(model, 3, None).best
+    near = replace(best.state, positions=best.state.positions * [1.0, 1.02, 1.0])
+    had = model.answers_near(best.state)
+    assert model.answers_near(near) is had
+    resumed = replace(model, candidates=Candidates(model.candidates.state))
+    np.testing.assert_allclose(resumed.answers_near(near), had, atol=1e-9)
+    assert np.abs(replace(model, candidates=Candidates()).answers_near(near) - had).max() > 1e-6
+
+
+def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path):
+    """The second-order model of the vicinity of a fit ranks proposals: it has to be right to first order."""
+    model = model_of(touched(tmp_path, 0.1 * PUSH, ball=False))
+    alone = estimate_frame(model, 2, None).best
+    frame = replace(estimate_frame(model, 3, None).best.frame)
+    start = fit(model, frame, (), np.zeros((0, 3)), frame.predicted)
+    assert start is not None and not alone.contacts
+    best = max(proposals(model, start), key=lambda one: one.gain)
+    found = fit(model, frame, best.contacts, best.forces, frame.predicted, tau=best.tau)
+    assert found is not None
+    gained = start.criterion - found.criterion
+    assert gained > 0.0 and best.gain == pytest.approx(gained, rel=0.5, abs=6.0)

@@ -15,8 +15,9 @@ from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
-from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.prepare import make_sensor, prepare
+from femsense.sensing.contact_free import learn
+from femsense.sensing.odds import INFERRED
+from femsense.sensing.prepare import make_sensor
 
 INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.2, 0, 0, 0], [0.0, 0, 0.4, 0], [0.3, 0, 0.3, 0]])
 
@@ -45,10 +46,9 @@ def limit(folder: Path, pull: float) -> float:
     folder.mkdir()
     seen = seen_free(folder, pull)
     calibration = calibrate(arm(), seen)
-    return with_gains_of_free_frames(prepare(arm(), seen, calibration)).knowledge.gain_limit
+    return learn(make_sensor(arm(), seen, calibration)).inferred_odds
 
 
 def test_a_contact_has_to_explain_more_than_errors_that_other_free_frames_do_not_teach(tmp_path: Path) -> None:
-    noise = make_sensor(arm(), seen := seen_free(tmp_path, 0.0), calibrate(arm(), seen)).knowledge.gain_limit
-    assert limit(tmp_path / "plain", 0.0) == pytest.approx(noise, rel=0.5)
-    assert limit(tmp_path / "pulled", 0.05) > 5.0 * noise
+    assert limit(tmp_path / "plain", 0.0) == pytest.approx(INFERRED, abs=5.0)
+    assert limit(tmp_path / "pulled", 0.05) > 3.0 * INFERRED

@@ -13,6 +13,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.core.pose import moved_poses
 from femsense.pointcloud.local_planes import local_planes
 from femsense.sensing.background import Glance, look, off_background
+from femsense.sensing.contact_free import learn
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import FrameReport
@@ -64,7 +65,7 @@ def test_a_touch_that_is_seen_is_no_camera_that_moved(tmp_path, wall):
 
 def test_points_off_the_background_move_with_the_pose_as_their_derivative_says(tmp_path):
     seen = touched(tmp_path, np.zeros(3), ball=False, wall=True)
-    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    sensor = learn(make_sensor(arm(), seen, calibrate(arm(), seen))).sensor
     assert sensor.background is not None
     step, glance = 1e-4 * np.array([3.0, -2, 4, 1, 2, -1]), look(sensor, 2)
     here, by_pose = off_background(sensor, sensor.background, glance, sensor.calibration.poses)

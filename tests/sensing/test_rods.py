@@ -13,9 +13,8 @@ from femsense.calib.calibrate import calibrate
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.places import object_touches
 from femsense.sensing.prepare import make_sensor
-from femsense.sensing.search import held_on
 from femsense.sensing.states import free_state
-from femsense.sensing.touches import make_touch, place_cost, ways_of
+from femsense.sensing.touches import ways_of
 from femsense.sensing.types import Sensor
 
 RADIUS = 0.004
@@ -46,23 +45,3 @@ def test_a_rod_is_placed_well_across_it_and_anywhere_along_it(sensor):
         assert stds[1] < 0.003
         assert abs(touch.place[1] - 0.001) < 0.001
         assert abs(touch.place[0] - 0.05) < 2.0 * stds[0]
-
-
-def test_a_place_costs_by_how_well_it_is_known_along_and_across(sensor):
-    touch = make_touch(sensor, np.array([0.05, 0.0, 0.01]), source="cloud", std_m=0.01)
-    lying = replace(touch, line=np.array([1.0, 0.0, 0.0]), across_m=0.001)
-    off = replace(lying, place=touch.place + np.array([0.01, 0.002, 0.0]))
-    assert place_cost(off) == pytest.approx(1.0 + 4.0)
-    assert place_cost(replace(off, line=np.zeros(3))) == pytest.approx(1.04)
-    assert place_cost(replace(off, std_m=0.0)) == 0.0
-    assert not ways_of(replace(off, std_m=0.0))[1].any()
-
-
-def test_a_rod_that_tips_over_is_one_contact(sensor):
-    """One that is found far from where it was, but no farther than it may be, is no second one."""
-    here, there = (make_touch(sensor, np.array([x, 0.0, 0.01]), source="cloud", std_m=0.02) for x in (0.03, 0.055))
-    touches, kept = held_on(sensor, [here], [there], [True])
-    assert len(touches) == 1
-    assert list(kept) == [0]
-    ball = replace(there, std_m=0.001)
-    assert len(held_on(sensor, [here], [ball], [True])[0]) == 2

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
-from femsense.pointcloud import MatchingOptions, match_along_normals
+from femsense.sensing.baseline.matching import MatchingOptions, match_along_normals
 
 AVERAGE = MatchingOptions(average=True)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
-from femsense.pointcloud import detect_contacts, map_to_features
+from femsense.sensing.baseline.contact_detection import detect_contacts, map_to_features
 
 SEEDS = st.integers(0, 2**32 - 1)
 

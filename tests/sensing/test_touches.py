@@ -1,0 +1,57 @@
+"""Where objects touch, and over how wide a patch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import arm
+from scipy.spatial import cKDTree
+from touched_arm import touched
+
+from femsense.calib.calibrate import calibrate
+from femsense.pointcloud.primitives import Shape
+from femsense.sensing.contact_free import learn
+from femsense.sensing.estimate_frame import sense
+from femsense.sensing.places import object_touches
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.touches import contact_radius, make_touch, pressed
+from femsense.sensing.types import SensedFrame, Sensor
+
+FORCE = np.array([0.0, 0.0, -0.15])
+AWAY = np.array([0.04, 0.0, 0.01])
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sensor, SensedFrame]:
+    """Return a sensor and its frame in which a ball pushes."""
+    folder: Path = tmp_path_factory.mktemp("ball")
+    seen = touched(folder, FORCE, ball=True)
+    model = learn(make_sensor(arm(), seen, calibrate(arm(), seen)))
+    return model.sensor, sense(model, 3, None)
+
+
+def test_points_of_the_body_itself_touch_nothing_in_the_state_that_the_force_makes(pushed):
+    """A dark crease is not of the body's colour: in the state without forces its points lie beside the body."""
+    sensor, frame = pushed
+    upper = frame.state.positions[np.isclose(sensor.robot.body.mesh.nodes[:, 2], 0.01)]
+    crease = upper[np.linalg.norm(upper - frame.touches[0].place, axis=1) < 0.02]
+    shape = Shape("points", crease.mean(axis=0), np.eye(3), np.zeros(3), 0.0, 0.006, crease, cKDTree(crease), edge_m=0.0015)
+    assert object_touches(sensor, [shape], frame.free_state)
+    assert not object_touches(sensor, [shape], frame.state)
+    assert object_touches(sensor, [replace(shape, edge_m=0.0)], frame.state)
+
+
+def test_a_patch_is_as_wide_as_hertz_has_it(pushed: tuple[Sensor, SensedFrame]) -> None:
+    sensor, nodes = pushed[0], pushed[0].robot.body.mesh.nodes
+    touch = make_touch(sensor, AWAY, source="cloud", radius=0.03)
+    assert pressed(sensor, touch, np.zeros(3)).patch is touch.patch  # a point, as the mesh has it
+    wide = pressed(sensor, touch, np.array([0.0, 0.0, -40.0]))
+    a = contact_radius(sensor, 0.03, 40.0)
+    assert a**3 == pytest.approx(0.75 * 40.0 * 0.03 * (1 - 0.45**2) / float(sensor.robot.body.material.young_modulus[0]))
+    middle = wide.patch.mean(nodes)
+    square = wide.patch.weights @ ((nodes[wide.patch.nodes] - middle) ** 2).sum(axis=1)
+    assert square == pytest.approx(0.4 * a**2, rel=0.15)
+    assert pressed(sensor, wide, np.array([0.0, 0.0, -41.0])) is wide
