@@ -15,9 +15,8 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from unittest import mock
 
@@ -27,9 +26,10 @@ from independent.grade import Row, grade, summed
 from independent.make import make
 
 from femsense import SensingOptions, calibrate, estimate, load_recording, load_robot
-from femsense.sensing import pipeline, prepare, touches, tracks
+from femsense.sensing import contact_free, estimate_frame, model, pipeline, touches
+from femsense.sensing.model import Model
 from femsense.sensing.run_files import write_run
-from femsense.sensing.types import Fit, Knowledge
+from femsense.sensing.types import Sensor
 
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
 ASKED = ("bar-normal", "bar-tangential", "arm-slide", "pad-normal", "slab-gray", "post-two", "diamond-normal")
@@ -37,7 +37,7 @@ GIVEN = "all, with the true places given"
 PUSH = GIVEN + ", whose forces push"
 MEDIAN = 0.6745
 """Median of the size of what is normal, in its standard deviations."""
-Patches = tuple[tuple[ModuleType, str, Any], ...]
+Patches = tuple[tuple[Any, str, Any], ...]
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,14 @@ class Way:
     name: str
     options: SensingOptions = field(default_factory=SensingOptions)
     patches: Patches = ()
-    """Module, name in it, and what stands there instead."""
+    """Module or class, name in it, and what stands there instead."""
     given: bool = False
     """The true places are given."""
 
 
-def _untaught(knowledge: Knowledge, frames: object) -> Knowledge:
-    """Return what is known of the pose alone: neither shared errors nor a modulus or pulls that may be off."""
-    root = knowledge.root.copy()
-    root[6 * len(knowledge.noises) :] = 0.0  # one camera each
-    return replace(knowledge, root=root)
-
-
-def _no_law(sensor: object, k: int, fit: Fit, *more: object) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros(len(fit.touches)), np.zeros((len(fit.touches), 3))
+def _untaught(sensor: Sensor) -> Model:
+    """Return the model before any contact-free frame is seen."""
+    return contact_free.prior_model(sensor)
 
 
 def _nothing_seen(*given: object) -> list[Any]:
@@ -71,12 +65,12 @@ WAYS = (
     Way("the published method", SensingOptions(method="paper")),
     Way(
         "all, but nothing learnt from free frames",
-        patches=((prepare, "_taught", _untaught), (pipeline, "with_gains_of_free_frames", lambda prepared: prepared.sensor)),
+        patches=((pipeline, "learn", _untaught),),
     ),
-    Way("all, but no objects: contacts by the shape alone", patches=((pipeline, "seen_objects", _nothing_seen),)),
+    Way("all, but no objects: contacts by the shape alone", patches=((estimate_frame, "objects_near", _nothing_seen),)),
     Way("all, but no forces along the surface", SensingOptions(friction=0.0)),
     Way("all, but no patch by the object", patches=((touches, "HERTZ", 0.0),)),
-    Way("all, but no deviation of the law", patches=((tracks, "law_std", _no_law),)),
+    Way("all, but no deviation of the compliance", patches=((model.Model, "compliance_std", 0.0),)),
     Way("all"),
     Way(GIVEN, given=True),
     Way(PUSH, SensingOptions(push=True), given=True),

@@ -30,8 +30,8 @@ from femsense.io.files import PART_PREFIX, folder_hash
 from femsense.io.folder_lock import lock_of
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
-from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.prepare import prepare
+from femsense.sensing.contact_free import learn
+from femsense.sensing.prepare import make_sensor
 
 MOST_KILLS = 40
 PREPARES_S = 0.7
@@ -134,7 +134,7 @@ def prepared(robot: str, recording: str, calibration: str | None) -> str:
     laps = [time.process_time()]
     used = calibrate(body, seen) if calibration is None else read_calibration(calibration)
     laps.append(time.process_time())
-    with_gains_of_free_frames(prepare(body, seen, used))
+    learn(make_sensor(body, seen, used))
     laps.append(time.process_time())
     return (
         f"calibration {laps[1] - laps[0]:.1f} s, free frames {laps[2] - laps[1]:.1f} s of one core, of {seen.frame_count} frames"

@@ -22,7 +22,7 @@ from femsense import Run, SensingOptions, calibrate, estimate, load_recording, l
 
 NEAR = 0.09
 """A contact farther from the truth than this is another one [m]."""
-METHODS = {name: SensingOptions(method=name) for name in ("paper", "rays", "evidence")}
+METHODS = {name: SensingOptions(method=name) for name in ("paper", "rays")}
 
 
 def graded(run: Run, truth: list[dict[str, Any]], *, given: bool) -> str:

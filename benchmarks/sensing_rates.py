@@ -19,15 +19,15 @@ from femsense.core.parallel import one_blas_thread
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.io.files import write_toml
 from femsense.pointcloud.cloud import PointCloud
-from femsense.sensing.false_alarms import with_gains_of_free_frames
-from femsense.sensing.pipeline import sense_frame
-from femsense.sensing.prepare import prepare
+from femsense.sensing.contact_free import learn
+from femsense.sensing.estimate_frame import sense
+from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import SensedFrame
 
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
 FREE, TOUCHED = 4, 8
 PLACE = [0.0, -0.0429, 0.0906]
-STAGES = ("equilibrium", "scan", "rows", "places", "forces")
+STAGES = ("equilibrium", "read", "objects", "fit", "search", "state", "check")
 
 
 def print_rates(points: int, folder: Path) -> None:
@@ -38,8 +38,10 @@ def print_rates(points: int, folder: Path) -> None:
     """
     print(f"data/diamond, {points} points a frame, one touch; processor time [ms], medians of touched frames")
     print("beside: the paper 143 (7 Hz, all of it), SOFA 16-19 (its quadratic programme alone)")
-    print("| | ready [s] | on the robot | equilibrium | scan | rows | places | forces | together | rate | untouched | not ok |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    print(
+        "| | ready [s] | on the robot | equilibrium | read | objects | fit | search | state | check | together | rate | first contact | untouched | not ok |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
     for label in ("tet4", "tet4, no colour", "tet10"):
         row = folder / f"{label.replace(', ', '-').replace(' ', '-')}-{points}.txt"
         if not row.exists():
@@ -105,23 +107,26 @@ def _row(label: str, robot: Robot, recording: Recording, free: int) -> str:
     """Return a row of the table: frames from `free` on are touched, the first of them finds the contact and does not count."""
     calibration = calibrate(robot, recording)
     began = time.process_time()
-    sensor = with_gains_of_free_frames(prepare(robot, recording, calibration))
+    model = learn(make_sensor(robot, recording, calibration))
     ready = time.process_time() - began
     last: SensedFrame | None = None
+    first = 0.0
     seen: dict[bool, list[SensedFrame]] = {False: [], True: []}
     times: dict[bool, list[float]] = {False: [], True: []}
     for k in range(free + TOUCHED):
         began = time.process_time()
-        last = sense_frame(sensor, k, last)
+        last = sense(model, k, last)
+        if k == free:
+            first = 1e3 * (time.process_time() - began)
         if k not in (0, free):
             times[k > free].append(1e3 * (time.process_time() - began))
             seen[k > free].append(last)
     shares = [
         t / sum(f.report.stages_ms.values()) for t, f in zip(times[True], seen[True])
     ]  # other programs take the processor, too
-    stages = [float(np.median([s * f.report.stages_ms[name] for s, f in zip(shares, seen[True])])) for name in STAGES]
+    stages = [float(np.median([s * f.report.stages_ms.get(name, 0.0) for s, f in zip(shares, seen[True])])) for name in STAGES]
     together, untouched = (float(np.median(times[touched])) for touched in (True, False))
     bad = sum(f.report.status != "ok" or not f.contacts for f in seen[True])
     met = int(np.median([f.report.matched for f in seen[True]]))
     told = " | ".join(f"{value:.0f}" for value in stages)
-    return f"| {label} | {ready:.1f} | {met} | {told} | {together:.0f} | {1000.0 / together:.1f} Hz | {untouched:.0f} | {bad}/{len(seen[True])} |"
+    return f"| {label} | {ready:.1f} | {met} | {told} | {together:.0f} | {1000.0 / together:.1f} Hz | {first:.0f} | {untouched:.0f} | {bad}/{len(seen[True])} |"

@@ -44,11 +44,11 @@ class ContactFree:
 
 def learn(sensor: Sensor) -> Model:
     """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
-    model = _first_model(sensor)
+    model = prior_model(sensor)
     for turn in range(2):
         frames = _contact_free(model)
         if not frames:
-            return replace(model, inferred_odds=INFERRED)
+            return model
         model = _taught(model, [one.fit for one in frames])
         if turn == 0:
             model = _at_the_mean(model, [one.fit for one in frames])
@@ -57,7 +57,8 @@ def learn(sensor: Sensor) -> Model:
     return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
 
 
-def _first_model(sensor: Sensor) -> Model:
+def prior_model(sensor: Sensor) -> Model:
+    """Return the model before any contact-free frame is seen."""
     nodes, triangles = sensor.robot.body.mesh.nodes, sensor.surface.triangles
     skin = Skin(triangles, nodes, freeze(facing_of(nodes[triangles])), sensor.error_field, sensor.pivot, sensor.size)
     pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
@@ -65,7 +66,7 @@ def _first_model(sensor: Sensor) -> Model:
     modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
     covariance = block_diag(pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives))
     nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(sensor.error_field))
-    return Model(sensor, skin, nuisance, sensor.knowledge.noises)
+    return Model(sensor, skin, nuisance, sensor.knowledge.noises, inferred_odds=INFERRED)
 
 
 def _contact_free(model: Model) -> list[ContactFree]:
