@@ -119,7 +119,7 @@ def test_extras_that_a_text_names_exist(page: Path) -> None:
 
 
 def test_the_architecture_shows_every_room() -> None:
-    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/architecture.md").read_text(encoding="utf-8")
     rooms = [folder.name for folder in (ROOT / "femsense").iterdir() if (folder / "__init__.py").exists()]
     inner = [f"loop/{folder.name}" for folder in (ROOT / "femsense/loop").iterdir() if (folder / "__init__.py").exists()]
     assert not [room for room in [*rooms, *inner] if f"| `{room}/` |" not in page]

@@ -1,6 +1,6 @@
 """Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data, hand back a better model.
 
-docs/closing-the-loop.md says what follows what, and why.
+docs/method/closing-the-loop.md says what follows what, and why.
 """
 
 from __future__ import annotations

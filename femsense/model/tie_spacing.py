@@ -17,7 +17,7 @@ from femsense.fem.body_parts import Cable
 from femsense.fem.sections import cut_section
 
 HELD = 0.15
-"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 85 % wrong where it is 0.90,
+"""Share of Euler's load that a tension may be [1]. The tentacle of docs/guides/bodies.md answers 85 % wrong where it is 0.90,
 6.4 % at 0.24, 1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
 ONE_TURN = 1.0
 """Where no largest tension is declared, it is taken as the one that bends the body along the path by so much [rad]."""
@@ -88,5 +88,5 @@ def tie_spacing_text(spacing: TieSpacing, count: int) -> str:
         f"cable {spacing.cable!r}: its points are too far apart. The body is free between points {spacing.after} and "
         f"{spacing.after + 1} of its path ({1e3 * spacing.gap:.3g} mm) and buckles there at {spacing.buckles_at:.3g} N, but the "
         f"cable may pull {spacing.tension:.3g} N ({pulled}). Where it runs in a channel, give it about "
-        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (docs/bodies.md)"
+        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (docs/guides/bodies.md)"
     )
