@@ -1,0 +1,134 @@
+"""What the site needs beyond Sphinx: MathML, the reference of the commands, plain docstrings, and llms.txt.
+
+MathML is rendered by the browser itself, so pages with equations need no script and no network.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import latex2mathml.converter
+import typer.main
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+SUMMARY = """# femsense
+
+> An ordinary depth camera as a force sensor for soft robots: femsense fits a finite-element model of the robot to what the camera sees and
+> reports where something pushes, how hard, and with which standard deviation. `femsense improve` finds what the model itself lacks.
+
+Python 3.11 and 3.12; SI units; command line and Python. Each link leads to a page as Markdown.
+"""
+
+
+def inline_math(translator: Any, node: nodes.math) -> None:
+    translator.body.append(latex2mathml.converter.convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def display_math(translator: Any, node: nodes.math_block) -> None:
+    number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+    formula = latex2mathml.converter.convert(node.astext(), display="block")
+    translator.body.append(f'<div class="math">{number}{formula}</div>\n')
+    raise nodes.SkipNode
+
+
+class Commands(SphinxDirective):
+    """Lists each command of the command line with its arguments, options, defaults and example, from the program itself."""
+
+    def run(self) -> list[nodes.Node]:
+        from femsense.app.cli import app
+
+        commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+        text = "\n".join(line for name, command in commands.items() for line in command_page(name, command))
+        return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+def command_page(name: str, command: Any) -> Iterator[str]:
+    """Yield the Markdown of a command."""
+    usage = [part for p in command.params if p.param_type_name == "argument" for part in [p.metavar or p.name.upper()]]
+    yield f"(command-{name})=\n## femsense {name}\n"
+    yield f"{(command.help or '').strip()}\n"
+    yield f"```sh\nfemsense {' '.join([name, *usage])} [OPTIONS]\n```\n"
+    options = [p for p in command.params if p.param_type_name != "argument"]
+    yield "| | |\n|---|---|"
+    for parameter in command.params:
+        if parameter.param_type_name == "argument":
+            yield f"| `{parameter.metavar or parameter.name.upper()}` | {_cell(parameter.help)} |"
+    for parameter in options:
+        flags = ", ".join(f"`{flag}`" for flag in [*parameter.opts, *parameter.secondary_opts])
+        takes = (
+            ""
+            if getattr(parameter, "is_flag", False)
+            else f" `{parameter.metavar or parameter.type_descriptor_name}`"
+            if hasattr(parameter, "type_descriptor_name")
+            else f" `{parameter.metavar}`"
+            if parameter.metavar
+            else ""
+        )
+        yield f"| {flags}{takes} | {_cell(parameter.help)}{_default(parameter)} |"
+    if command.epilog:
+        yield f"\n{command.epilog.strip()}"
+    yield ""
+
+
+def _cell(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", r"\|")
+
+
+def _default(parameter: Any) -> str:
+    value = getattr(parameter.default, "value", parameter.default)
+    plain = not isinstance(value, bool) and isinstance(value, (str, int, float, Path)) and value != ""
+    return f" Default: `{value}`." if plain else ""
+
+
+def plain_docstring(_: Sphinx, what: str, name: str, __: Any, ___: Any, lines: list[str]) -> None:
+    """Escape what reStructuredText would take for markup: docstrings here are plain text with `names` in backquotes."""
+    for i, line in enumerate(lines):
+        parts = re.split(r"(``[^`]*``|`[^`]*`)", line)
+        lines[i] = "".join(
+            part if part.startswith("`") else re.sub(r"(?<=\w)_(?=\W|$)", r"\_", re.sub(r"([*|])", r"\\\1", part))
+            for part in parts
+        )
+
+
+def write_llms(app: Sphinx, failure: Exception | None) -> None:
+    """Write llms.txt (llmstxt.org): what femsense is, and every page with its first sentence, by parts of the site."""
+    if failure is not None or app.builder.name != "html":
+        return
+    env, parts = app.env, [SUMMARY]
+    for part in env.toctree_includes.get("index", []):
+        parts.append(f"\n## {env.titles[part].astext()}\n")
+        for page in _below(env, part):
+            source = Path(env.doc2path(page)).read_text(encoding="utf-8")
+            parts.append(f"- [{env.titles[page].astext()}](_sources/{page}.md.txt): {first_sentence(source)}")
+    Path(app.outdir, "llms.txt").write_text("\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _below(env: Any, page: str) -> Iterator[str]:
+    yield page
+    for inner in env.toctree_includes.get(page, []):
+        yield from _below(env, inner)
+
+
+def first_sentence(source: str) -> str:
+    """Return the first sentence of the first paragraph of a page in Markdown."""
+    source = re.sub(r"^(```|:::).*?^\1[^\n]*$", "", source, flags=re.MULTILINE | re.DOTALL)
+    for paragraph in source.split("\n\n"):
+        text = " ".join(paragraph.split())
+        if text and text[0] not in "#|<!:({+-`":
+            text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+            return re.split(r"(?<=[.:?]) ", text)[0]
+    return ""
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
+    app.add_directive("commands", Commands)
+    app.connect("autodoc-process-docstring", plain_docstring, priority=400)
+    app.connect("build-finished", write_llms)
+    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
