@@ -120,8 +120,8 @@ def first_sentence(source: str) -> str:
     source = re.sub(r"^(```|:::).*?^\1[^\n]*$", "", source, flags=re.MULTILINE | re.DOTALL)
     for paragraph in source.split("\n\n"):
         text = " ".join(paragraph.split())
-        if text and text[0] not in "#|<!:({+-`":
-            text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+        if text and text[0] not in "#|<!:({+-" and not text.startswith("```"):
+            text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text.replace("**", ""))
             return re.split(r"(?<=[.:?]) ", text)[0]
     return ""
 
