@@ -105,11 +105,11 @@ def draw_picture(demo: Demo, file: Path) -> None:
     left.set_ylim(view.height, 0)
     left.set_aspect("equal")
     left.set_axis_off()
-    left.set_title("measured: the point cloud of a depth camera", fontsize=12)
+    left.set_title("measured: the point cloud of a depth camera", fontsize=12, x=0.05, ha="left")
     [contact] = [contact for contact in demo.run.contacts if contact.frame == SHOWN]
     nodes = np.asarray(demo.run.states.nodes_m[row], dtype=float)
     draw_model(right, demo, view, nodes, contact.position_m, contact.force_n_xyz)
-    right.set_title("estimated: shape, contact point and force", fontsize=12)
+    right.set_title("estimated: shape, contact point and force", fontsize=12, x=0.05, ha="left")
     text = f"{contact.force_n:.2f} ± {Z95 * contact.std_n:.2f} N"
     for height, line, color in (
         (1.01, text, FORCE),
