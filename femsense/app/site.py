@@ -34,7 +34,7 @@ def find_page(site: Path, name: str | None = None) -> Path:
 
     Arguments:
         site: folder of the built site.
-        name: its path without ending (`effects/creep`), or the last part of it (`creep`); None: the home page.
+        name: its path without ending (`effects/creep`), the last part of it (`creep`), or a part of the site (`effects`); None: the home page.
 
     Raises:
         InputError: no such page, or several.
@@ -44,9 +44,10 @@ def find_page(site: Path, name: str | None = None) -> Path:
     wanted = name.strip("/").removesuffix(".html").removesuffix(".md").removeprefix("docs/")
     pages = {file.relative_to(site).with_suffix("").as_posix(): file for file in sorted(site.rglob("*.html"))}
     pages = {page: file for page, file in pages.items() if not page.startswith("_")}
-    found = [page for page in pages if page == wanted or page.endswith(f"/{wanted}")]
-    if wanted in pages:
-        return pages[wanted]
+    for page in (wanted, f"{wanted}/index", f"{wanted}/README"):
+        if page in pages:
+            return pages[page]
+    found = [page for page in pages if page.endswith(f"/{wanted}")]
     if len(found) == 1:
         return pages[found[0]]
     if found:
