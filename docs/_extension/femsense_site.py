@@ -16,6 +16,8 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from femsense.app.cli import EXAMPLES, app
+
 SUMMARY = """# femsense
 
 > An ordinary depth camera as a force sensor for soft robots: femsense fits a finite-element model of the robot to what the camera sees and
@@ -41,8 +43,6 @@ class Commands(SphinxDirective):
     """Lists each command of the command line with its arguments, options, defaults and example, from the program itself."""
 
     def run(self) -> list[nodes.Node]:
-        from femsense.app.cli import app
-
         commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
         text = "\n".join(line for name, command in commands.items() for line in command_page(name, command))
         return self.parse_text_to_nodes(text, allow_section_headings=True)
@@ -53,27 +53,21 @@ def command_page(name: str, command: Any) -> Iterator[str]:
     usage = [part for p in command.params if p.param_type_name == "argument" for part in [p.metavar or p.name.upper()]]
     yield f"(command-{name})=\n## femsense {name}\n"
     yield f"{(command.help or '').strip()}\n"
-    yield f"```sh\nfemsense {' '.join([name, *usage])} [OPTIONS]\n```\n"
-    options = [p for p in command.params if p.param_type_name != "argument"]
-    yield "| | |\n|---|---|"
+    yield f"```text\nfemsense {' '.join([name, *usage])} [OPTIONS]\n```\n"
+    yield "| argument, option | meaning |\n|---|---|"
     for parameter in command.params:
-        if parameter.param_type_name == "argument":
-            yield f"| `{parameter.metavar or parameter.name.upper()}` | {_cell(parameter.help)} |"
-    for parameter in options:
-        flags = ", ".join(f"`{flag}`" for flag in [*parameter.opts, *parameter.secondary_opts])
-        takes = (
-            ""
-            if getattr(parameter, "is_flag", False)
-            else f" `{parameter.metavar or parameter.type_descriptor_name}`"
-            if hasattr(parameter, "type_descriptor_name")
-            else f" `{parameter.metavar}`"
-            if parameter.metavar
-            else ""
-        )
-        yield f"| {flags}{takes} | {_cell(parameter.help)}{_default(parameter)} |"
-    if command.epilog:
-        yield f"\n{command.epilog.strip()}"
+        yield f"| {_name(parameter)} | {_cell(parameter.help)}{_default(parameter)} |"
+    yield f"\nExample:\n\n```sh\n{EXAMPLES[name]}\n```"
     yield ""
+
+
+def _name(parameter: Any) -> str:
+    """Return how a table names a parameter: an argument by its word, an option by its flags and what it takes."""
+    metavar = _cell(parameter.metavar or parameter.name.upper())
+    if parameter.param_type_name == "argument":
+        return f"`{metavar}`"
+    flags = ", ".join(f"`{flag}`" for flag in [*parameter.opts, *parameter.secondary_opts])
+    return f"{flags} `{metavar}`" if parameter.metavar else flags
 
 
 def _cell(text: str | None) -> str:
@@ -96,17 +90,23 @@ def plain_docstring(_: Sphinx, what: str, name: str, __: Any, ___: Any, lines: l
         )
 
 
-def write_llms(app: Sphinx, failure: Exception | None) -> None:
+def plain_signature(*event: Any) -> tuple[str | None, str | None]:
+    """Return a signature with the names of array types as the source has them."""
+    *_, signature, returns = event
+    return tuple(text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returns))  # type: ignore[return-value]
+
+
+def write_llms(sphinx: Sphinx, failure: Exception | None) -> None:
     """Write llms.txt (llmstxt.org): what femsense is, and every page with its first sentence, by parts of the site."""
-    if failure is not None or app.builder.name != "html":
+    if failure is not None or sphinx.builder.name != "html":
         return
-    env, parts = app.env, [SUMMARY]
+    env, parts = sphinx.env, [SUMMARY]
     for part in env.toctree_includes.get("index", []):
         parts.append(f"\n## {env.titles[part].astext()}\n")
         for page in _below(env, part):
             source = Path(env.doc2path(page)).read_text(encoding="utf-8")
             parts.append(f"- [{env.titles[page].astext()}](_sources/{page}.md.txt): {first_sentence(source)}")
-    Path(app.outdir, "llms.txt").write_text("\n".join(parts) + "\n", encoding="utf-8")
+    Path(sphinx.outdir, "llms.txt").write_text("\n".join(parts) + "\n", encoding="utf-8")
 
 
 def _below(env: Any, page: str) -> Iterator[str]:
@@ -126,9 +126,10 @@ def first_sentence(source: str) -> str:
     return ""
 
 
-def setup(app: Sphinx) -> dict[str, Any]:
-    app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
-    app.add_directive("commands", Commands)
-    app.connect("autodoc-process-docstring", plain_docstring, priority=400)
-    app.connect("build-finished", write_llms)
+def setup(sphinx: Sphinx) -> dict[str, Any]:
+    sphinx.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
+    sphinx.add_directive("commands", Commands)
+    sphinx.connect("autodoc-process-docstring", plain_docstring, priority=400)
+    sphinx.connect("autodoc-process-signature", plain_signature)
+    sphinx.connect("build-finished", write_llms)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -23,7 +23,7 @@ def shell(command: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", *words], text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False
     )
-    print(done.stdout.strip(), flush=True)
+    print(done.stdout.strip("\n"), flush=True)
     if done.returncode:
         raise SystemExit(f"{command}: exit status {done.returncode}")
 
