@@ -1,4 +1,4 @@
-"""Whether the points of a cable's path lie close enough that the body between two of them stays beside its channel.
+"""Check of the spacing of a cable's path points: the body must not buckle away from the cable between two of them.
 
 Between two points that tie it, a cable runs straight. The body there is a column under the tension T:
 it leaves the cable as a column of length ℓ that is held at its ends, by a factor 1/(1 − T/P) with Euler's P = π² EI/ℓ²,
@@ -20,7 +20,7 @@ HELD = 0.15
 """Share of Euler's load that a tension may be [1]. The tentacle of docs/guides/bodies.md answers 85 % wrong where it is 0.90,
 6.4 % at 0.24, 1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
 ONE_TURN = 1.0
-"""Where no largest tension is declared, it is taken as the one that bends the body along the path by so much [rad]."""
+"""Without a declared largest tension, the tension that bends the body along the path by this angle is assumed [rad]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,7 +46,7 @@ class TieSpacing:
 
     @property
     def points_wanted(self) -> float:
-        """By how much more points the path would hold [1]."""
+        """Ratio of the number of points that the path needs to the number it has [1]."""
         return float(np.sqrt(self.tension / (HELD * self.buckles_at)))
 
 
@@ -74,7 +74,7 @@ def tie_spacing(body: BodyModel, cable: Cable) -> TieSpacing | None:
 
 
 def warn_of_tie_spacing(body: BodyModel) -> None:
-    """Warn of cables whose points let the body buckle between them."""
+    """Warn about cables between whose points the body buckles."""
     for cable in body.cables:
         spacing = tie_spacing(body, cable)
         if spacing is not None and not spacing.holds:
