@@ -158,7 +158,9 @@ def _asked(
         [name for name in names if name != MESH.name] if how.references else names
     )  # what they leave holds for the declared mesh
     if not names:
-        raise InputError("no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists")
+        raise InputError(
+            "no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists"
+        )
     _require_one_that_acts(names if effects else [], own, robot, recordings)
     return names, (*FORMS, *forms_by_recording(FORMS, recordings), *own)
 
