@@ -14,10 +14,12 @@ import latex2mathml.converter
 import typer.main
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 from femsense.app.cli import EXAMPLES, app
 
+logger = logging.getLogger(__name__)
 SUMMARY = """# femsense
 
 > An ordinary depth camera as a force sensor for soft robots: femsense fits a finite-element model of the robot to what the camera sees and
@@ -27,15 +29,27 @@ Python 3.11 and 3.12; SI units; command line and Python. Each link leads to a pa
 """
 
 
+ALIGNED = re.compile(r"\\begin\{(aligned|align\*?|split)\}(.*?)\\end\{\1\}", re.DOTALL)
+
+
+def mathml(latex: str, display: str) -> str:
+    """Return LaTeX as MathML; aligned equations become a table whose columns the style sheet aligns (browsers ignore `columnalign`)."""
+    aligned = ALIGNED.search(latex) is not None
+    latex = ALIGNED.sub(r"\\begin{matrix}\2\\end{matrix}", latex)
+    found = latex2mathml.converter.convert(" ".join(latex.split()), display=display)
+    if unknown := sorted(set(re.findall(r"\\[A-Za-z]+", found))):
+        logger.warning("LaTeX that MathML does not have: %s in %s", ", ".join(unknown), latex)
+    return found.replace("<mtable", '<mtable class="aligned" displaystyle="true"') if aligned else found
+
+
 def inline_math(translator: Any, node: nodes.math) -> None:
-    translator.body.append(latex2mathml.converter.convert(node.astext()))
+    translator.body.append(mathml(node.astext(), "inline"))
     raise nodes.SkipNode
 
 
 def display_math(translator: Any, node: nodes.math_block) -> None:
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    formula = latex2mathml.converter.convert(node.astext(), display="block")
-    translator.body.append(f'<div class="math">{number}{formula}</div>\n')
+    translator.body.append(f'<div class="math">{number}{mathml(node.astext(), "block")}</div>\n')
     raise nodes.SkipNode
 
 
