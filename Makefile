@@ -29,7 +29,7 @@ test: lint docs
 	$(RUN)/python scripts/sabotage.py --sample 12 --jobs $(JOBS)
 
 docs: $(VENV)/.installed-dev
-	$(RUN)/python -m sphinx -b html -d build/doctrees -W --keep-going -q docs build/site
+	$(RUN)/python -m sphinx -E -b html -d build/doctrees -W --keep-going -q docs build/site
 	@echo "the site: build/site/index.html, or femsense docs"
 
 sabotage: $(VENV)/.installed-dev
