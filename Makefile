@@ -1,5 +1,6 @@
 # make demo      the whole chain on the recording that comes along, into femsense-demo/
-# make test      lint, types, all tests, and a sample of the sabotages: a line is broken, and its test must fail
+# make test      lint, types, the site, all tests, and a sample of the sabotages: a line is broken, and its test must fail
+# make docs      the site, into build/site; a warning is an error (10 s)
 # make sabotage  every sabotage
 # make mutants   ROOM=core: the share of mutants of a room that its tests notice (minutes to hours)
 # make lint      ruff and mypy
@@ -17,15 +18,19 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 
-.PHONY: demo test sabotage mutants lint clean
+.PHONY: demo test docs sabotage mutants lint clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed
 	$(RUN)/femsense demo -o $(DEMO)
 
-test: lint
+test: lint docs
 	$(RUN)/python -m pytest -n $(JOBS)
 	$(RUN)/python scripts/sabotage.py --sample 12 --jobs $(JOBS)
+
+docs: $(VENV)/.installed-dev
+	$(RUN)/python -m sphinx -E -b html -d build/doctrees -W --keep-going -q docs build/site
+	@echo "the site: build/site/index.html, or femsense docs"
 
 sabotage: $(VENV)/.installed-dev
 	$(RUN)/python scripts/sabotage.py --jobs $(JOBS)

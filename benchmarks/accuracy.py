@@ -1,4 +1,4 @@
-"""What the mesh of each robot costs: the lines of meshes/README.md and docs/accuracy.md.
+"""What the mesh of each robot costs: the lines of meshes/README.md and docs/guides/accuracy.md.
 
 python benchmarks/accuracy.py                 # the robots that come along
 python benchmarks/accuracy.py PATH…           # any robots

@@ -3,7 +3,7 @@ and what six markers cannot tell.
 
     python benchmarks/beam.py [FOLDER of data/beam] [--cells NX NY NZ] [--declared-mesh] [--tables | --loops]
 
-Prints every figure of docs/beam-study.md and writes its pictures into docs/pictures.
+Prints every figure of docs/studies/beam-study.md and writes its pictures into docs/pictures.
 The beam is made of 8 × 3 × 3 cells unless told otherwise; `--declared-mesh` runs the loops on the mesh that comes with the data.
 Tables take one frame a state: the five repeat each other.
 """

@@ -2,7 +2,7 @@
 
     python benchmarks/bodies.py [--tension N]
 
-Prints the table of docs/bodies.md.
+Prints the table of docs/guides/bodies.md.
 """
 
 from __future__ import annotations

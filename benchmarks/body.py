@@ -1,5 +1,5 @@
 """How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh.
-Prints the tables of docs/speed.md.
+Prints the tables of docs/results/speed.md.
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py
     [cold|parts|orders|crowded|frames|terms|kept|growth|iterative …] [--data FOLDER]

@@ -1,6 +1,6 @@
 """Elements that lock and elements that do not: error against milliseconds on a block and on the diamond robot.
 
-Prints the tables of docs/elements.md. Small displacements, written with scipy beside the package's own elements, so that elements
+Prints the tables of docs/method/elements.md. Small displacements, written with scipy beside the package's own elements, so that elements
 which the package does not have stand in the same table; its default is compared with its own row of them. The diamond is the
 one of the data folder beside the project (or the argument); without it only the block is done. `--fine N` sets how often the
 meshes of the converged values are refined (1: three minutes). `--only finest` refines the diamond twice (a quarter of an hour,

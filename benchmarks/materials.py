@@ -1,4 +1,4 @@
-"""Prints the table of docs/materials.md: what is known of each silicone, and what follows for its Young's modulus."""
+"""Prints the table of docs/guides/materials.md: what is known of each silicone, and what follows for its Young's modulus."""
 
 from __future__ import annotations
 

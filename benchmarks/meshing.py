@@ -1,4 +1,4 @@
-"""femsense mesh on surfaces of many triangles and on spoilt ones: the table of docs/meshing.md.
+"""femsense mesh on surfaces of many triangles and on spoilt ones: the table of docs/guides/meshing.md.
 
 python benchmarks/meshing.py [WORD …]
 

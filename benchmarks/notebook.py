@@ -1,4 +1,4 @@
-"""Run the lines of docs/notebooks.md on the recording of the demo, and print what they answer.
+"""Run the lines of docs/guides/notebooks.md on the recording of the demo, and print what they answer.
 
     python benchmarks/notebook.py
 
@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "notebooks.md"
+PAGE = ROOT / "docs" / "guides" / "notebooks.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 READERS_OWN = "from_arrays"
 LONGEST = 160

@@ -4,7 +4,7 @@
                               [--calibrated | --weights | --by-hand | --fitted | --states]
 
 Robots and recordings are made below OUT from the files of `shared/data`; nothing of these is copied. A row that stands in OUT already is
-read, not computed again, and one that takes longer than M minutes says so. `--calibrated` leaves the loop out. docs/real-robots.md tells
+read, not computed again, and one that takes longer than M minutes says so. `--calibrated` leaves the loop out. docs/studies/real-robots.md tells
 what the rows mean; it prints rms of distances [mm], where the authors of the tentacle print means.
 """
 
@@ -125,12 +125,12 @@ SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] =
     ),
     "beam": (
         beam_rows,
-        "a repeat of the run at 1.00 N differs by 0.59 mm rms; an independent solver leaves 0.83 mm there (docs/beam-study.md)",
+        "a repeat of the run at 1.00 N differs by 0.59 mm rms; an independent solver leaves 0.83 mm there (docs/studies/beam-study.md)",
     ),
     "arm": (
         arm_rows,
         (
-            "linear maps leave 5.4 mm (encoders) and 36.8 mm (pressures) of the tip; see docs/real-robots.md for what stops "
+            "linear maps leave 5.4 mm (encoders) and 36.8 mm (pressures) of the tip; see docs/studies/real-robots.md for what stops "
             "the model"
         ),
     ),
@@ -217,7 +217,7 @@ def print_pairs(out: Path, data: Path) -> None:
 
 
 def print_fitted(rows: list[Asked]) -> None:
-    """Print what calibration within the loop leaves by both weights (docs/closing-the-loop.md, section 4)."""
+    """Print what calibration within the loop leaves by both weights (docs/method/closing-the-loop.md, section 4)."""
     print(
         "| way of asking | declared, held out [mm] | fitted; held out [mm] | modulus | by weights with the error: fitted; held out | modulus | corrected |"
     )

@@ -3,7 +3,7 @@
     python benchmarks/reports.py FOLDER [--only NAME …]
 
 FOLDER holds the inputs (data/reports), one folder a kind. Every row runs the commands that its README names, and prints exit status
-and the sentence that matters. Prints the second table of docs/trials.md.
+and the sentence that matters. Prints the second table of docs/results/trials.md.
 """
 
 from __future__ import annotations

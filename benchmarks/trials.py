@@ -1,10 +1,10 @@
 """Small inputs that once went wrong: what the commands make of each now, beside what they made of it before.
 
-    python benchmarks/trials.py FOLDER [--only NAME …] [--page docs/trials.md]
+    python benchmarks/trials.py FOLDER [--only NAME …] [--page docs/results/trials.md]
 
 FOLDER holds the inputs (data/trials): robots, recordings and files, each of a kind.
 Every row runs the commands a user would run, in a folder of its own, and prints their exit status, forces and what they say.
-Prints the table of docs/trials.md.
+Prints the table of docs/results/trials.md.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.model_file import load_model, save_model
     from femsense.xr.user_skin import read_skin
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "EFFECTS",

@@ -1,4 +1,4 @@
-"""Write docs/files.md from the tables that read the files: every file, key, column, unit and default of robot and recording.
+"""Write docs/formats/files.md from the tables that read the files: every file, key, column, unit and default of robot and recording.
 
     python scripts/file_pages.py [--check]
 
@@ -22,7 +22,7 @@ from femsense.io.recording_toml import RecordingTable
 from femsense.io.robot_tables import RobotTable
 from femsense.model.effects import EFFECT_NAMES
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "files.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "formats" / "files.md"
 HEAD = """# Files: robot and recording
 
 Written by `scripts/file_pages.py` from the tables that read the files; a test holds it up to date.

@@ -10,6 +10,11 @@ from pathlib import Path
 
 import pytest
 
+import femsense
+from femsense.many.outcome import Status as JobStatus
+from femsense.qp.solve import Status as ProgramStatus
+from femsense.sensing.status import Status as FrameStatus
+
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "meshes").rglob("*.md")])
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
@@ -119,7 +124,7 @@ def test_extras_that_a_text_names_exist(page: Path) -> None:
 
 
 def test_the_architecture_shows_every_room() -> None:
-    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/architecture.md").read_text(encoding="utf-8")
     rooms = [folder.name for folder in (ROOT / "femsense").iterdir() if (folder / "__init__.py").exists()]
     inner = [f"loop/{folder.name}" for folder in (ROOT / "femsense/loop").iterdir() if (folder / "__init__.py").exists()]
     assert not [room for room in [*rooms, *inner] if f"| `{room}/` |" not in page]
@@ -142,3 +147,25 @@ def test_what_does_not_exist_is_found() -> None:
         "these",
     }
     assert "no_such" not in top_level_names(ROOT / "femsense/core/pose.py")
+
+
+STATUSES = [
+    *(status.value for status in FrameStatus),
+    *(status.value for status in JobStatus),
+    *(status.value for status in ProgramStatus),
+]
+
+
+@pytest.mark.parametrize("text", STATUSES)
+def test_every_status_has_its_row_with_cause_and_remedy(text: str) -> None:
+    page = (ROOT / "docs/guides/statuses.md").read_text(encoding="utf-8")
+    shown = re.sub(r"\{[^}]*\}", "…", text)
+    rows = [line for line in page.splitlines() if line.startswith(f"| `{shown}` |")]
+    assert len(rows) == 1
+    assert len(rows[0].split(" | ")) == 3
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs/reference").glob("*.md"))
+    described = re.findall(r"^\.\. auto\w+:: femsense\.(\w+)$", pages, re.MULTILINE)
+    assert sorted(described) == sorted(set(femsense.__all__) - {"__version__"})

@@ -43,7 +43,7 @@ class Pose:
 
 
 def description(density: float = FIT_DENSITY, *, points: int | None = POINTS) -> dict[str, object]:
-    """Return the text of `femsense mesh`: a cone with two channels (docs/bodies.md).
+    """Return the text of `femsense mesh`: a cone with two channels (docs/guides/bodies.md).
 
     The authors' 30° and 150° are counted from the robot's y to its x, for a body that hangs along −z; ours from x,
     about the line.

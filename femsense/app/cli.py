@@ -77,11 +77,32 @@ COMMANDS: dict[str, Callable[..., Answer]] = {
     "view": results.view,
     "stream": results.stream,
     "report": results.report,
+    "docs": start.docs,
     "doctor": start.doctor,
 }
 """In the order of the help."""
+EXAMPLES: dict[str, str] = {
+    "demo": "femsense demo -o femsense-demo",
+    "inspect": "femsense inspect my-recording --robot my-robot",
+    "import": "femsense import take.db3 -o my-recording --free 0:20",
+    "mesh": "femsense mesh finger.stl --unit mm -o my-robot",
+    "simulate": "femsense simulate my-robot script.toml -o my-recording",
+    "calibrate": "femsense calibrate my-robot my-recording -o calibration.json",
+    "estimate": "femsense estimate my-robot my-recording -c calibration.json -o run",
+    "live": "femsense live my-robot --camera realsense --actuation fixed:top=2",
+    "improve": "femsense improve my-robot monday --validation tuesday -o improved",
+    "export": "femsense export run -o robot.glb --arrows",
+    "reach": "femsense reach four-leg --target tip=0.01,0,0.12 -o motion.json",
+    "learn": "femsense learn sensors.csv markers.csv -o finger.onnx",
+    "view": "femsense view run",
+    "stream": "femsense stream --sensors sensors.csv --model finger.onnx --browser",
+    "report": "femsense report run",
+    "docs": "femsense docs is-this-force-real",
+    "doctor": "femsense doctor",
+}
+"""The last line of each command's help."""
 for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
+    app.command(_name, epilog=f"\b\nExample:\n  {EXAMPLES[_name]}")(_command)
 
 
 # Running them

@@ -170,7 +170,7 @@ def describe(report: Mapping[str, Any]) -> str:
 
 
 TITLES = {
-    "line": "a body along a line (docs/bodies.md)",
+    "line": "a body along a line (femsense docs bodies)",
     "robot": "a robot",
     "recording": "a recording",
     "mesh": "a mesh of tetrahedra",

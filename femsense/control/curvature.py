@@ -1,7 +1,7 @@
-"""What bends of a far target's error beyond its slopes: the second-order part of the squared error, learnt from steps.
+"""Second-order part of the squared error of an unreachable target, estimated from steps.
 
-Where the target is out of reach, much is missed at the nearest state, and Gauss–Newton nears it slowly: Σ r ∇²r is no longer small
-against JᵀJ. It is learnt by the secant of Dennis, Gay and Welsch (1981), as in NL2SOL.
+At the closest state to an unreachable target the residual r is large, and Gauss–Newton converges slowly, because Σ r ∇²r is not small against JᵀJ. It is
+estimated by the secant condition of Dennis, Gay and Welsch (1981), as in NL2SOL.
 """
 
 from __future__ import annotations
@@ -46,6 +46,6 @@ def learned(curvature: FloatArray, last: Seen, now: Seen) -> FloatArray:
 
 
 def convex(matrix: FloatArray) -> FloatArray:
-    """Return a symmetric matrix without what curves downwards."""
+    """Return the positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,7 +1,7 @@
-"""Inputs for a target that moves, such as a point that a hand drags: each answer goes on where the last one ended.
+"""Inputs for a moving target, such as a dragged point: each result continues from the previous one.
 
-A search of `reach` starts anew with each target, and ends at its answer. Here state, slopes, trust region and curvature stay.
-An answer is one equilibrium further on, or as many as its time allows; it says whether it still converges.
+`reach` starts a new search for each target and runs it to its end. Here state, tangent, trust region and curvature persist, and each call solves one more
+equilibrium, or as many as its time allows; the status states whether it is still converging.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class Follower:
         calibration: Calibration | None = None,
         options: ReachOptions | None = None,
     ) -> None:
-        """Begin at rest.
+        """Start at rest.
 
         Arguments:
             robot: with its effects; its cables' and chambers' limits hold.
-            control: what is commanded of the cables: "tension" [N] or "displacement" [m].
-            limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], beside those of the robot.
-            calibration: its initial inputs are taken off the commands.
-            options: when a search ends; an empirical correction is left out.
+            control: kind of the cable commands: "tension" [N] or "displacement" [m].
+            limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], in addition to those of the robot.
+            calibration: its initial inputs are subtracted from the commands.
+            options: criteria to end a search; an empirical correction is ignored.
 
         Raises:
             InputError: an unknown cable or control, limits the wrong way round.
@@ -55,12 +55,12 @@ class Follower:
         self._start: Equilibrium | None = None
         self._search: Search | None = None
         self._other: Search | None = None
-        self._compared = False  # with what a search from rest finds
+        self._compared = False  # with the result of a search from rest
 
     def begin(self, inputs: Mapping[str, float]) -> None:
-        """Begin anew where inputs bring the robot: commands of all cables [N or m] and chambers [Pa].
+        """Restart at the equilibrium under given inputs: commands of all cables [N or m] and chambers [Pa].
 
-        Where they bring it nowhere, nothing changes.
+        If they have no equilibrium, nothing changes.
         """
         body = self.robot.body
         true = {
@@ -90,17 +90,17 @@ class Follower:
         return search is not None and bool(search.status) and (search.status == REACHED or self._compared)
 
     def step(self, target: Target, *, seconds: float = 0.0, stays: bool = False) -> Motion:
-        """Go on towards a target, and return where that has led so far.
+        """Continue towards a target, and return the motion so far.
 
         Arguments:
             target: as `reach` takes it.
-            seconds: no further equilibrium is begun after so long [s], unless the target is reached but for the fineness of the
-                state; one is solved in any case.
-            stays: the target is not about to move. Where the way has ended elsewhere, further steps seek it from rest too;
-                what they find is taken where it is nearer.
+            seconds: time after which no further equilibrium is started [s], except to solve the final state to full tolerance; at least one
+                is solved.
+            stays: the target will not move. If the search has ended elsewhere, further steps also search from rest, and a closer
+                result is taken.
 
         Returns:
-            the motion; "converging" where more steps come nearer.
+            the motion; its status is "converging" while further steps reduce the error.
 
         Raises:
             InputError: an unknown marker, or a target that is no place.

@@ -1,4 +1,4 @@
-"""What is wanted of the body: rows of the coordinates of its points, and the contact forces that act meanwhile."""
+"""The goal of a search: target coordinates of points of the body, and the contact forces that act on it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from femsense.model.robot import Robot
 Forces = Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]
 """Known contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,)."""
 Target = Mapping[str | tuple[float, float, float], npt.ArrayLike]
-"""A marker's name, or a point of the body at rest [m] → where it is wanted, robot frame [m], (3,);
+"""A marker's name, or a point of the body at rest [m] → its target position, robot frame [m], (3,);
 NaN leaves a direction free."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Goal:
-    """What is wanted: rows of the points' coordinates."""
+    """Target coordinates, one row each."""
 
     ties: Embedding
     """The points, p of them."""
@@ -47,7 +47,7 @@ class Goal:
         return np.stack([np.einsum("rpc,pc->r", self.directions, self.ties.moves(move)) for move in moves], axis=1)
 
     def error(self, positions: FloatArray) -> float:
-        """Return the largest distance of a point from what is wanted of it [m]."""
+        """Return the largest distance of a point from its target [m]."""
         off = np.einsum("r,rpc->pc", self.miss(positions), self.directions)
         return float(np.linalg.norm(off, axis=1).max(initial=0.0))
 

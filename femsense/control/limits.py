@@ -19,7 +19,7 @@ CONTROLS = ("tension", "displacement")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Limits:
-    """Bounds of efforts (tensions [N], then pressures [Pa]) and of what the motors wind up [m]."""
+    """Bounds of efforts (tensions [N], then pressures [Pa]) and of the lengths wound up by the motors [m]."""
 
     low: FloatArray
     high: FloatArray
@@ -32,7 +32,7 @@ class Limits:
     ) -> tuple[FloatArray | None, FloatArray | None, list[tuple[int, str]]]:
         """Return G and h of the limits of length for scaled steps within low … high, and which limit each row is.
 
-        A limit that is violated asks for what most of the trust region can do towards it, so that the problem has an answer.
+        A violated limit is relaxed to a value that most of the trust region can reach, so that the problem is feasible.
         """
         pairs = [(i, "longest", slopes[i], self.short_high[i] - wound[i]) for i in range(len(wound))]
         pairs += [(i, "shortest", -slopes[i], wound[i] - self.short_low[i]) for i in range(len(wound))]
@@ -45,11 +45,11 @@ class Limits:
         return G, np.maximum([room for *_, room in pairs], within), [(i, which) for i, which, _, _ in pairs]
 
     def violation(self, wound: FloatArray) -> float:
-        """Return by how much a limit of length is violated at most [m]."""
+        """Return the largest violation of a length limit [m]."""
         return float(np.maximum(wound - self.short_high, self.short_low - wound).max(initial=0.0))
 
     def outside(self, effort: FloatArray) -> float:
-        """Return by how much a limit of effort is violated at most [N, Pa]."""
+        """Return the largest violation of an effort limit [N, Pa]."""
         return float(np.maximum(effort - self.high, self.low - effort).max(initial=0.0))
 
     def text(self, i: int, which: str, body: BodyModel) -> str:

@@ -1,4 +1,4 @@
-"""What `reach` takes and returns."""
+"""Arguments and results of `reach`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Motion:
     """Inputs that bring points of the body to wanted places, or as near as the limits allow."""
 
     inputs: dict[str, float]
-    """What to command: tension [N] or shortening [m] of each cable, pressure [Pa] of each chamber."""
+    """Commands: tension [N] or shortening [m] of each cable, pressure [Pa] of each chamber."""
     positions: FloatArray
     """Where the nodes end up at equilibrium [m], shape (n, 3)."""
     reached_m: dict[str, FloatArray]
@@ -59,7 +59,7 @@ class Motion:
     equilibrium: Equilibrium
     """The state, a start for the next target."""
     correction_std_m: float | None = None
-    """Standard deviation along each axis of what the robot's correction adds to `reached_m` [m]; None where it is not used."""
+    """Standard deviation along each axis of the empirical correction in `reached_m` [m]; None if it is not used."""
 
     @property
     def text(self) -> str:

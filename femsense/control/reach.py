@@ -43,23 +43,23 @@ def reach(
     contacts: Sequence[WallContact] = (),
     options: ReachOptions | None = None,
 ) -> Motion:
-    """Find the inputs that bring points of the body to wanted places, within limits.
+    """Find the inputs that bring points of the body to target positions, within limits.
 
     Arguments:
         robot: the robot with its effects; its cables' and chambers' limits hold.
-        target: a marker's name, or a point of the body at rest [m] → where it is wanted, robot frame [m], shape (3,); NaN leaves
+        target: a marker's name, or a point of the body at rest [m] → its target position, robot frame [m], shape (3,); NaN leaves
             a direction free.
-        control: what is commanded of the cables: "tension" [N] or "displacement" [m].
-        limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], beside those of the robot.
+        control: kind of the cable commands: "tension" [N] or "displacement" [m].
+        limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], in addition to those of the robot.
         forces: known or sensed contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,).
-        start: where the robot is now; by default at rest without inputs. Where no way leads on from there,
-            one from rest is tried.
-        calibration: its initial inputs are taken off the commands.
-        contacts: walls to press against with a wanted force.
-        options: when to end.
+        start: the current state of the robot; by default at rest without inputs. If the search fails from there, it is repeated
+            from rest.
+        calibration: its initial inputs are subtracted from the commands.
+        contacts: walls to press with a given force.
+        options: criteria to end the search.
 
     Returns:
-        the motion; a target out of reach is a status with the nearest state and what limits it, no exception.
+        the motion; an unreachable target is a status with the closest state and the active limits, not an exception.
 
     Raises:
         InputError: an unknown marker, cable or control, limits the wrong way round, or no correction where one is asked for.

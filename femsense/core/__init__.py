@@ -1,1 +1,1 @@
-"""What every room uses: errors, arrays, poses, least squares, parallel work, words of messages."""
+"""Used by every room: errors, arrays, poses, least squares, parallel work, texts of messages."""

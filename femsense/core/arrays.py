@@ -1,4 +1,4 @@
-"""The only coercion of input arrays, and the array types that the code speaks of."""
+"""Array types, and the coercion of input arrays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def as_numbers(values: npt.ArrayLike, name: str, *, expected: object = "numbers", hint: str | None = None) -> FloatArray:
-    """Coerce to numbers of any shape. Raises InputError, which says what was expected and what to try."""
+    """Coerce to numbers of any shape. Raises InputError with what was expected and a hint."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What can go wrong, said once and clearly."""
+"""The exceptions of femsense. Physics that fails is a status in a result, not an exception."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class FemsenseError(Exception):
 
 
 class InputError(FemsenseError):
-    """Bad input: where it stands, what was found, what was expected, what to try.
+    """Bad input, with its location, what was found, what was expected, and a hint.
 
     Arguments:
         what: the problem in one sentence.

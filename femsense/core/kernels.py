@@ -1,4 +1,4 @@
-"""Kernels: functions that numba compiles once and keeps.
+"""Kernels: functions that numba compiles once and caches.
 Those that were kept are loaded without the rules by which numba compiles.
 
 numba brings all its rules of typing and lowering into memory before it looks whether a kernel was kept.
@@ -29,7 +29,7 @@ atexit.register(
 
 
 class KeptKernels(FunctionCache):  # type: ignore[misc]
-    """What numba kept of a kernel; the rules of compiling are loaded only where nothing fits."""
+    """Numba's cache of a kernel; the compiler is loaded only if the cache has no matching entry."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the kernel for a signature, or None, after which numba compiles it."""
@@ -43,7 +43,7 @@ class KeptKernels(FunctionCache):  # type: ignore[misc]
 
 
 def njit(*arguments: Any, cache: bool = False, **options: Any) -> Any:
-    """Return `numba.njit`; with `cache`, what was compiled is kept beside the module and loaded from there."""
+    """Return `numba.njit`; with `cache`, machine code is cached next to the module and loaded from there."""
     if arguments:
         return numba.njit(*arguments, **options)
     plain = numba.njit(**options)

@@ -23,7 +23,7 @@ class Latest(Generic[T]):
         """Number of items that were replaced before anybody took them."""
 
     def put(self, item: T) -> None:
-        """Replace what is in the slot; returns at once."""
+        """Replace the item; returns immediately."""
         with self._changed:
             self.dropped += len(self._items)
             self._items = [item]

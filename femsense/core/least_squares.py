@@ -1,4 +1,4 @@
-"""Bounded Gauss–Newton with priors, a covariance, and a statement of what the data do not determine."""
+"""Bounded Gauss–Newton for whitened residuals, with priors as rows, a covariance, and infinite variances along undetermined directions."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
 
 
 STILL = 1e-2
-"""A step that changes the whitened residual by less than this is none."""
+"""The fit has converged when a step changes the whitened residual by less than this norm."""
 
 
 NEARLY = 4.0
-"""A step is idle that gained less than what counts as a gain where the predicted gain of a whole step was less than so many times
-that."""
+"""A step is idle if its gain is below the threshold `gain` and the predicted gain of the undamped step is below NEARLY × `gain`."""
 LITTLE = 2.0
-"""A step is the last whose predicted gain was less than so many times what counts as a gain, by a Jacobian of its own;
-not in units of the misfit, which may be large because the fit is far from its end."""
+"""A step is the last one if the Jacobian at θ predicts a gain below LITTLE × `enough`. This threshold is not scaled by the misfit, which may be
+large because the fit is far from its minimum."""
 LEAST_SHRINKING = 0.25
-"""No step is foretold to be shorter than this share of the one before."""
+"""Smallest predicted ratio of the lengths of two successive steps."""
 CONVERGED, STOPPED_EARLY = "converged", "stopped early"
 MOST_DAMPING = 1e8
 AT_NONSMOOTH = 0.2
-"""A fit has converged on a bend that is nearer than so many standard errors."""
+"""θ lies on a kink of the residual if it is within this number of standard errors of it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -41,22 +40,23 @@ class FitResult:
     theta: FloatArray
     """Shape (p,)."""
     covariance: FloatArray
-    """Of θ for unit residual variance, shape (p, p); infinite variance where the data say nothing."""
+    """Of θ for unit residual variance, shape (p, p); infinite variance along directions that the data do not determine."""
     residual: FloatArray
     """Whitened residual, shape (N,)."""
     jacobian: FloatArray
-    """Its derivative, shape (N, p); on a bend the mean of both sides that leaves no gradient."""
+    """Its derivative, shape (N, p); on a kink the convex combination of both one-sided derivatives for which the gradient vanishes."""
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
     """"converged", "iterations", or "stopped early" (see `worth` of `GaussNewtonOptions`)."""
     own: bool = True
-    """Whether the Jacobian is that at θ; else that of a step before."""
+    """Whether the Jacobian was computed at θ; otherwise it is that of an earlier step."""
 
 
 class Pace:
-    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf:
-    not known."""
+    """Lengths of the last step and, extrapolated as a geometric series, of the next one; inf: unknown.
+
+    Only steps with a Jacobian computed at their own start count."""
 
     def __init__(self) -> None:
         self.last, self.next = np.inf, np.inf
@@ -68,13 +68,13 @@ class Pace:
 
 
 def broyden_update(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the Jacobian that is nearest to J and has what J missed along a step, shape (N, p).
+    """Return Broyden's update of a Jacobian, shape (N, p): the nearest one that reproduces the change along the last step.
 
     Arguments:
         J: a Jacobian, shape (N, p).
         step: the step that was taken, shape (p,).
-        scale: size of each column, in whose units steps are short or long, shape (p,).
-        missed: what the residual changed by beside J step, shape (N,).
+        scale: norm of each column, the unit of its parameter, shape (p,).
+        missed: change of the residual minus J step, shape (N,).
 
     J + missed (D²s)ᵀ / (sᵀD²s), D = diag(scale).  Source: Broyden, "A class of methods for solving nonlinear simultaneous equations" (1965).
     """
@@ -85,41 +85,37 @@ def broyden_update(J: FloatArray, step: FloatArray, scale: FloatArray, missed: F
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """How a fit learns from its own steps."""
+    """How a fit uses the history of its steps."""
 
     update: Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray] = broyden_update
     """J, step, scale, missed → the Jacobian after a step."""
     pace: Callable[[], Pace] = Pace
-    """Makes what foretells the length of the next step."""
+    """Factory of the predictor of step lengths."""
     curvature: Callable[[], Curvature] = Curvature
-    """Makes what knows of second derivatives."""
+    """Factory of the estimator of second derivatives."""
 
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonOptions:
-    """When a step and a Jacobian serve, and when a fit ends."""
+    """When a Jacobian is reused, and when a fit ends."""
 
     max_iterations: int = 30
     """Gauss–Newton steps at most."""
     tolerance: float = 1e-10
     """Relative decrease at which it stops [1]."""
     still: float = STILL
-    """Length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise."""
+    """Change of the whitened residual at which it stops, in units of the root mean square misfit if that exceeds 1."""
     serves: float = 0.0
-    """A Jacobian serves for another step where it missed the change of the residual by less than this share of it,
-    or by less than what counts as a gain."""
+    """A Jacobian is reused if its prediction error is below this share of the change of the residual, or below the square root of the gain threshold."""
     worth: float = np.inf
-    """A fit whose sum of squares stays above this is stopped early:
-    where the predicted gain of a step is less than half of what is missing,
-    or a borrowed Jacobian says that nothing is left to gain."""
+    """Stop early if the sum of squares will stay above this value: the predicted gain is less than half of the excess, or a borrowed
+    Jacobian predicts no further gain."""
     trusted: float = 0.0
-    """A Jacobian that missed less than this share of every step since it was made is believed, too,
-    that nothing is left to gain."""
+    """A reused Jacobian may also declare convergence if its relative prediction error stayed below this value in every step since it was computed."""
     enough: float = 0.0
-    """What counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0:
-    all that `tolerance` says."""
+    """Decrease of the sum of squares that counts as a gain, in units of the mean squared misfit if that exceeds 1. 0: `tolerance` alone decides."""
     learning: Learning = field(default_factory=Learning)
-    """How it learns from its own steps."""
+    """How it uses the history of its steps."""
 
 
 def gauss_newton(
@@ -133,24 +129,30 @@ def gauss_newton(
     nonsmooth: Callable[[FloatArray], Nonsmoothness | None] | None = None,
     options: GaussNewtonOptions | None = None,
 ) -> FitResult:
-    """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends,
-    as far as its Jacobians have shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
+    """Minimise ‖r(θ)‖² within bounds.
 
-    A Jacobian that predicted the last step well serves for the next one too;
-    the fit ends only where the Jacobian at θ itself says that there is nothing left to gain (or one that is `trusted`), or, where
-    what is left is noise, where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own, shrink like a geometric
-    series, so that two of them foretell the next. It ends as well where two steps in turn were idle: their predicted gain was
-    little and they brought less (`enough`). On a bend there may always be a little to gain. And a step with next to no predicted
-    gain by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
+    Gauss–Newton with Levenberg's damping after a failed step. Curvature of the residual, estimated from the Jacobians of earlier steps, is added
+    to JᵀJ as long as it predicts steps at least as well as the linear model (`core.local_model`). A Jacobian that predicted the last
+    step well is reused, corrected by Broyden's update.
+
+    The fit ends when
+
+    - the Jacobian at θ, or a reused one that is `trusted`, predicts no gain and no change of the residual;
+    - the misfit is at noise level and the next step, extrapolated from the last two as a geometric series, would be still;
+    - two successive steps were idle (`NEARLY`): on a kink of the residual a small gain is always predicted and never obtained;
+    - the Jacobian at θ predicts a gain below `LITTLE` × `enough`: the step is taken, and is the last.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
-        theta: the start, shape (p,).
+        theta: initial guess, shape (p,).
         low, high: bounds, shape (p,).
-        known: residual and Jacobian at the start, where they are known.
-        borrowed: a Jacobian from near the start to begin with.
-        nonsmooth: θ → where the residual bends near by, for the Jacobian that was computed last.
-        options: when a step serves, and when to end.
+        known: residual and Jacobian at the initial guess, if they are known.
+        borrowed: a Jacobian from a nearby θ, used for the first step.
+        nonsmooth: θ → the kinks of the residual near θ, for the Jacobian that was computed last.
+        options: when a Jacobian is reused, and when to end.
+
+    Raises:
+        DataError: the residual cannot be evaluated at the initial guess.
     """
     p = len(theta)
     low = np.full(p, -np.inf) if low is None else low
@@ -163,7 +165,7 @@ def gauss_newton(
     rule = options or GaussNewtonOptions()
     learning = rule.learning
     damping, status, steps, pace = 0.0, "iterations", 0, learning.pace()
-    idle = 0  # idle steps in turn
+    idle = 0  # successive idle steps
     curvature = learning.curvature()
     while steps < rule.max_iterations or not slope.own:
         bends = None if nonsmooth is None else nonsmooth(theta)
@@ -173,7 +175,9 @@ def gauss_newton(
         step = near.step(damping)
         change, predicted_sum = near.change(step), near.predicted_gain(step)
         whole = predicted_sum if damping == 0.0 else near.predicted_gain(near.step(0.0))
-        error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is rule.worth where the model misfits
+        error = (
+            max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5
+        )  # rms misfit: the unit of changes that matter, at least that of the noise
         gain = rule.enough * error**2
         small = predicted_sum <= rule.tolerance * costs[-1] or np.linalg.norm(change) <= rule.still * error
         at_end = not slope.own and (small or steps >= rule.max_iterations)
@@ -196,7 +200,7 @@ def gauss_newton(
             if not slope.own and idle < 2:
                 residual, slope = _both(evaluate, theta)
                 continue
-            if curvature.believed:  # straight lines may do better
+            if curvature.believed:  # the linear model may predict better than the curved one
                 curvature.believed = False
             else:
                 damping = _shorter(near, damping, change)
@@ -230,17 +234,17 @@ def gauss_newton(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Slope:
-    """The Jacobian at hand, and how far it may be believed."""
+    """The current Jacobian and its validity."""
 
     J: FloatArray
     own: bool = True
-    """Whether it is that at θ."""
+    """Whether it was computed at θ."""
     sure: bool | None = True
-    """Whether it foretold all steps since it was made; None: it was made elsewhere, and no step has been taken by it."""
+    """Whether it predicted all steps since it was computed; None: it is borrowed, and no step has tested it."""
 
 
 def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:
-    """Return the damping that makes a step change the residual by half as much as `change` or less."""
+    """Return a damping for which the step changes the residual by at most half as much as `change`."""
     while damping <= MOST_DAMPING:
         damping = max(10.0 * damping, 1e-4)
         if np.linalg.norm(near.change(near.step(damping))) <= 0.5 * np.linalg.norm(change):
@@ -249,11 +253,9 @@ def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:
 
 
 def _at_nonsmooth(J: FloatArray, r: FloatArray, nonsmooth: Nonsmoothness) -> FloatArray:
-    """Return the derivative that stands for both sides of the bends on which a fit converged:
-    the mean of them that leaves no gradient.
+    """Return the element of Clarke's generalised Jacobian for which the gradient vanishes, on kinks at which a fit converged, shape (N, p).
 
-    Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its
-    gradients).
+    At such a minimum neither one-sided derivative has a zero gradient: the linear model of one side would predict a further gain.
     """
     spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", nonsmooth.slope, _finite(covariance_of(J)), nonsmooth.slope), 0.0))
     here = np.abs(nonsmooth.value) < AT_NONSMOOTH * spread
@@ -277,7 +279,7 @@ def _finite(covariance: FloatArray) -> FloatArray:
 def _first(
     evaluate: Evaluate, theta: FloatArray, known: tuple[FloatArray, FloatArray | None] | None, borrowed: FloatArray | None
 ) -> tuple[FloatArray, _Slope]:
-    """Return residual and Jacobian to begin with."""
+    """Return residual and Jacobian at the initial guess."""
     if known is not None and known[1] is not None:
         return known[0], _Slope(known[1])
     if borrowed is not None:
@@ -292,7 +294,7 @@ def _both(evaluate: Evaluate, theta: FloatArray) -> tuple[FloatArray, _Slope]:
 
 
 def _tried(evaluate: Evaluate, theta: FloatArray) -> FloatArray | None:
-    """Return the residual; None where θ cannot be evaluated."""
+    """Return the residual, or None if θ cannot be evaluated."""
     try:
         return evaluate(theta, False)[0]
     except DataError:
@@ -300,7 +302,7 @@ def _tried(evaluate: Evaluate, theta: FloatArray) -> FloatArray | None:
 
 
 def covariance_of(jacobian: FloatArray) -> FloatArray:
-    """Return (JᵀJ)⁻¹, with infinite variance along parameters that J does not see."""
+    """Return (JᵀJ)⁻¹, with infinite variance of parameters that J does not determine, shape (p, p)."""
     scale = np.linalg.norm(jacobian, axis=0)
     seen = scale > 0
     covariance = np.full((jacobian.shape[1],) * 2, 0.0)
@@ -318,7 +320,7 @@ def covariance_of(jacobian: FloatArray) -> FloatArray:
 
 
 def basis_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return an orthonormal basis Q of columns J (N, p), and A with A Qᵀ = J⁺, so that A Aᵀ = (JᵀJ)⁻¹ over the directions that J sees."""
+    """Return an orthonormal basis Q of columns J (N, p), and A with A Qᵀ = J⁺, so that A Aᵀ = (JᵀJ)⁻¹ in the row space of J."""
     norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     U, s, Vt = np.linalg.svd(columns / norm, full_matrices=False)
     seen = s > max(1e-9 * s.max(initial=0.0), 1e-300)
@@ -326,6 +328,6 @@ def basis_of(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def beside(columns: FloatArray, values: FloatArray) -> FloatArray:
-    """Return what is left of values (N, …) once columns (N, p) explain what they can."""
+    """Return values (N, …) projected onto the orthogonal complement of columns (N, p)."""
     Q = basis_of(columns)[0]
     return np.asarray(values - Q @ (Q.T @ values))

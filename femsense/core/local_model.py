@@ -1,13 +1,11 @@
-"""A sum of squares near a point: that of a linear residual,
-but for known nonsmoothness and for the curvature that earlier steps showed.
+"""A local model of ‖r‖²: linear residual, known kinks, and curvature estimated from earlier steps.
 
-Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton takes S for 0.
-Along a bent valley where much residual is left S takes away most of JᵀJ, and each step covers a small share of the way; how J
-changed from one point of the fit to the next tells S along that way.
+Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton neglects S. In a curved valley with a large residual S cancels most
+of JᵀJ, and Gauss–Newton steps cover a small share of the way; the change of J from one iterate to the next determines S along that step.
 
-Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is updated and sized as they do it;
-of all S that agree with the last step it is the nearest to the one before, measured by JᵀJ (they measure by the change of the
-slope, which may be next to nothing).
+Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is updated and sized as there: among all S that satisfy the
+secant condition of the last step it is the one closest to the previous S, in the norm of JᵀJ. (They use the norm of the change of the gradient, which
+can be almost zero.)
 """
 
 from __future__ import annotations
@@ -20,41 +18,41 @@ from scipy.optimize import lsq_linear
 from femsense.core.arrays import BoolArray, FloatArray
 
 WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
-"""How far bends of the residual are rounded, in shares of the way that a plain step goes past them; one after the other."""
+"""Widths to which kinks are smoothed in turn, as shares of the distance by which the unsmoothed step passes them."""
 TURNS = 4
-"""Gauss–Newton steps for each of these, of a problem that costs nothing to evaluate."""
+"""Gauss–Newton steps for each width; evaluating the local model is cheap."""
 LEAST = 0.2
-"""Share of JᵀJ that S leaves in any direction: what few steps show may be wrong elsewhere."""
+"""JᵀJ + S keeps at least this share of JᵀJ in every direction: S is estimated from few steps and may be wrong in other directions."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nonsmoothness:
-    """Where the residual bends, although what makes it bend is known:  r(θ + s) ≈ r + J₀ s + W (max(v + U s, 0) − max(v, 0)).
+    """Kinks of the residual: r(θ + s) ≈ r + J₀ s + W (max(v + U s, 0) − max(v, 0)).
 
-    A cable that is not pulled does not push, so that the tension that its zero and its log make together ends at 0.
+    Example: a cable does not push, so its tension, the logged value plus a fitted zero, is cut off at 0.
     """
 
     columns: FloatArray
-    """W: change of the whitened residual by each value that is cut off at 0, shape (N, g)."""
+    """W: derivative of the whitened residual by each value that is cut off at 0, shape (N, g)."""
     value: FloatArray
-    """v: what it would be at θ if it were not cut off, shape (g,)."""
+    """v: the values at θ before the cut-off, shape (g,)."""
     slope: FloatArray
     """U: its derivative by θ, shape (g, p)."""
     counted: BoolArray
-    """Whether the Jacobian counts it as not cut off, shape (g,)."""
+    """Whether the Jacobian was computed with the value above the cut-off, shape (g,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Point:
-    """Where a Jacobian was computed."""
+    """An iterate with its Jacobian."""
 
     theta: FloatArray
     J: FloatArray
     nonsmooth: Nonsmoothness | None
 
     def as_counted_at(self, other: _Point) -> FloatArray | None:
-        """Return the Jacobian here with the bends counted as they are elsewhere, so that no jump is taken for curvature;
-        None: they are others."""
+        """Return the Jacobian here with the active kinks of another point, so that a jump of the derivative is not taken for curvature;
+        None if the points have different kinks."""
         here, there = self.nonsmooth, other.nonsmooth
         if here is None or there is None:
             return self.J if here is there else None
@@ -64,13 +62,13 @@ class _Point:
 
 
 class Curvature:
-    """S as far as the Jacobians of a fit have shown it."""
+    """The estimate of S from the Jacobians of a fit."""
 
     def __init__(self) -> None:
         self.S: FloatArray | None = None
-        """Shape (p, p); None: nothing is known."""
+        """Shape (p, p); None: no estimate yet."""
         self.believed = True
-        """Whether it foretold the last step no worse than straight lines; at first it is."""
+        """Whether it predicted the last step at least as well as the linear model; initially True."""
         self.last: _Point | None = None
 
     def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, nonsmooth: Nonsmoothness | None) -> None:
@@ -95,18 +93,18 @@ class Curvature:
         self.S = S + outer + outer.T - float(step @ missed) / size**2 * np.outer(along, along)
 
     def judge(self, near: LocalModel, step: FloatArray, gain: float) -> None:
-        """Go on believing in S if it foretells what a step brought no worse than straight lines do."""
+        """Keep using S if it predicts the gain of a step at least as well as the linear model."""
         straight, curved = (abs(near.predicted_gain(step, curved=curved) - gain) for curved in (False, True))
         self.believed = curved <= straight
 
 
 def with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return C with CᵀC = JᵀJ + S, S being cut so that it leaves the least share of JᵀJ, and nothing where J sees nothing.
+    """Return C with CᵀC = JᵀJ + S, with S bounded so that at least the share LEAST of JᵀJ remains, and zero in the null space of J.
 
     Arguments:
         J: the Jacobian, shape (N, p).
-        S: what curvature adds to JᵀJ, symmetric, shape (p, p).
-        scale: size of each column of J, shape (p,).
+        S: curvature term, symmetric, shape (p, p).
+        scale: norm of each column of J, shape (p,).
     """
     _, size, Vt = np.linalg.svd(J / scale, full_matrices=False)
     seen = size > 1e-9 * size.max()
@@ -117,7 +115,7 @@ def with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArra
 
 
 class LocalModel:
-    """What the sum of squares is near θ."""
+    """The local model of ‖r‖² near θ."""
 
     def __init__(
         self,
@@ -136,7 +134,7 @@ class LocalModel:
         self.scale = np.linalg.norm(J, axis=0)
         self.scale[self.scale == 0] = 1.0
         self.r, self.J = r, J
-        if nonsmooth is not None:  # of all rows, these are what sums of squares depend on
+        if nonsmooth is not None:  # sums of squares depend on the R factor alone: far fewer rows
             p, g = len(self.scale), len(nonsmooth.value)
             R = np.asarray(np.linalg.qr(np.column_stack([self.plain, nonsmooth.columns, r]), mode="r"))
             self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
@@ -147,19 +145,19 @@ class LocalModel:
             self.S = C.T @ C - self.J.T @ self.J
 
     def change(self, step: FloatArray) -> FloatArray:
-        """Return by how much a step changes the residual, shape (N,)."""
+        """Return the change of the residual by a step, shape (N,)."""
         k = self.nonsmooth
         if k is None:
             return np.asarray(self.J @ step)
         return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
 
     def predicted_gain(self, step: FloatArray, *, curved: bool | None = None) -> float:
-        """Return by how much a step lowers the sum of squares; with S or without it, by default as far as it is believed."""
+        """Return the predicted decrease of the sum of squares by a step, with or without S; by default with S if it is in use."""
         bend = self.bend(step) if curved is None else curved * float(step @ self.S @ step)
         return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2)) - bend
 
     def bend(self, step: FloatArray) -> float:
-        """Return what S adds to the sum of squares, as far as it is believed."""
+        """Return the contribution sᵀ S s to the sum of squares; 0 if S is not in use."""
         return float(step @ self.S @ step) if self.curved else 0.0
 
     def step(self, damping: float) -> FloatArray:
@@ -183,7 +181,7 @@ class LocalModel:
         return best
 
     def _turn(self, s: FloatArray, damping: float, width: float) -> tuple[FloatArray, bool]:
-        """Return a better step, and whether there was one, where bends are rounded to a width."""
+        """Return an improved step for kinks smoothed to a width, and whether one was found."""
         k = self.nonsmooth
         assert k is not None
         root = np.sqrt(damping) * self.scale
@@ -200,7 +198,7 @@ class LocalModel:
         return s, False
 
     def _squares(self, J: FloatArray, r: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return C, c whose ‖c + C t‖² is, but for a constant, ‖r + J t‖² + (s + t)ᵀ S (s + t)."""
+        """Return C, c with ‖c + C t‖² = ‖r + J t‖² + (s + t)ᵀ S (s + t) up to a constant."""
         if not self.curved:
             return J, r
         C = with_curvature(J, self.S, self.scale)
@@ -217,7 +215,7 @@ class LocalModel:
 
 
 def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Return max(value, 0), rounded to a width, and its derivative."""
+    """Return max(value, 0), smoothed to a width, and its derivative."""
     length = np.sqrt(value**2 + width**2)
     return 0.5 * (value + length), 0.5 * (1.0 + value / np.maximum(length, 1e-300))
 

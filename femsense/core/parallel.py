@@ -29,15 +29,14 @@ _chosen: list[int] = []
 
 
 def set_workers(count: int | None) -> None:
-    """Choose how many threads work; None leaves it to FEMSENSE_WORKERS and the machine. Raises InputError."""
+    """Set the number of threads; None: by FEMSENSE_WORKERS, or by the machine. Raises InputError."""
     if count is not None and count < 1:
         raise InputError("not a number of threads", where="workers", found=count, expected="1 or more")
     _chosen[:] = [] if count is None else [count]
 
 
 def workers() -> int:
-    """Return how many threads work: as chosen, by FEMSENSE_WORKERS, or one a core;
-    one in a process that others were started beside."""
+    """Return the number of threads: as set, by FEMSENSE_WORKERS, or one per core; one in a worker process."""
     if _chosen:
         return _chosen[0]
     said = os.environ.get("FEMSENSE_WORKERS", "")
@@ -94,9 +93,9 @@ def _blas() -> ThreadpoolController:
 
 @contextmanager
 def beside(function: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Work on what will be needed later in a thread of its own, and give what waits for it and raises what it raised.
+    """Start a computation in a thread, and return a function that waits for its result and raises its exception.
 
-    With one worker nothing is begun: who needs it makes it then. Leaving waits for the thread.
+    With one worker it is computed at the first call instead. Leaving the context waits for the thread.
     """
     if workers() < 2:
         yield lambda: None

@@ -1,4 +1,4 @@
-"""Words in messages and names in files: what was meant, cut to a width, where in a document, and one spelling for a name."""
+"""Texts of messages and names in files: suggestions, shortening, locations in documents, normalised names."""
 
 from __future__ import annotations
 

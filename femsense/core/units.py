@@ -1,7 +1,7 @@
-"""Units of measurement: what their names mean in SI. Whatever reads a unit from a file, a column or an option asks here.
+"""Units of measurement and their SI values. All readers of files, columns and options use this table.
 
 Names are read in any case where that is unambiguous: `KPA` is kPa; `mPa` and `MN` are refused, because MPa and mN may be meant.
-Pressures are gauge pressures unless the unit says "absolute" (`bara`, `psia`, `kPa abs`): chambers take what is above the surroundings.
+Pressures are gauge pressures unless the unit says "absolute" (`bara`, `psia`, `kPa abs`): chambers take the pressure above the surroundings.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from enum import StrEnum
 from femsense.core.errors import InputError
 
 ATMOSPHERE_PA = 101_325.0
-"""Standard atmosphere [Pa]: what is subtracted from absolute pressures."""
+"""Standard atmosphere [Pa], subtracted from absolute pressures."""
 
 
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
@@ -24,7 +24,7 @@ PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 
 class Quantity(StrEnum):
-    """What a unit measures."""
+    """The quantity that a unit measures."""
 
     TIME = "time"
     LENGTH = "length"

@@ -1,4 +1,4 @@
-"""Work that is counted as it is done: it tells how far a computation is, and does not depend on the machine."""
+"""Counts of work done: a measure of progress that does not depend on the machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Work:
     equilibria: int = 0
     """Equilibria that were solved, those on the way to a load included."""
     responses: int = 0
-    """Linear responses of states to whatever was asked of them at once."""
+    """Linear responses of states, each to all its right-hand sides at once."""
     refined: int = 0
     """States that were continued on a finer mesh."""
 
@@ -27,7 +27,7 @@ _counting: ContextVar[tuple[tuple[Work, Callable[[], None] | None], ...]] = Cont
 
 @contextmanager
 def counting(tell: Callable[[], None] | None = None) -> Iterator[Work]:
-    """Yield what counts the work that this thread does meanwhile, that of its helpers included.
+    """Yield a counter of the work of this thread and of its helper threads.
 
     Arguments:
         tell: called after whatever was counted.
@@ -41,7 +41,7 @@ def counting(tell: Callable[[], None] | None = None) -> Iterator[Work]:
 
 
 def count(*, equilibria: int = 0, responses: int = 0, refined: int = 0) -> None:
-    """Count work that was done, wherever somebody does (`counting`)."""
+    """Add work that was done to the active counter (`counting`), if there is one."""
     for work, tell in _counting.get():
         with _adding:
             work.equilibria += equilibria

@@ -1,4 +1,4 @@
-"""What the solver knows of a body: mesh, material, clamp, cables and dead loads."""
+"""A body as the solver sees it: mesh, material, clamp, cables and dead loads."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BodyModel:
     gravity: FloatArray
     """[m/s²], shape (3,)."""
     dead_forces: FloatArray
-    """Nodal forces beside the weight, constant in space [N], shape (n, 3)."""
+    """Dead nodal forces in addition to the weight [N], shape (n, 3)."""
     stencil: Stencil
     cable_slots: tuple[IntArray, ...]
     """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
@@ -67,7 +67,7 @@ class BodyModel:
     chamber_curvature: tuple[sp.csr_matrix, ...] = ()
     """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
     carried_mass: FloatArray | None = None
-    """Masses of the nodes beside that of the body itself [kg], shape (n,); None: it carries none."""
+    """Additional masses at the nodes [kg], shape (n,); None: no additional mass."""
 
     @property
     def cable_names(self) -> tuple[str, ...]:
@@ -78,13 +78,13 @@ class BodyModel:
         return tuple(chamber.name for chamber in self.chambers)
 
     def weight(self) -> FloatArray:
-        """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g), on what the body carries too."""
+        """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g), additional masses included."""
         mass = self.material.density * self.stencil.node_volume
         return (mass if self.carried_mass is None else mass + self.carried_mass)[:, None] * self.gravity
 
     @property
     def mass(self) -> float:
-        """Mass of the body without what it carries [kg]."""
+        """Mass of the body without additional masses [kg]."""
         return float(self.material.density * self.stencil.node_volume.sum())
 
     def dead_load(self) -> FloatArray:
@@ -101,14 +101,14 @@ class BodyModel:
         return replace(self, gravity=_finite_vector(vector, "gravity"))
 
     def with_dead_forces(self, forces: npt.ArrayLike) -> BodyModel:
-        """Return the body with other dead forces beside its weight [N], shape (n, 3). Raises InputError."""
+        """Return the body with other dead forces in addition to its weight [N], shape (n, 3). Raises InputError."""
         wanted = as_points(forces, "dead_forces")
         if wanted.shape != self.mesh.nodes.shape:
             raise InputError("wrong shape", where="dead_forces", found=wanted.shape, expected=self.mesh.nodes.shape)
         return replace(self, dead_forces=freeze(wanted))
 
     def with_carried_mass(self, mass: npt.ArrayLike) -> BodyModel:
-        """Return the body with other masses of its nodes beside its own [kg], shape (n,): weights that turn with gravity.
+        """Return the body with other additional masses at its nodes [kg], shape (n,); their weight turns with gravity.
 
         Raises InputError.
         """
@@ -177,9 +177,9 @@ class BodyModel:
         return replace(self, clamp_stiffness=float(stiffness), clamp_turn_stiffness=float(turn), free_map=free_map)
 
     def scaled(self, scale: float) -> BodyModel:
-        """Return the body made larger about `clamp_center`: its nodes at rest, and with them what is tied to it.
+        """Return the body scaled about `clamp_center`: its rest positions and the points tied to it.
 
-        Pull points stay in space. Gradients go with 1/scale and volumes with scale³; patterns and ties stay.
+        Pull points stay in space. Gradients scale with 1/scale and volumes with scale³; sparsity patterns and ties are unchanged.
         """
         center, stencil = self.clamp_center, self.stencil
         mesh = TetMesh(center + scale * (self.mesh.nodes - center), self.mesh.tets)

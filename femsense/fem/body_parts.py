@@ -43,7 +43,7 @@ class Cable:
     pull_point: FloatArray
     """[m], shape (3,)."""
     exit_direction: FloatArray | None = None
-    """Unit vector in which the cable leaves the pull point, shape (3,); only friction feels it."""
+    """Unit vector along which the cable leaves the pull point, shape (3,); only friction depends on it."""
     min_tension: float = 0.0
     """[N]."""
     max_tension: float = np.inf

@@ -120,8 +120,8 @@ def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
 
 @njit(cache=True)
 def _bends(nodes: IntArray, weights: FloatArray, end: FloatArray, leaves: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the angles between unit vectors of segments, the last with what leaves, if anything does (Kahan:
-    accurate for small and for large angles)."""
+    """Return the angles between successive unit vectors of segments [rad], the last one with the exit direction if there is one
+    (Kahan's formula: accurate for small and for large angles)."""
     directions, _ = _segments(nodes, weights, end, positions)
     angles = np.zeros(len(directions))
     for s in range(len(directions)):

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Capstan friction: what a cable that rubs at its bends hands on from its motor to its far end."""
+"""Capstan friction: the tension along a cable from its motor to its far end, with stick at each bend."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from femsense.fem.body_parts import Cable
 def capstan_tensions(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
     """Return the tensions along a cable after a change of the motor's tension: capstan friction with stick (Euler, Eytelwein).
 
-    Going outwards from the motor, the tension behind a bend of angle θ stays what it was unless it leaves
-    [T e^(−μθ), T e^(+μθ)] of the tension T before the bend; then it is moved to that end.
+    Outwards from the motor, let T be the tension before a bend of angle θ. The tension behind the bend keeps its previous value (stick)
+    if that lies in [T e^(−μθ), T e^(+μθ)], and is moved to the nearest end of this interval (slip) otherwise.
 
     Arguments:
         angles: the bends, as `cables.bend_angles` gives them [rad], shape (s,).

@@ -83,7 +83,7 @@ def find_chamber(
         name: of the chamber.
         seed: any point inside the cavity [m], shape (3,).
         max_pressure: [Pa].
-        where: what messages name.
+        where: location for messages.
 
     Raises:
         InputError: the seed lies in the material, outside of the body, or in a cavity that is open.
@@ -193,7 +193,7 @@ def _solid_angles(nodes: FloatArray, faces: IntArray, point: FloatArray) -> Floa
 
 
 def _hidden_share(nodes: FloatArray, faces: IntArray, point: FloatArray) -> float:
-    """Return the share of directions from a point in which the surface stands [1]."""
+    """Return the share of directions from a point that meet the surface [1]."""
     step = np.arange(RAYS) + 0.5
     polar, azimuth = np.arccos(1.0 - 2.0 * step / RAYS), np.pi * (1.0 + np.sqrt(5.0)) * step
     rays = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)

@@ -29,8 +29,7 @@ from femsense.fem.mesh import EDGES, TetMesh
 from femsense.fem.stencil import Stencil, block_row_numbers
 
 TIE = 1e4
-"""Where the plate alone gives, its nodes are tied to it with springs that are together so many times as stiff as Young's modulus
-× reach."""
+"""Total stiffness of the springs between nodes and plate when only the rotation of the plate is compliant, in units of Young's modulus × reach."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +48,7 @@ class Ties:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Followers:
-    """Clamped nodes in the middle of an edge whose ends have springs: they are tied to the middle of these."""
+    """Clamped mid-edge nodes whose edge ends have springs: they are tied to the midpoint of the edge."""
 
     nodes: IntArray
     """shape (m, 3): a middle, and the ends of its edge."""

@@ -98,7 +98,7 @@ def compliance(
         equilibrium: the state at which it is linearised.
         points: points of the body at rest [m], shape (k, 3).
         directions: a direction at each point [1], shape (k, 3); used as they are, so unit vectors give m/N.
-        tangent: the linearisation, where it is known already.
+        tangent: the linearisation, if it is already known.
 
     Returns:
         W [m/N], shape (k + a + c, k + a + c): displacement of row i along its direction (for a cable: its shortening, for a

@@ -7,7 +7,7 @@ Energy of an element with quadrature points q of volume w_q and V = Σ w_q:
 
 R_q the closest rotation to F_q, λ' = min(λ, ¾ μ). What λ exceeds λ' by acts on θ, one number an element, the mean
 dilatation: that part of a tetrahedron with ten nodes asks for one thing, not four, and the element does not lock where ν is
-close to ½. Why ¾ stands in docs/elements.md. With one point (four nodes) it is the textbook element, whatever λ'.
+close to ½. Why ¾ stands in docs/method/elements.md. With one point (four nodes) it is the textbook element, whatever λ'.
 With h_qa = R_q ∇N_a, h_a = Σ w_q h_qa / V, V_q = F_q R_qᵀ, D_q = tr(V_q) I − V_q and p_q = λ' θ_q + (λ − λ') θ:
 
     force      f_a  = Σ w_q (2μ (F_q − R_q) + p_q R_q) ∇N_a

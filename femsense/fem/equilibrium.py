@@ -78,10 +78,10 @@ class Equilibrium:
     residual_n: float
     """Largest unbalanced nodal force under the whole load [N]."""
     status: str
-    """"converged" or what happened (a key of ADVICE)."""
+    """"converged", or the reason of the failure (a key of ADVICE)."""
     iterations: int
     reached: float
-    """Share of the load at which the positions stand [1]: 1, or where load steps had to stop."""
+    """Share of the load that `positions` balance [1]: 1, or the last successful load step."""
     indefinite_steps: int
     """Newton steps at which the stiffness was not positive definite: above 0 the body may have buckled or snapped through on the
     way, and there may be other equilibria."""
@@ -90,7 +90,7 @@ class Equilibrium:
     held: BoolArray
     """Cables that are held at a displacement and taut, then chambers that are held at a volume, shape (a + c,)."""
     nodal_forces: FloatArray
-    """Nodal forces beside the body's own dead load [N], shape (n, 3)."""
+    """Nodal forces in addition to the body's own dead load [N], shape (n, 3)."""
     factor: Factorization | None
     """The last factorised stiffness (of the last Newton step but one); a start for nearby solves."""
 
@@ -105,13 +105,13 @@ class Equilibrium:
 
     @property
     def advice(self) -> str:
-        """Cause of the status and what to try."""
+        """Cause of the status and its remedy."""
         return ADVICE[self.status]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SolveOptions:
-    """How an equilibrium is solved, and what friction remembers."""
+    """Options of the solver, and the history of friction."""
 
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
@@ -131,7 +131,7 @@ class SolveOptions:
     single: bool = False
     """Factors in single precision wherever these are positive definite; the residual and its tolerance are as ever."""
     newton: NewtonOptions = field(default_factory=NewtonOptions)
-    """When Newton takes a new stiffness, turns elements, or leaves a state that is only tried."""
+    """When Newton factorises a new stiffness, uses rotated steps, or gives up a trial state."""
 
 
 def solve_equilibrium(
@@ -151,16 +151,16 @@ def solve_equilibrium(
     Arguments:
         body: the body with its weight and dead forces.
         tension: name → tension at the motor [N]; cables that are not named anywhere are slack.
-        shortening: name → shortening that a cable is held at [m]; such a cable never pushes unless `bilateral`.
+        shortening: name → imposed shortening of a cable [m]; such a cable never pushes unless `bilateral`.
         pressure: name → pressure in a chamber above the surroundings [Pa]; chambers that are not named anywhere have none.
-        volume: name → growth of a chamber since rest [m³] that it is held at, as a pump of liquid does; it may suck.
+        volume: name → growth of a chamber since rest [m³] that is imposed, as by a liquid pump; its pressure may be negative.
         nodal_forces: further nodal forces [N], shape (n, 3).
-        start: an equilibrium to start from (its positions, tensions and factor).
+        start: an equilibrium as warm start (its positions, tensions and factor).
         bilateral: held cables may push.
-        options: how it is solved, and what friction remembers.
+        options: of the solver, and the history of friction.
 
     Returns:
-        the state; `status` says whether it is an equilibrium, `advice` what to do if not.
+        the state; `status` states whether it is an equilibrium, `advice` the remedy if not.
 
     Raises:
         InputError: unknown cable or chamber, one named twice, wrong shapes or values.
@@ -246,7 +246,7 @@ def _collect_loads(
 def _drive_values(
     names: tuple[str, ...], kind: str, effort: str, travel: str, given: Mapping[str, Mapping[str, float] | None]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return what cables or chambers are given: efforts, travels, and which are held at their travel."""
+    """Return the inputs of cables or chambers: efforts, travels, and which travels are imposed."""
     tables = {where: dict(given[where] or {}) for where in (effort, travel)}
     for where, values in tables.items():
         for name, value in values.items():

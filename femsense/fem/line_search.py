@@ -26,7 +26,7 @@ def line_search(
     gap: FloatArray,
     force: FloatArray,
 ) -> Internal | None:
-    """Go along a Newton step as far as the potential allows (Armijo); return the internal state there, None if nowhere.
+    """Backtrack along a Newton step until the potential decreases sufficiently (Armijo); return the internal state there, or None.
 
     Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
     """
@@ -35,7 +35,7 @@ def line_search(
     step = np.zeros(x0.shape)
     step.reshape(-1)[free] = du
     penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
-    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
+    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: the friction at its bends is a given force
     rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
     lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
     base = _merit(body, loads, state, held, here, penalty, lost)
@@ -92,7 +92,7 @@ def _weighted_length(cable: Cable, x: FloatArray, share: FloatArray) -> float:
 def _slope(
     body: BodyModel, loads: Loads, state: State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
 ) -> float:
-    """Return the derivative of the potential (of held cables only what friction takes away) along a step."""
+    """Return the derivative of the potential along a step; held cables contribute their friction only."""
     gradient = here.forces - loads.forces
     rows = drive_rows(body, state)
     loose = state.T.copy()

@@ -125,7 +125,7 @@ def to_quadratic(mesh: TetMesh) -> TetMesh:
 
 
 def to_linear(mesh: TetMesh) -> TetMesh:
-    """Return the mesh of the corner nodes (their numbers stay where they stand first)."""
+    """Return the mesh of the corner nodes, which keep their numbers if they come first."""
     if not mesh.is_quadratic:
         return mesh
     used = np.unique(mesh.tets[:, :4])
@@ -320,7 +320,7 @@ ROUNDING = 1e-12
 """Weights below this are rounding. Their products, in the stiffness of cables,
 would be numbers so small that processors take many times as long for them: factors in single precision took twice the time."""
 ONE_BY_ONE = 16
-"""So many points are compared with every centre: importing SciPy's tree takes longer."""
+"""Up to this number of points, a comparison with every centre is faster than importing SciPy's tree."""
 AT_ONCE = 4096
 """Points that are looked for together."""
 

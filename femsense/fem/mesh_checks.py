@@ -16,7 +16,7 @@ from femsense.fem.mesh import TetMesh, body_parts, element_volumes
 def check_mesh(mesh: TetMesh, where: str) -> None:
     """Refuse what cannot be computed: no elements, flat or inverted ones, unused nodes, loose parts. Raises InputError.
 
-    Parts that hang together by an edge or a corner can be computed but swing; this is a warning.
+    Parts connected by an edge or a corner only can be computed but act as hinges; this is a warning.
     """
     if not len(mesh.tets):
         raise InputError("the mesh has no tetrahedra", where=where, expected="tetrahedra (tetra or tetra10 cells)")

@@ -28,10 +28,10 @@ from femsense.fem.newton_state import (
 from femsense.fem.slack_and_friction import let_go, update_friction, update_slack
 
 SURE = 0.1
-"""Where a step left less than this share, the next one is likely to leave less than `NewtonOptions.chord`:
-no tangent is made for the state it leads to."""
+"""If a step left less than this share of the residual, the next one will likely leave less than `NewtonOptions.chord`, so no
+tangent is assembled at the state it leads to."""
 LENT = 0.1
-"""So does one that was lent by a state near by."""
+"""The same for a factor borrowed from a nearby state."""
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
 PATIENCE = 5
@@ -44,11 +44,11 @@ PAIRS = 8
 ARRIVED = 5e-7
 """A state that is only tried is there when a step was shorter than this share of the body's size."""
 FAR = 1e6
-"""A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
+"""A stiffness factorised at a residual above this multiple of the tolerance does not decide the stability of the final state."""
 CLOSED = 1e-12
 """How far a held cable may miss its length [m]."""
 FOLLOW_FRICTION = 25
-"""Newton steps at most in which the tensions along the cables follow the bends; then they stand still until Newton rests."""
+"""Largest number of Newton steps in which cable tensions follow the bends; afterwards they are fixed until Newton converges."""
 
 
 def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> str:
@@ -71,7 +71,7 @@ def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             continue
         if not frictional or update_friction(body, loads, state):
             return CONVERGED
-        state.borrowed = True  # the tensions move by little: the factor at hand serves
+        state.borrowed = True  # the tensions change little, so the current factor is reused
     return "iterations"
 
 
@@ -143,12 +143,11 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
 
 
 class Secants:
-    """What steps since the last factor have shown of the stiffness, where nothing is held:
-    BFGS updates of its inverse (Matthies & Strang 1979)."""
+    """BFGS updates of the inverse stiffness by the steps since the last factor, without held drives (Matthies & Strang 1979)."""
 
     def __init__(self) -> None:
         self.pairs: list[tuple[FloatArray, FloatArray, float]] = []
-        """Steps [m], what they took away from the unbalanced force [N], and one over their product."""
+        """Steps s [m], the decreases y of the unbalanced force [N], and 1/(sᵀy)."""
         self.last: tuple[FloatArray, FloatArray] | None = None
 
     def learn(self, x: FloatArray, force: FloatArray) -> None:
@@ -161,7 +160,7 @@ class Secants:
         self.last = x, force
 
     def step(self, factor: Factorization, force: FloatArray) -> FloatArray:
-        """Return the step that an unbalanced force asks for [m], shape (f,)."""
+        """Return the quasi-Newton step of an unbalanced force [m], shape (f,)."""
         shares = []
         for step, fell, weight in reversed(self.pairs):
             shares.append(weight * float(step @ force))
@@ -246,5 +245,5 @@ def bordered_step(
 
 
 def _contradicts(reached: FloatArray, gap: FloatArray, lever: FloatArray) -> bool:
-    """Return whether a step cannot close the gaps of what is held: their rows depend on each other."""
+    """Return whether a step cannot close the gaps of held drives, because their rows are linearly dependent."""
     return bool((np.abs(reached - gap) / lever).max() > 1e-3 * (np.abs(gap) / lever).max() + CLOSED)

@@ -1,4 +1,4 @@
-"""What drives a body, where the iteration towards its equilibrium stands, and the forces and travels of its drives."""
+"""The drives of a body, the state of the Newton iteration, and forces and travels of the drives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONVERGED = "converged"
 
 @dataclass(frozen=True, slots=True)
 class NewtonOptions:
-    """When Newton takes a new stiffness, when it turns elements, and when it leaves a state that is only tried."""
+    """When Newton factorises a new stiffness, when it uses rotated steps, and when it gives up a trial state."""
 
     chord: float = 1e-2
     """A stiffness serves for another step where the last one left less than this share of the residual,
@@ -43,12 +43,12 @@ class NewtonOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Loads:
-    """What drives the body (cables, then chambers: a + c drives)."""
+    """The drives of the body (cables, then chambers: a + c)."""
 
     forces: FloatArray  # dead nodal forces [N], (n, 3)
     effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
-    target: FloatArray  # shortening [m] or growth [m³] of what is held, (a + c,)
-    controlled: BoolArray  # what is held, (a + c,)
+    target: FloatArray  # imposed shortening [m] or growth [m³] of held drives, (a + c,)
+    controlled: BoolArray  # whether the travel is imposed, (a + c,)
     lever: FloatArray  # effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], (a + c,)
     bilateral: bool
     before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
@@ -64,7 +64,7 @@ class Loads:
 
 @dataclass(eq=False, slots=True)
 class State:
-    """Where the iteration stands."""
+    """State of the Newton iteration."""
 
     x: FloatArray  # (n, 3)
     T: FloatArray  # motor tensions [N], then pressures [Pa], (a + c,)
@@ -75,12 +75,12 @@ class State:
     iterations: int = 0
     residual: float = np.inf
     shifted: bool = False  # the stiffness was not positive definite where it was last factorised
-    shift: float = 0.0  # what made the stiffness positive definite there [N/m]
+    shift: float = 0.0  # shift that made the stiffness positive definite there [N/m]
     single: bool = False  # factors in single precision
     rough: bool = False  # the state is only tried
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
-    here: Internal | None = None  # what Newton saw last, at x
+    here: Internal | None = None  # last residual of Newton, at x
     serves: bool = False  # the factor is likely to serve for the step after this one
     options: NewtonOptions = field(default_factory=NewtonOptions)
 

@@ -65,7 +65,7 @@ def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> Fl
 
 
 def corners_of(body: BodyModel) -> Corners:
-    """Return what turning the elements of a body needs of its shape at rest, with the factor of its Laplacian."""
+    """Return the rest-shape data of rotated steps, with the factor of the Laplacian."""
     mesh, tets = body.mesh, body.mesh.tets[:, :4]
     edges = mesh.nodes[tets[:, 1:]] - mesh.nodes[tets[:, :1]]
     slopes = np.linalg.inv(edges)  # columns: gradients of N1, N2, N3

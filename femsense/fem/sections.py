@@ -1,4 +1,4 @@
-"""Sections of a body across a direction: area, centroid and bending stiffness of what a plane cuts."""
+"""Cross-sections of a body: area, centroid and bending stiffness."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPPOSITE = np.array([5, 3, 4, 1, 2, 0])
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CutSection:
-    """What a plane cuts of a body."""
+    """Cross-section of a body by a plane."""
 
     area: float
     """[m²]."""
@@ -30,8 +30,8 @@ class CutSection:
 def cut_section(mesh: TetMesh, young_modulus: FloatArray, point: FloatArray, normal: FloatArray) -> CutSection | None:
     """Return the section of a straight-edged body through a point [m], shape (3,), across a direction, shape (3,).
 
-    Only what hangs together with the element nearest to the point counts: a body that bends back is cut once.
-    None where nothing is cut.
+    Only the part connected to the element nearest to the point counts, so that a body that bends back is cut once.
+    None if the plane does not cut the body.
     """
     tets = mesh.tets[:, :4]
     unit = np.asarray(normal, dtype=float) / np.linalg.norm(normal)

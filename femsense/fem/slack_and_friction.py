@@ -24,7 +24,7 @@ def let_go(body: BodyModel, loads: Loads, state: State) -> bool:
 
 
 def update_slack(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Let go what would push and tighten what became too long; return whether anything changed."""
+    """Release held cables that would push and tighten slack ones that became too long; return whether anything changed."""
     if loads.bilateral or not loads.controlled.any():
         return False
     cable = np.arange(len(state.T)) < len(body.cables)

@@ -18,14 +18,14 @@ FALL_ITERATIONS = 30
 
 
 def holds_itself(body: BodyModel, state: State) -> bool:
-    """Return whether a balanced body whose clamp does not hold it stands all the same (cables may hold it)."""
+    """Return whether a balanced body without a sufficient clamp is stable (cables may hold it)."""
     blocks = stiffness_blocks(body, internal(body, state.x), state)
     factor = with_turning_plate(body, state.x, factorize(body.free_map.pattern, reduced_values(body, blocks)))
     return factor is not None and factor.negative == 0
 
 
 def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
-    """Return whether the stiffness at hand leaves open if a balanced state is stable.
+    """Return whether the current stiffness leaves the stability of a balanced state undecided.
 
     It does where it was not positive definite, and where it was factorised far from the end. A path from one state to the next is
     spared the latter (`follows_path`): the next step, which starts with the stiffness of this state, sees it.

@@ -1,4 +1,4 @@
-"""What depends on the mesh alone: gradients at the quadrature points and the fixed sparsity pattern of the stiffness."""
+"""Mesh-dependent data: gradients at the quadrature points and the sparsity pattern of the stiffness."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ class Stencil:
     block_columns: IntArray
     """Block pattern in CSR: indices ≥ their row, shape (nb,); the last entry is −1 for the row that nobody reads."""
     lanes: list[Lanes] = field(default_factory=list)
-    """What `lanes_of` made of it, once it was needed."""
+    """Cached result of `lanes_of`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FreeMap:
-    """The free unknowns in the order in which they are factorised, and where their stiffness entries stand."""
+    """The free unknowns in the order of elimination, and the positions of their stiffness entries."""
 
     dofs: IntArray
     """Unknowns 3·node + direction, in factor order, shape (f,)."""
@@ -75,7 +75,7 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
 
     Arguments:
         mesh: the mesh at rest.
-        cliques: sets of nodes that are coupled beside the elements (segments of cables), arrays (s, k) of node indices.
+        cliques: sets of nodes coupled in addition to the elements (segments of cables), arrays (s, k) of node indices.
 
     Returns:
         the stencil, and for each clique array the slots of its node pairs, shape (s, k, k).

@@ -1,6 +1,6 @@
 """Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data, hand back a better model.
 
-docs/closing-the-loop.md says what follows what, and why.
+docs/method/closing-the-loop.md says what follows what, and why.
 """
 
 from __future__ import annotations
@@ -158,7 +158,9 @@ def _asked(
         [name for name in names if name != MESH.name] if how.references else names
     )  # what they leave holds for the declared mesh
     if not names:
-        raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
+        raise InputError(
+            "no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists"
+        )
     _require_one_that_acts(names if effects else [], own, robot, recordings)
     return names, (*FORMS, *forms_by_recording(FORMS, recordings), *own)
 
@@ -273,5 +275,5 @@ def _require_one_that_acts(names: Sequence[str], own: Sequence[Effect], robot: R
             "none of these effects can act here",
             where="effects",
             found=", ".join(names),
-            expected=f"effects of a robot that is driven by {' or '.join(drives)} (docs/effects/)",
+            expected=f"effects of a robot that is driven by {' or '.join(drives)} (femsense docs effects)",
         )

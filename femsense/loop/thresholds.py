@@ -1,7 +1,7 @@
 """Every number that decides in the loop, in one type that all steps are given with the data (`Data.thresholds`).
 
 A rule is switched off by a value: 0, −inf or inf, as its line says. `benchmarks/ablation.py` does so for one after the other, and
-docs/closing-the-loop-ablation.md says what each is worth.
+docs/results/closing-the-loop-ablation.md says what each is worth.
 """
 
 from __future__ import annotations

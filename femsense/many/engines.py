@@ -252,7 +252,7 @@ def _jobqueue(file: Path, workers: int | None) -> Any:
             where=f"{file}: jobqueue",
             found=", ".join(names) or "none",
             expected=f"one of {', '.join(sorted(map(str, kinds)))}",
-            hint="docs/many.md shows a file",
+            hint="femsense docs many shows a file",
         )
     dask_.config.update(dask_.config.config, document)
     cluster = kinds[names[0]]()

@@ -1,4 +1,4 @@
-"""What a robot as it is predicts of a scene: no parameter is free and nothing is derived."""
+"""Residuals of a robot without free parameters and without derivatives."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def evaluate_robot(
         robot: the robot.
         scene: what was measured.
         poses: `T_robot_camera` of each camera [m], shape (4, 4).
-        initial: inputs of the actuators that the recording counts from; None where they are known.
-        starts: states of earlier evaluations near by; brought up to date.
+        initial: unknown initial inputs of the actuators; None if the recorded inputs are absolute.
+        starts: states of nearby evaluations, used as warm starts and updated.
 
     Raises:
         DataError: a frame has no equilibrium.

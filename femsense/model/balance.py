@@ -1,4 +1,4 @@
-"""The forces that balance in a solved state, and by how much a robot that differs by little upsets them."""
+"""Forces of a solved state, and the residual forces of a slightly different robot in the same state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Tensions = tuple[FloatArray, ...]
 
 
 class Balance:
-    """The forces that balance in the base state of a frame, and by how much a variant upsets them."""
+    """Forces of the base state of a frame, and the residual forces of variants."""
 
     def __init__(self, driven: DrivenRobot, frame: int, base: Equilibrium) -> None:
         self.driven, self.frame, self.base = driven, frame, base
@@ -60,7 +60,7 @@ class Balance:
         return x
 
     def left(self) -> FloatArray:
-        """Return all forces in the base state [N], (n, 3): at the clamp what it takes up, elsewhere what Newton left."""
+        """Return the sum of all forces in the base state [N], (n, 3): reactions at the clamp, the residual of Newton elsewhere."""
         x = self.base.positions
         force = self.dead + self.base.nodal_forces
         for cable, along in zip(self.body.cables, self.base.segment_tensions):
@@ -75,7 +75,7 @@ class Balance:
         return tuple(np.full(len(c.path), T) for c, T in zip(variant.robot.body.cables, motors))
 
     def more_tension(self, along: Tensions) -> FloatArray:
-        """Return by how much tensions along all cables differ from those of the base state [N], shape (s,)."""
+        """Return the difference of the tensions along all cables from those of the base state [N], shape (s,)."""
         differences = [a - b for a, b in zip(along, self.base.segment_tensions)]
         return np.concatenate(differences) if differences else np.zeros(0)
 
@@ -90,8 +90,7 @@ class Balance:
         return np.asarray(force)
 
     def change(self, variant: DrivenRobot) -> FloatArray:
-        """Return what a variant changes of the forces in the base state, where they sum to nothing,
-        but for tensions along cables [N], (n, 3)."""
+        """Return the residual forces of a variant in the base state, without the change of tensions along cables [N], (n, 3)."""
         body = self._body(variant)
         x, own, drive = self.base.positions, self.body, variant.drive
         force = np.zeros_like(x)
@@ -110,7 +109,7 @@ class Balance:
         return force
 
     def _add_inner(self, body: BodyModel, force: FloatArray) -> None:
-        """Add by how much less another body resists to a force [N], (n, 3)."""
+        """Add the difference of the internal forces of another body to a force [N], (n, 3)."""
         own, x = self.body, self.base.positions
         springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, own)]
         if springs[0] != springs[1] or not _same_but_modulus(body, own):
@@ -120,7 +119,7 @@ class Balance:
             add_elements(own.stencil.tets, self.by_element, softer, force)
 
     def _add_paths(self, body: BodyModel, force: FloatArray) -> None:
-        """Add what the tensions of the base state do along the paths of another body, where these run elsewhere,
+        """Add the difference of the cable forces on another body, whose cables take other paths, under the tensions of the base state
         to a force [N], (n, 3)."""
         x = self.base.positions
         for cable, own, along in zip(body.cables, self.body.cables, self.base.segment_tensions):
@@ -145,7 +144,7 @@ class Balance:
 
 
 def rubbed(variant: DrivenRobot, frame: int, base: Equilibrium, x: FloatArray) -> Tensions:
-    """Return the tensions along the cables of a variant at positions x if those of the base state are what was before."""
+    """Return the tensions along the cables of a variant at positions x, with those of the base state as the previous tensions."""
     motors = motor_tensions(variant, frame, base)
     return tuple(
         capstan_tensions(c, bend_angles(c, x), before, T) if c.friction > 0 else np.full(len(c.path), T)
@@ -161,8 +160,7 @@ def motor_tensions(variant: DrivenRobot, frame: int, base: Equilibrium) -> list[
 
 
 def _same_but_modulus(body: BodyModel, other: BodyModel) -> bool:
-    """Return whether the elements of two bodies answer alike, but for their modulus,
-    where their meshes do not differ by what moves their nodes."""
+    """Return whether the elements of two bodies differ at most in their modulus, given meshes that differ at most in node positions."""
     a, b = body.material, other.material
     if a is b or body.mesh is not other.mesh:
         return a is b

@@ -1,4 +1,4 @@
-"""What of a body can be computed with, but is hardly meant, by the ranges of `plausibility`."""
+"""Implausible properties of a body, by the ranges of `plausibility`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from femsense.model.plausibility import RANGES, likely_meant
 
 
 def doubts_of_body(body: BodyModel) -> list[str]:
-    """Return what of a body can be computed with, but is hardly meant: its material, cracks, cables that double back, limits."""
+    """Return implausible properties of a body: material, cracks, cables that double back, limits."""
     return [*_doubts_of_material(body), *_doubts_of_cracks(body), *_doubts_of_cables(body), *_doubts_of_limits(body)]
 
 
@@ -46,7 +46,7 @@ def _doubts_of_ratio(body: BodyModel) -> list[str]:
 
 
 def _doubts_of_cracks(body: BodyModel) -> list[str]:
-    """Return nodes of the surface that stand at one place and are not joined."""
+    """Return coincident surface nodes that are not joined."""
     from scipy.spatial import cKDTree
 
     mesh = body.mesh

@@ -1,4 +1,4 @@
-"""A depth camera: its lens, and what a single depth is off by."""
+"""A depth camera: its lens and the noise of its depths."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from femsense.core.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraNoise:
-    """What a single depth is off by, as one standard deviation over the distance z."""
+    """Standard deviation of a single depth as a function of the distance z."""
 
     kind: str
     """"stereo": at_1m · z²;  "tof": floor + slope · z."""
@@ -54,4 +54,4 @@ class Camera:
     distortion_model: str = "brown_conrady"
     """"brown_conrady", "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones) or "kannala_brandt"."""
     noise: CameraNoise | None = None
-    """What a single depth is off by; None where not known."""
+    """Noise of a single depth; None if unknown."""

@@ -1,4 +1,4 @@
-"""What drives a robot in a recording: true inputs after zero, gain, play and creep, pressures, gravity and known loads."""
+"""The drive of a robot in a recording: true inputs (after zero, gain, play and creep), pressures, gravity and known loads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from femsense.model.robot import Robot
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drive:
-    """What truly drives the robot in each frame: recorded inputs after offset, gain, play and creep."""
+    """The true inputs of the robot in each frame: recorded inputs after offset, gain, play and creep."""
 
     control: str
     """"tension" or "displacement"."""
@@ -39,7 +39,7 @@ class Drive:
 
 
 def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None = None) -> Drive:
-    """Return what drives a robot in a recording.
+    """Return the drive of a robot in a recording.
 
     Arguments:
         robot: the robot with its effects.
@@ -79,7 +79,7 @@ def creep_response(robot: Robot, recording: Recording) -> FloatArray:
 
 
 def _load_ties(mesh: TetMesh, points: FloatArray) -> Embedding:
-    """Return the ties of loads, each place looked up once; variant after variant asks for the same ones."""
+    """Return the ties of loads to the mesh; each place is looked up once, because all variants need the same ones."""
     return _ties_at(mesh, points.tobytes())
 
 
@@ -120,21 +120,21 @@ def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DrivenRobot:
-    """A robot and its drive: what a quasi-static path is computed of."""
+    """A robot and its drive: the input of a quasi-static path."""
 
     robot: Robot
     drive: Drive
 
 
 def body_in(driven: DrivenRobot, frame: int) -> BodyModel:
-    """Return the body as it is in a frame: under its gravity there, and softened by what it has been through."""
+    """Return the body in a frame: under the gravity of that frame, and softened by its load history."""
     body, drive = driven.robot.body, driven.drive
     body = body if drive.gravity is None else body.with_gravity(drive.gravity[frame])
     return body if drive.softness is None else body.with_stiffness_scale(drive.softness[frame])
 
 
 def has_history(robot: Robot) -> bool:
-    """Return whether the state depends on what was before (friction along a cable)."""
+    """Return whether the state depends on the history (friction along a cable)."""
     return any(cable.friction > 0 for cable in robot.body.cables)
 
 
@@ -147,7 +147,7 @@ def frame_loads(driven: DrivenRobot, frame: int) -> FloatArray | None:
 
 
 def frame_key(driven: DrivenRobot, frame: int) -> bytes:
-    """Return what tells the drive of two frames apart."""
+    """Return a key by which the drives of two frames are compared."""
     drive = driven.drive
     rows = drive.load_frame == frame
     parts = [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]

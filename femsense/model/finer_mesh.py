@@ -26,8 +26,8 @@ FINER_STEPS = 8
 
 
 LAST_STEP = 0.2
-"""Newton steps end when the last one was no more than this share of the whole way:
-what bends easily may be far off and leave little force."""
+"""Newton steps end when the last one was at most this share of the total displacement. The residual force is no criterion: a compliant
+motion can be far from equilibrium and leave little force."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ EARLY = 3e-2
 
 
 def share_on_finer(body: BodyModel) -> None:
-    """Make what the steps of all states on a finer mesh share, whatever its material: it is kept with the body's free map."""
+    """Compute what the steps of all states on a finer mesh share, independent of the material; cached with the body's free map."""
     prepare_roughly(body.free_map.pattern)
     rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
@@ -113,7 +113,7 @@ def _stepped(
     pace: float,
     how: FinerOptions,
 ) -> FloatArray | None:
-    """Return what `finer_state` is after; the first steps go so far of the way."""
+    """Return the state that `finer_state` computes; the first steps are damped."""
     body, balance = fine.robot.body, Balance(driven, frame, base)
     x = coarse = ties.positions(base.positions)
     at, force, first = _pulling(fine, balance, base, x)

@@ -25,9 +25,9 @@ def solve_frame(
     Arguments:
         driven: robot and drive.
         frame: index of the frame.
-        start: a state to start from.
-        nodal_forces: forces beside the known loads [N], shape (n, 3).
-        options: as of `solve_equilibrium`; friction remembers nothing where they do not say.
+        start: initial guess.
+        nodal_forces: forces in addition to the known loads [N], shape (n, 3).
+        options: as of `solve_equilibrium`; without them friction has no history.
     """
     drive, body = driven.drive, body_in(driven, frame)
     loads = frame_loads(driven, frame)
@@ -50,7 +50,7 @@ def solve_frame(
 
 
 def require_converged(state: Equilibrium, frame: int) -> Equilibrium:
-    """Return a state that converged. Raises DataError where it did not, with the frame and what is left unbalanced."""
+    """Return a converged state. Raises DataError with the frame and the unbalanced force if it did not converge."""
     if not state.converged:
         raise DataError(f"no equilibrium in frame {frame}: {state.status}: {state.advice} (unbalanced {state.residual_n:.2g} N)")
     return state

@@ -1,4 +1,4 @@
-"""How a solved state answers to small forces: by its tangent, whose solves are kept."""
+"""Linear response of a solved state to small forces, with cached solves of its tangent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from femsense.fem.mesh import Embedding
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AtPoints:
-    """What the observed points of a state answer to, whatever the variant."""
+    """Adjoint responses of the observed points of a state, shared by all variants."""
 
     to_forces: FloatArray
     """Moves of the nodes under a unit force at each of p points along each axis,
@@ -29,22 +29,22 @@ class AtPoints:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Upset:
-    """What a variant adds to the balance of a base state."""
+    """Residual forces and tensions of a variant in a base state."""
 
     key: tuple[int, int]
     """Variant, and the frame it is computed in."""
     start: FloatArray
     """Where its response starts [m], (n, 3)."""
     force: FloatArray | None
-    """What it changes of the forces, but for tensions along cables [N], (n, 3); None: the answer to that is known."""
+    """Residual forces, without the change of tensions along cables [N], (n, 3); None: their response is known."""
     tension: FloatArray
-    """What it adds to the tensions along the segments of all cables [N], (s,)."""
+    """Change of the tensions along the segments of all cables [N], (s,)."""
     pulled: FloatArray
     """Shortening that it adds to held cables [m], (a,)."""
 
 
 class Answers:
-    """The tangent of a base state, and what was solved with it."""
+    """The tangent of a base state with its cached solves."""
 
     def __init__(self, make: Callable[[], Tangent], times: int) -> None:
         self.make, self.times = make, times

@@ -19,11 +19,11 @@ PLACES = 8
 MOST_TETS = 24_000
 """A quadratic mesh of more elements takes too long for a remark, and in every state of a recording."""
 LARGE = 0.1
-"""From which share on it is said: below, forces are off by no more than a modulus is known to in practice."""
+"""Smallest share that is reported: below it, the force error is no larger than the uncertainty of a modulus in practice."""
 
 
 def excess_stiffness(body: BodyModel) -> float:
-    """Return how much farther the same forces move quadratic elements of the same mesh, relative, the median over places [1].
+    """Return by which share quadratic elements on the same mesh are more compliant, median over places [1].
 
     To first order at rest. 0 on quadratic elements. The quadratic mesh has an error of its own, so that the whole is larger.
 

@@ -27,7 +27,7 @@ class Correction:
     length: float
     """In ranges of an input."""
     control: str
-    """What drove the cables where it was learned: "tension" or "displacement"."""
+    """Kind of the inputs with which it was learned: "tension" or "displacement"."""
     input_names: tuple[str, ...]
     """Cables, then chambers."""
     ranges: FloatArray
@@ -42,7 +42,7 @@ class Correction:
     covariance: FloatArray
     """Of the weights of one axis of a marker [m²], shape (q, q)."""
     noise: float
-    """What it leaves of a marker along each axis where it was learned [m]."""
+    """Residual standard deviation of a marker along each axis on the data with which it was learned [m]."""
 
     @property
     def terms(self) -> int:
@@ -99,7 +99,7 @@ def kernel_of(kind: str, length: float, a: FloatArray, b: FloatArray) -> FloatAr
 
 
 def corrected(recording: Recording, correction: Correction, poses: Sequence[FloatArray]) -> Recording:
-    """Return a recording whose markers are moved by what a correction says, so that the model alone is to explain them.
+    """Return a recording with corrected markers, to be fitted by the model alone.
 
     Arguments:
         recording: markers and inputs.

@@ -12,9 +12,9 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
 UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet", 1e6: "micrometres", 1e-3: "kilometres"}
-"""Numbers so many times too large are in this unit."""
+"""Ratio of marker distances to those of the robot → the unit that it indicates."""
 APART, NEAR = 2.0, 0.2
-"""Markers that are so many times as far apart as on the robot are in another unit: no silicone stretches so far, and none coils up so tightly."""
+"""Ratios of marker distances beyond which another unit is assumed: no silicone stretches or coils that far."""
 SMALLEST, LARGEST = 0.02, 2.0
 """A robot's markers span between these [m]: those of the robots in meshes/ span 0.06 to 0.25 m, in centimetres that would read 6 to 25."""
 FARTHEST = 10.0
@@ -61,9 +61,9 @@ def check_marker_sizes(measured: Sequence[FloatArray] | FloatArray, known: Seque
 
 
 def doubt_of_size(points: FloatArray) -> str:
-    """Return, as a question, in which units markers may be, shape (n, m, 3), that are farther apart than those of a robot; empty where they are not.
+    """Return a question about the unit of markers, shape (n, m, 3), that are farther apart than those of a robot; empty if they are not.
 
-    Used where nothing says how large the robot is.
+    Used if the size of the robot is unknown.
     """
     across = span(points)
     if not across > LARGEST:

@@ -1,8 +1,8 @@
 """From parameters to marker residuals: poses of the cameras, initial inputs and effects, over one or several recordings.
 
 The residual of a marker is  T_robot_camera · y − p(x),  y the measured point (after the camera's depth law) and p its
-place on the body in the state x. Where `rest.csv` measures the markers on the unloaded body, it says where they really
-sit: placement = T_robot_camera · y_rest. How far placements lie from their declared places ties the pose down.
+place on the body in the state x. Where `rest.csv` measures the markers on the unloaded body, it determines their
+placements T_robot_camera · y_rest. The distances of placements from the declared places constrain the pose.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ class Scene:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Hypothesis:
-    """Effects whose parameters are fitted, on top of a robot."""
+    """A robot with effects whose parameters are fitted."""
 
     robot: Robot
     terms: tuple[tuple[Effect, Entry, tuple[Parameter, ...]], ...] = ()
-    """(effect, what is fixed of its entry, parameters that are fitted)."""
+    """(effect, fixed keys of its entry, fitted parameters)."""
     settled: tuple[tuple[Effect, Entry], ...] = ()
     """Effects without parameters, which the robot has already."""
 
@@ -348,7 +348,7 @@ def _variants(
 
 
 def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot], label: str) -> list[int]:
-    """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
+    """Return the variants with a slightly larger tension of each cable in every frame; none if no parameter moves tensions.
 
     They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros,
     whose derivative is theirs wherever a tension is not cut off.

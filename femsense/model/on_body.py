@@ -1,4 +1,4 @@
-"""Whether places that are said to lie on the body do."""
+"""Checks that declared places lie on the body."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from femsense.model.contact_patch import body_surface, closest_surface_point
 FAR = 0.1
 """A place farther from the surface than this share of the body's diagonal is none of the body."""
 OTHER_UNIT = 20.0
-"""A place that is so many times farther from the origin than the body is in another unit."""
+"""A place that is this many times farther from the origin than the body is assumed to be in another unit."""
 
 
 def check_on_body(mesh: TetMesh, places: FloatArray, *, where: str) -> None:
@@ -21,7 +21,7 @@ def check_on_body(mesh: TetMesh, places: FloatArray, *, where: str) -> None:
     Arguments:
         mesh: of the body.
         places: [m], robot frame, shape (k, 3).
-        where: what gives them, for the message.
+        where: their source, for the message.
 
     Raises:
         InputError: a place is farther from the surface than a tenth of the body's diagonal.

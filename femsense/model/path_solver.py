@@ -1,4 +1,4 @@
-"""What the states of a path, and their linear response, are solved with."""
+"""Solver settings of the states of a path and of their linear response."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What recordings and robots can physically hold: one list of ranges, used where files are imported, inspected and computed with.
+"""Physical ranges of recordings and robots, used by import, inspection and computation.
 
-Numbers outside of a range can be computed with, but are hardly meant: the usual cause is another unit, clock, sign or frame.
+Numbers outside a range are valid input but implausible: the usual cause is another unit, clock, sign or frame.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from femsense.model.robot import Robot
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Limits of what soft robots and their sensors do."""
+    """Physical limits of soft robots and their sensors."""
 
     step_s: tuple[float, float] = (5e-4, 5.0)
     """Between frames: motion capture takes up to 1000 a second, a patient experimenter one each few seconds."""
     scene_m: tuple[float, float] = (0.05, 10.0)
-    """Median distance of what a depth camera sees."""
+    """Median distance of the points of a depth camera."""
     assumed_scene_m: float = 0.25
     """The nearest scene where the unit of depth images is only that of their layout: those cameras see from 0.4 m on."""
     behind: float = 0.2
@@ -45,7 +45,7 @@ class Ranges:
     load_n: float = 120.0
     """Largest known load."""
     marker_noise_m: float = 0.01
-    """What a marker repeats to."""
+    """Repeatability of a marker."""
     young_modulus_pa: float = 2e9
     """Stiffest material of a soft robot."""
     focal_share: tuple[float, float] = (0.05, 50.0)
@@ -69,7 +69,7 @@ RANGES = Ranges()
 
 
 def doubts_of_recording(recording: Recording, robot: Robot | None = None) -> list[str]:
-    """Return what of a recording can be computed with, but is hardly meant: times, inputs, lenses, poses, places behind a camera.
+    """Return implausible values of a recording: times, inputs, lenses, poses, points behind a camera.
 
     Pressures are compared with the limits of a robot's chambers, and given poses of cameras with its markers, where there is one.
     """

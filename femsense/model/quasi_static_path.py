@@ -50,25 +50,25 @@ def solve_path(
     answers: dict[int, AtPoints] | None = None,
     solver: PathSolver | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:
-    """Solve frames in order, and with each the same frame of variants that differ from it by little.
+    """Solve frames in order, and the same frames of slightly different variants by linearisation.
 
-    A variant's state is the linear response of the base state to the forces that the variant adds there, so that all of them
-    together cost one factorisation and one solve with many right-hand sides; they must differ by little. A variant on another
-    mesh, or with a rigid clamp where that of the base gives, is solved for itself.
+    A variant's state is the linear response of the base state to the residual forces of the variant there, so that all variants together
+    cost one factorisation and one solve with many right-hand sides. A variant on another mesh, or with a rigid clamp instead of a
+    compliant one, is solved nonlinearly.
 
     Arguments:
         driven: the base.
-        frames: indices, ascending; frames between them are solved too where the past matters.
-        ties: robot → the points that are observed, p of them.
+        frames: indices, ascending; frames between them are solved too if the state depends on the history.
+        ties: robot → the observed points, p of them.
         variants: other robots or drives.
         starts: frame → a state near by, such as that of an earlier path; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
-        answers: frame → what its points answer to, from an earlier path along these very states with other variants;
+        answers: frame → adjoint responses of its points, from an earlier path along the same states with other variants;
             what is missing is added where the points are few.
-        solver: what it is solved with.
+        solver: settings of the solver.
 
     Yields:
-        frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
+        frame index, equilibrium, positions of the points [m], shape (p, 3), and those of the variants, shape (v, p, 3).
     """
     wanted, solver = sorted(set(int(f) for f in frames)), solver or PathSolver()
     past = has_history(driven.robot)
@@ -93,7 +93,7 @@ def solve_path(
 def free_path(driven: DrivenRobot, frames: Sequence[int]) -> Iterator[tuple[int, Equilibrium]]:
     """Yield frames with their states under inputs and known loads alone, in order; a frame without an equilibrium is left out.
 
-    Where the robot has a history all frames before them are passed through: friction remembers them.
+    If the robot has friction, all earlier frames are solved too, because the state depends on them.
 
     Arguments:
         driven: robot and drive.
@@ -189,7 +189,7 @@ def _parts(frames: list[int]) -> list[list[int]]:
 
 
 def _nearest(driven: DrivenRobot, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
-    """Return for other frames the states of those frames whose inputs and loads are most like theirs."""
+    """Return as warm start of each frame the state of the known frame with the most similar inputs and loads."""
     drive = driven.drive
     load = np.zeros((len(drive.inputs), 3))
     np.add.at(load, drive.load_frame, drive.load_forces)
@@ -205,9 +205,8 @@ def _solve_with_history(
 ) -> list[Equilibrium]:
     """Return the states of frames with a past, from states near by.
 
-    The frames are cut into parts that are solved side by side,
-    each from the tensions along the cables that the states near by let expect there. Then, part after part, frames are solved
-    again until these are what the part before left.
+    The frames are split into parts that are solved in parallel, each from cable tensions predicted by the warm starts. Then, part
+    after part, frames are solved again until the tensions at the start of a part equal those at the end of the previous one.
     """
     parts = _parts(frames)
     expected = _expected_tensions(driven, frames, near)
@@ -250,7 +249,7 @@ def _expected_tensions(driven: DrivenRobot, frames: list[int], near: dict[int, E
 
 
 def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack: float) -> bool:
-    """Return whether the tensions along all cables are what they were."""
+    """Return whether the tensions along all cables are unchanged."""
     return all(np.abs(a - b).max(initial=0.0) <= slack * max(1.0, float(a.max(initial=0.0))) for a, b in zip(now, then))
 
 

@@ -1,4 +1,4 @@
-"""What was recorded: frames with their inputs, markers, loads and clouds; how one is made, and parts of it."""
+"""A recording: frames with inputs, markers, loads and clouds; making one, and selecting frames of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Recording:
     folder: Path | None
     """Where it was read; None where it was made in Python."""
     actuation: str
-    """What `inputs` holds: "tension" [N] or "displacement" [m, > 0 shortens]."""
+    """Kind of `inputs`: "tension" [N] or "displacement" [m, > 0 shortens]."""
     actuation_zero: str
     """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
     camera_names: tuple[str, ...]
@@ -55,7 +55,7 @@ class Recording:
     free: BoolArray | None
     """Frames in which nothing undeclared touches the robot, shape (F,); None where not known."""
     sweep: tuple[str, ...] | None
-    """A label for each frame: what is held out together; None where not given."""
+    """Label of each frame; frames of one label are held out together. None if not given."""
     gravity: FloatArray | None
     """In the robot frame [m/s²], shape (F, 3); None: as the robot declares."""
     marker_names: tuple[str, ...]
@@ -80,11 +80,11 @@ class Recording:
     color_files: tuple[tuple[Path | None, ...], ...]
     """Colour image that goes with a depth image, the same shape."""
     marker_noise_m: float | None = None
-    """What a marker repeats to along each axis [m]; None where not given."""
+    """Repeatability of a marker along each axis, one standard deviation [m]; None if not given."""
     session: str | None = None
-    """Recordings of one session share what a session shares; None where not given."""
+    """Recordings of one session share values that are constant within a session; None if not given."""
     tools: tuple[Tool, ...] = ()
-    """What may touch the robot, where it is known."""
+    """Objects of known shape that may touch the robot."""
     unnamed_frame: IntArray = field(default_factory=_no_indices)
     """Frame of each marker that nobody named, an index 0 … F − 1, shape (U,); such rows are not among marker_xyz."""
     unnamed_view: IntArray = field(default_factory=_no_indices)
@@ -94,7 +94,7 @@ class Recording:
 
     @property
     def label(self) -> str:
-        """What values of their own in each recording go by: its session, else the name of its folder; "" where it has neither."""
+        """Label by which values per recording are looked up: the session, else the name of the folder, else ""."""
         return self.session or (self.folder.name if self.folder is not None else "")
 
     @classmethod
@@ -138,7 +138,7 @@ def make_recording(
     unnamed: UnnamedRows | None = None,
     about: About | None = None,
 ) -> Recording:
-    """Return a recording made of its parts; what is left out is empty or unknown.
+    """Return a recording made of its parts; parts that are left out are empty or unknown.
 
     Arguments:
         timeline: the frames.
@@ -146,8 +146,8 @@ def make_recording(
         markers: those with names.
         loads: known loads.
         views: cameras and their files.
-        unnamed: markers that nobody named.
-        about: what is known beside the frames.
+        unnamed: markers without names.
+        about: properties of the whole recording.
 
     Raises:
         InputError: where shapes do not fit, times do not increase, or an index points nowhere.

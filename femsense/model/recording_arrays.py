@@ -1,4 +1,4 @@
-"""A recording from arrays that a program already has."""
+"""A recording from arrays in memory."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def recording_from_arrays(
 
     Arguments:
         time_s: of each frame [s], increasing, shape (F,).
-        inputs: cable → its input [N or m], shape (F,); the true ones, not counted from an unknown zero.
-        actuation: what they are: "tension" or "displacement".
+        inputs: cable → its absolute input [N or m], shape (F,).
+        actuation: kind of the inputs, "tension" or "displacement".
         pressures: chamber → its pressure [Pa], shape (F,).
         markers: marker → its places in the camera's frame [m], shape (F, 3), nan where it is hidden.
-        T_robot_camera: pose of the camera, shape (4, 4); None: not known. The identity where markers are in the robot frame.
-        free: frames in which nothing undeclared touches, shape (F,); None: not known.
+        T_robot_camera: pose of the camera, shape (4, 4); None: unknown. The identity if markers are in the robot frame.
+        free: contact-free frames, shape (F,); None: unknown.
 
     Raises:
         InputError: no frame, shapes that do not fit, times that do not increase, values that are not finite.

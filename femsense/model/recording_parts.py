@@ -1,4 +1,4 @@
-"""The parts of a recording: what `make_recording` puts together (arrays are whatever NumPy takes), tools, and markers at rest."""
+"""The parts of a recording, arguments of `make_recording`; tools; markers at rest."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from femsense.model.camera import Camera
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Timeline:
-    """The frames, in order of time, and what is known of each beside its inputs."""
+    """The frames in order of time, with their labels."""
 
     time_s: npt.ArrayLike
     """[s], increasing, shape (F,)."""
@@ -24,20 +24,20 @@ class Timeline:
     free: npt.ArrayLike | None = None
     """Frames in which nothing undeclared touches the robot, shape (F,); None where not known."""
     sweep: Sequence[str] | None = None
-    """A label for each frame: what is held out together; None where not given."""
+    """Label of each frame; frames of one label are held out together. None if not given."""
     gravity: npt.ArrayLike | None = None
     """In the robot frame [m/s²], shape (F, 3); None: as the robot declares."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drives:
-    """What drives the robot."""
+    """Inputs of the robot."""
 
     cable_names: Sequence[str] = ()
     inputs: npt.ArrayLike | None = None
     """Of the cables [N] or [m, > 0 shortens], shape (F, a)."""
     actuation: str = "tension"
-    """What `inputs` holds: "tension" or "displacement"."""
+    """Kind of `inputs`: "tension" or "displacement"."""
     actuation_zero: str = "absolute"
     """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
     chamber_names: Sequence[str] = ()
@@ -59,7 +59,7 @@ class MarkerRows:
     view: npt.ArrayLike | None = None
     """That camera, an index into the views, shape (K,); None: the first."""
     noise_m: float | None = None
-    """What a marker repeats to along each axis [m]; None where not known."""
+    """Repeatability of a marker along each axis, one standard deviation [m]; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,7 +88,7 @@ class LoadRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Views:
-    """V cameras, and the files of what they saw."""
+    """V cameras and the files of their images or clouds."""
 
     names: Sequence[str] = ("",)
     cameras: Sequence[Camera | None] | None = None
@@ -144,13 +144,13 @@ class RestMarkers:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class About:
-    """What is known of a recording beside its frames."""
+    """Properties of a whole recording."""
 
     folder: Path | None = None
     """Where it was read; None where it was made in Python."""
     session: str | None = None
-    """Recordings of one session share what a session shares; None where not given."""
+    """Recordings of one session share values that are constant within a session; None if not given."""
     rest: RestMarkers | None = None
     """Markers of the unloaded body."""
     tools: Sequence[Tool] = ()
-    """What may touch the robot."""
+    """Objects of known shape that may touch the robot."""

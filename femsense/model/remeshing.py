@@ -18,9 +18,9 @@ from femsense.model.robot import Robot
 
 @functools.lru_cache(maxsize=4)
 def finer_mesh(mesh: TetMesh, element: str | None, refinements: int) -> TetMesh:
-    """Return a mesh of another element (None: the same), each element split into eight so many times.
+    """Return a mesh with another element type (None: the same), refined a number of times by splitting each element into eight.
 
-    The last ones are kept: states that were solved on a mesh then serve wherever it is asked for again.
+    The most recent meshes are cached, so that states solved on one can be reused.
     """
     quadratic = mesh.is_quadratic if element is None else element == "tet10"
     if not refinements and quadratic == mesh.is_quadratic:
@@ -93,7 +93,7 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
 
 
 def _spread_over(mesh: TetMesh, places: FloatArray, values: FloatArray) -> FloatArray:
-    """Return what nodes at places (p, 3) hold, shape (p, c), spread over the nodes of another mesh, shape (n, c)."""
+    """Return nodal values at places (p, 3), shape (p, c), distributed to the nodes of another mesh, shape (n, c)."""
     held = np.flatnonzero(values.any(axis=1))
     ties = embed_points(mesh, places[held])
     return np.asarray(ties.matrix(len(mesh.nodes)).T @ values[held])

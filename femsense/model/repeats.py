@@ -1,4 +1,4 @@
-"""States that are reached again in a recording: what differs between them is noise, whatever the model."""
+"""States that a recording visits repeatedly: their differences are noise, independent of the model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ State = tuple[bytes, bytes]
 
 
 def stays_of(recording: Recording) -> dict[int, tuple[int, State]]:
-    """Return for each frame the number of its stay, and what distinguishes states: the state and the one before it."""
+    """Return the number of the visit of each frame, and the key of its state: the inputs and those before."""
     keys = [state_key(recording, k) for k in range(len(recording.time_s))]
     result, stay, past = {}, 0, b""
     for k, key in enumerate(keys):
@@ -30,8 +30,8 @@ def squares_about_mean(values: FloatArray) -> FloatArray:
 
 
 def marker_repeatability(recording: Recording) -> float:
-    """Return what markers repeat to along each axis [m], camera frame: as declared, else from states that are reached again;
-    nan where nothing tells it."""
+    """Return the repeatability of markers along each axis, camera frame, one standard deviation [m]: as declared, else estimated from
+    repeated states; nan if there are none."""
     if recording.marker_noise_m is not None:
         return recording.marker_noise_m
     stays, groups = stays_of(recording), dict[tuple[State, int, int], list[FloatArray]]()

@@ -1,4 +1,4 @@
-"""A robot as the program sees it: a body, what is measured on it, and how commands become inputs."""
+"""A robot: its body, the points measured on it, and the transmission from commands to inputs."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ class Actuation:
     stretch_stiffness: FloatArray
     """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
     coupling: FloatArray | None = None
-    """Share of the scaled input of each cable (column) that goes to each (row) beside its own [1], shape (a, a); None:
-    no share."""
+    """Share of the scaled input of each cable (column) that is added to each other one (row) [1], shape (a, a); None: none."""
     pressure_gain: FloatArray = field(default_factory=lambda: freeze(np.ones(())))
     """true = gain × recorded + offset [1], shape (c,) in the order of the body's chambers, or () for all."""
     pressure_offset: FloatArray = field(default_factory=lambda: freeze(np.zeros(())))
@@ -46,14 +45,14 @@ class Actuation:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """What stands between the body and the measured points."""
+    """The errors between body points and measured points."""
 
     depth_scale: float = 1.0
     """measured distance along the ray = scale × true distance + offset [1]."""
     depth_offset: float = 0.0
     """[m]."""
     corrections: tuple[Callable[[FloatArray], FloatArray], ...] = ()
-    """What a user's effects do after that: measured points [m], (k, 3), camera frame → truer ones."""
+    """Corrections by a user's effects, applied afterwards: measured points [m], (k, 3), camera frame → corrected points."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,9 +61,9 @@ class MarkerLook:
 
     name: str
     aruco_id: int | None = None
-    """Number of the ArUco tag whose middle it is; None where it is none."""
+    """Number of the ArUco tag whose centre it is; None if it is not a tag."""
     color_rgb: FloatArray | None = None
-    """Colour of the dot whose middle it is, each in [0, 1], shape (3,); None where it is none."""
+    """Colour of the dot whose centre it is, each in [0, 1], shape (3,); None if it is not a dot."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,7 +80,7 @@ class Robot:
     features: IntArray
     """Surface nodes that serve as feature points, spread evenly over the free surface, shape (e,)."""
     color_rgb: FloatArray | None
-    """What the segmentation looks for, each in [0, 1], shape (3,)."""
+    """Colour of the body for the segmentation, each in [0, 1], shape (3,)."""
     actuation: Actuation
     observation: Observation
     creep: tuple[tuple[float, float], ...] = ()
@@ -89,21 +88,21 @@ class Robot:
     document: dict[str, Any] | None = None
     """The declared robot.toml (before effects), as plain tables; None where the robot was made in Python."""
     folder: Path | None = None
-    """Where robot.toml and the mesh stand."""
+    """Folder of robot.toml and the mesh."""
     marker_share: FloatArray | None = None
-    """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
+    """Share by which each marker follows the body, shape (k,): 1 on the body, 0 on the clamp; None: all on the body."""
     softening: tuple[tuple[float, float], ...] = ()
     """Terms (share [1], energy [J/m³]) by which elements soften that have been loaded before (see `model/softening.py`)."""
     by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
-    """What differs from recording to recording: (robot, label of a recording) → the robot there, one after the other."""
+    """Effects whose values differ between recordings: (robot, label of a recording) → the robot in that recording, applied in order."""
     marker_looks: tuple[MarkerLook, ...] = ()
     """Markers that colour images show, by name."""
     aruco_dictionary: str = "4X4_50"
     """Of the tags, as OpenCV names it."""
     correction: Correction | None = None
-    """How far markers are from the model beyond all effects; used where that is asked for."""
+    """Empirical correction of the markers beyond all effects; used on request."""
     surface_points: int = 0
-    """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
+    """Number of markers, at the end, that are surface points at which clouds are measured, not physical markers."""
 
     def __repr__(self) -> str:
         mesh, drives = self.body.mesh, [*self.body.cable_names, *self.body.chamber_names]
@@ -172,7 +171,7 @@ class Robot:
 
 
 def plain_actuation(cable_count: int) -> Actuation:
-    """Return the actuation of cables that do exactly what was recorded."""
+    """Return the transmission of cables whose true inputs equal the recorded ones."""
     one, zero = np.ones(cable_count), np.zeros(cable_count)
     return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero), freeze(one * np.inf))
 

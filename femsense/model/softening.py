@@ -1,7 +1,6 @@
-"""A body that softens by what it has been through (Mullins): which share of its modulus each element has in each frame.
+"""Mullins softening: the share of its modulus that each element retains in each frame, by the largest energy density so far.
 
-What an element has been through is taken from the path of the body that does not soften,
-so that frames need not wait for each other.
+The energy history is that of the body without softening, so that frames can be solved independently.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def path_energies(driven: DrivenRobot, last: int, starts: Mapping[int, Equilibri
     Arguments:
         driven: the body and what drives it.
         last: frame up to which it is wanted.
-        starts: states near by, if some are known.
+        starts: nearby states as warm starts.
 
     Raises:
         DataError: a frame has no equilibrium.

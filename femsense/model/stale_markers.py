@@ -14,9 +14,9 @@ from femsense.core.arrays import BoolArray, IntArray
 from femsense.model.recording import Recording, with_marker_table
 
 CHANCE = 0.05
-"""Rows that may repeat by chance in a recording whose copies are left out."""
+"""Expected number of rows that repeat by chance, above which copies are kept."""
 FAR = 2.0
-"""Silicone does not stretch so far that a marker is so many diagonals of the body from the others."""
+"""A marker farther than this many body diagonals from the others is an error."""
 SHOWN = 6
 """Rows that a warning names."""
 
@@ -91,7 +91,7 @@ def without_twins(recording: Recording) -> Recording:
 
 
 def _warn(r: Recording, bad: BoolArray, what: str) -> None:
-    """Warn of rows that are left out."""
+    """Warn about removed rows."""
     rows = [f"{r.marker_names[m]} in frame {r.frame_numbers[f]}" for f, m in zip(r.marker_frame[bad], r.marker_index[bad])]
     text = ", ".join(rows[:SHOWN]) + (f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else "")
     where = r.folder / "markers.csv" if r.folder else "markers"

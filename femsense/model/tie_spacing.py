@@ -1,4 +1,4 @@
-"""Whether the points of a cable's path lie close enough that the body between two of them stays beside its channel.
+"""Check of the spacing of a cable's path points: the body must not buckle away from the cable between two of them.
 
 Between two points that tie it, a cable runs straight. The body there is a column under the tension T:
 it leaves the cable as a column of length ℓ that is held at its ends, by a factor 1/(1 − T/P) with Euler's P = π² EI/ℓ²,
@@ -17,10 +17,10 @@ from femsense.fem.body_parts import Cable
 from femsense.fem.sections import cut_section
 
 HELD = 0.15
-"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 85 % wrong where it is 0.90,
+"""Share of Euler's load that a tension may be [1]. The tentacle of docs/guides/bodies.md answers 85 % wrong where it is 0.90,
 6.4 % at 0.24, 1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
 ONE_TURN = 1.0
-"""Where no largest tension is declared, it is taken as the one that bends the body along the path by so much [rad]."""
+"""Without a declared largest tension, the tension that bends the body along the path by this angle is assumed [rad]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,7 +46,7 @@ class TieSpacing:
 
     @property
     def points_wanted(self) -> float:
-        """By how much more points the path would hold [1]."""
+        """Ratio of the number of points that the path needs to the number it has [1]."""
         return float(np.sqrt(self.tension / (HELD * self.buckles_at)))
 
 
@@ -74,7 +74,7 @@ def tie_spacing(body: BodyModel, cable: Cable) -> TieSpacing | None:
 
 
 def warn_of_tie_spacing(body: BodyModel) -> None:
-    """Warn of cables whose points let the body buckle between them."""
+    """Warn about cables between whose points the body buckles."""
     for cable in body.cables:
         spacing = tie_spacing(body, cable)
         if spacing is not None and not spacing.holds:
@@ -88,5 +88,5 @@ def tie_spacing_text(spacing: TieSpacing, count: int) -> str:
         f"cable {spacing.cable!r}: its points are too far apart. The body is free between points {spacing.after} and "
         f"{spacing.after + 1} of its path ({1e3 * spacing.gap:.3g} mm) and buckles there at {spacing.buckles_at:.3g} N, but the "
         f"cable may pull {spacing.tension:.3g} N ({pulled}). Where it runs in a channel, give it about "
-        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (docs/bodies.md)"
+        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (femsense docs bodies)"
     )

@@ -1,4 +1,4 @@
-"""States of robots that differ from a solved one by little: the linear response of that state to what they change."""
+"""States of slightly different robots, by the linear response of a solved state."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FACTOR_MEMORY = 1e9
 """Factors of several frames are kept up to this total [bytes], and up to MEMORY_SHARE of the memory that is free."""
 MEMORY_SHARE = 0.25
 FEW_COLUMNS = 40
-"""With more right-hand sides of a state the solves that correct them take longer than a factor in double precision."""
+"""Number of right-hand sides from which iterative correction takes longer than a factor in double precision."""
 MANY_POINTS = 40
 """Answers to forces at more points than that are not kept."""
 
@@ -48,7 +48,7 @@ Job = tuple[int, int, list[int]]
 
 
 class Variants:
-    """What is observed of variants in the frames of a path."""
+    """Observed points of variants in the frames of a path."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class Variants:
             yield from each(self._written, self._groups(self.others))
 
     def _write_alone(self, i: int) -> None:
-        """Write what is observed of a variant that is solved for itself."""
+        """Write the observed points of a variant that is solved nonlinearly."""
         variant = self.variants[i]
         memory: Tensions | None = None
         for k in self.bases if has_history(variant.robot) else self.others:
@@ -140,7 +140,7 @@ class Variants:
         return Answers(partial(self.solver.tangent, body_in(self.driven, k), self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
-        """Return what is to be computed of some variants in frames with one base state."""
+        """Return the tasks of some variants in frames with the same base state."""
         jobs: dict[tuple[int, bytes], Job] = {}
         for i in which:
             for k in group:
@@ -196,7 +196,7 @@ class Variants:
         return [next(pulled) if same else self.ties[u.key[0]].positions(next(moved)) for u, same in zip(upsets, alike)]
 
     def _upsets(self, frame: int, jobs: list[Job], answers: Answers) -> list[Upset]:
-        """Return what variants add to the balance of a base state."""
+        """Return the residual forces and tensions of variants in a base state."""
         base = self.bases[frame]
         balances = {k: Balance(self.driven, k, base) for k in {k for _, k, _ in jobs}}
         upsets = list[Upset]()
@@ -246,7 +246,7 @@ class Variants:
         return [ties.positions(u.start) + move for u, move in zip(upsets, moves)]
 
     def _at_points(self, frame: int, answers: Answers) -> AtPoints:
-        """Return what the points of a base state answer to, kept where that is asked."""
+        """Return the adjoint responses of the points of a base state, cached on request."""
         first, ties = self.alike[frame], self.own_ties
         if self.known is not None and first in self.known:
             return self.known[first]
@@ -264,7 +264,7 @@ def is_linear(driven: DrivenRobot, variant: DrivenRobot) -> bool:
 
 
 def same_mechanics(driven: DrivenRobot, variant: DrivenRobot) -> bool:
-    """Return whether a variant has the same body under the same loads: it differs in what is observed alone."""
+    """Return whether a variant has the same body under the same loads, so that only its observation differs."""
     a, b = driven.drive, variant.drive
     return (
         variant.robot.body is driven.robot.body

@@ -138,6 +138,15 @@ def test_each_command_has_help_and_json(run: Any, name: str) -> None:
     assert said.status == 0 and f"Usage: femsense {name}" in said.out and "--json" in said.out
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_help_ends_with_an_example_of_options_that_exist(run: Any, name: str) -> None:
+    said = run(name, "--help").out
+    example = cli.EXAMPLES[name]
+    assert said.splitlines()[-1].strip() == example
+    assert example.startswith(f"femsense {name}")
+    assert not [word for word in example.split() if word.startswith("-") and f"{word} " not in said and f"{word}," not in said]
+
+
 def test_version(run: Any) -> None:
     assert run("--version").out == f"femsense {femsense.__version__}\n"
 

@@ -96,7 +96,7 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
 
 
 def test_every_key_of_a_script_is_in_its_page():
-    page = (ROOT / "docs" / "scripts.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "formats" / "scripts.md").read_text(encoding="utf-8")
     tables = [
         t for t in vars(script_module).values() if isinstance(t, type) and issubclass(t, script_module.Schema) and t.model_fields
     ]

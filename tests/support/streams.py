@@ -15,7 +15,7 @@ import numpy as np
 
 from femsense.xr.stream.payloads import Contact, Input, Twin, TwinFrame
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "streaming.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "streaming.md"
 PAGE = {"index.html": b"<p>page</p>", "app.js": b"1"}
 GLB = b"glTF of a robot"
 

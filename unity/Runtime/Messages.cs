@@ -1,4 +1,4 @@
-// The bytes of a stream (docs/streaming.md), and the only place where frames of reference are converted. Needs no Unity.
+// The bytes of a stream (docs/guides/streaming.md), and the only place where frames of reference are converted. Needs no Unity.
 using System;
 using System.Collections.Generic;
 using System.Globalization;

@@ -19,7 +19,7 @@ def import_(
         argument("SOURCE…", "A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras."),
     ] = None,
     output: Annotated[Path | None, option("-o --output", "RECORDING", "The folder to write.")] = None,
-    format: Annotated[str | None, option("--format", "NAME", "If the guess is wrong; see docs/importing.md.")] = None,
+    format: Annotated[str | None, option("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None,
     topic: Annotated[list[str] | None, option("--topic", "NAME", "What to take, where there is a choice.")] = None,
     map_: Annotated[
         list[str] | None, option("--map", "NAME=TARGET", "Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.")

@@ -30,7 +30,7 @@ def improve(
     effects: Annotated[list[str] | None, option("--effects", "NAME,…", "Try these effects only.")] = None,
     without: Annotated[list[str] | None, option("--without", "NAME,…", "Do not try these effects.")] = None,
     user_effect: Annotated[
-        list[Path] | None, option("--user-effect", "FILE", "Try an effect of your own (docs/effects/own.md).")
+        list[Path] | None, option("--user-effect", "FILE", "Try an effect of your own (femsense docs own).")
     ] = None,
     measured: Annotated[
         str,

@@ -17,7 +17,7 @@ Jobs = Annotated[
     option("--jobs", "TABLE|GLOB", "Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
 ]
 Workers = Annotated[int | None, option("--workers", "N", "Many jobs: so many processes; by default one a core.", min=0)]
-Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see docs/many.md.")]
+Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see femsense docs many.")]
 Memory = Annotated[float | None, option("--memory", "GB", "Many jobs: what a worker may take at most.")]
 MANY = ("jobs", "workers", "dask", "memory")
 

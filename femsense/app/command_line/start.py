@@ -1,4 +1,4 @@
-"""Where one starts: `demo`, `inspect`, `doctor`."""
+"""Where one starts: `demo`, `inspect`, `docs`, `doctor`."""
 
 from __future__ import annotations
 
@@ -41,6 +41,22 @@ def inspect(
             say("comparing with the robot, and finding the camera's pose to state the forces that it resolves")
         report = inspect_path(path, robot=robot)
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
+
+
+def docs(
+    page: Annotated[str | None, argument("PAGE", "Such as statuses or effects/creep; by default the home page.")] = None,
+    browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,
+    json: Json = False,
+) -> Answer:
+    """Open the documentation of this version, offline."""
+    from femsense.app.site import find_page, site_folder
+
+    address = find_page(site_folder(), page).resolve().as_uri()
+    if browser:
+        import webbrowser
+
+        webbrowser.open(address)
+    return Answer({"page": address}, address)
 
 
 def doctor(json: Json = False) -> Answer:

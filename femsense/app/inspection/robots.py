@@ -68,7 +68,7 @@ def _warn_of_gaps(robot: Robot, file: Path) -> None:
     if not robot.marker_names:
         warnings.warn(
             f"{file.name}: no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
-            "(docs/calibration.md), and there are no forces without clouds",
+            "(femsense docs calibration), and there are no forces without clouds",
             stacklevel=3,
         )
 

@@ -30,7 +30,7 @@ from femsense.fem.linalg.symbolic import Analysis, analyse
 
 ITERATIVE_FROM = 100_000
 """Unknowns from which on the memory of a direct factor is looked at.
-Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/speed.md, `python benchmarks/body.py
+Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/results/speed.md, `python benchmarks/body.py
 iterative`), so that memory alone switches."""
 ITERATIVE_LEAST = 60
 """Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""

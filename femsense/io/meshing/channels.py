@@ -20,7 +20,7 @@ SEARCHED_WITH, MOST_TRIES = 64, 12
 """Points with which a tension that bends the body is looked for, and how many are tried."""
 STILL = 0.005
 """A path is fine enough where twice the points change the motion by less than this share of it [1].
-The tentacle of docs/bodies.md moves by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
+The tentacle of docs/guides/bodies.md moves by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
 GAP = 0.01
 """A pull point that is not given lies so far before the channel [m], straight on."""
 BEND = 0.4

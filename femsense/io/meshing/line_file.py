@@ -1,4 +1,4 @@
-"""The text that describes a body along a line: its tables, and the body that they mean (docs/bodies.md)."""
+"""The text that describes a body along a line: its tables, and the body that they mean (docs/guides/bodies.md)."""
 
 from __future__ import annotations
 

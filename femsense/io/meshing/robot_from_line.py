@@ -43,7 +43,7 @@ def line_into(
 
     Arguments:
         folder: of the robot; a robot.toml in it is replaced if it was made from such a description.
-        source: the description (docs/bodies.md).
+        source: the description (docs/guides/bodies.md).
         most_tets: not more tetrahedra than about so many; along_mm: thickness of a layer instead [mm].
         say: told in one line what happens beside.
         again: make it even where the folder holds this result.

@@ -1,4 +1,4 @@
-"""The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left (docs/closing-the-loop.md, 4).
+"""The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left (docs/method/closing-the-loop.md, 4).
 
     Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 

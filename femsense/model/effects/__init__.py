@@ -76,7 +76,7 @@ def find_effect(name: str) -> Effect:
         where="effects.name",
         found=name,
         expected=", ".join(EFFECT_NAMES),
-        hint=f"did you mean {near[0]}?" if near else "an effect of your own comes with its file (docs/effects/own.md)",
+        hint=f"did you mean {near[0]}?" if near else "an effect of your own comes with its file (femsense docs own)",
     )
 
 

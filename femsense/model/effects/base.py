@@ -1,4 +1,4 @@
-"""What an effect is: a name, parameters with units and bounds, and how it changes a robot."""
+"""The types of an effect: a name, parameters with units and bounds, and a function that changes a robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Entry = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class KnownLength:
-    """What is known beforehand of the length of a vector."""
+    """Prior on the length of a vector."""
 
     value: float
     """In the unit of its components."""
@@ -55,7 +55,7 @@ class Parameter:
     high: float
     """Highest plausible value of the coordinate."""
     step: float
-    """Step for derivatives; small against what matters."""
+    """Step of finite differences, small against relevant changes."""
     scale: str = "linear"
     """How the coordinate u gives the value: "linear" (u), "log" (exp u) or "reciprocal" (1/u)."""
     known: float = float("inf")
@@ -65,7 +65,7 @@ class Parameter:
     of_range: bool = False
     """Whether sizes (`plausible`, what calibration knows) are shares of the range of the input of its cable."""
     length: KnownLength | None = None
-    """What is known of the length of the vector that it is a component of."""
+    """Prior on the length of the vector of which it is a component."""
 
     @property
     def usual_size(self) -> float:
@@ -121,11 +121,11 @@ def part_in(parameter: Parameter, label: str) -> int | str | tuple[str, int] | N
 
 
 USUAL = 0.05
-"""Usual size of a parameter of which nothing else is said, as a share of the range between its bounds."""
+"""Default typical size of a parameter, as a share of the range between its bounds."""
 
 
 class Experiment(Enum):
-    """What may be recorded to tell an effect from others, in the order in which it is proposed."""
+    """Experiments that distinguish an effect from others, in the order in which they are proposed."""
 
     TURN_THE_BASE = 1
     LOAD_UNLOAD_AND_HOLD = 2
@@ -155,7 +155,7 @@ class Alias:
     common: bool = False
     """Whether that is so where all parameters move alike; else it is its mirror image."""
     told_by: str = ""
-    """What to record to distinguish the two, in words."""
+    """The recording that distinguishes the two, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +164,13 @@ class Effect:
 
     name: str
     lacks: str
-    """What the plain model lacks, in a few words."""
+    """What the declared model lacks, in a few words."""
     parameters: Callable[[Robot, str], tuple[Parameter, ...]]
     """(robot, control) → the parameters that a fit moves; control is "tension" or "displacement". Empty: cannot act here."""
     apply: Callable[[Robot, Entry], Robot]
     """(robot, entry) → the robot with the effect. Raises InputError where the entry does not fit the robot."""
     seeds: Callable[[Robot], Sequence[Entry]] = lambda robot: ({},)
-    """(robot) → starting points for what is not in `parameters` (places, radii); each is tried."""
+    """(robot) → initial values of quantities that are not in `parameters` (places, radii); each is tried."""
     keys: tuple[str, ...] = ()
     """All keys that an entry may have."""
     path_dependent: bool = False

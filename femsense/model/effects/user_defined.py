@@ -88,7 +88,7 @@ def try_own_effect(effect: Effect, robot: Robot) -> None:
                 expected="no forces, the same robot, the same points",
                 found=", ".join(f"{p.key} = {null[p.key]}" for p in parameters if p.part in (None, 0))
                 + ", which changes the robot",
-                hint='say where it vanishes: "null" (docs/effects/own.md)',
+                hint='say where it vanishes: "null" (femsense docs own)',
             )
 
 
@@ -113,7 +113,7 @@ def find_own_file(entry: Mapping[str, Any], robot: Robot) -> Path:
 
 def _run(file: Path) -> ModuleType:
     if not file.is_file():
-        raise InputError("no such file", where=file, expected="a Python file with an effect", hint="see docs/effects/own.md")
+        raise InputError("no such file", where=file, expected="a Python file with an effect", hint="see femsense docs own")
     spec = importlib.util.spec_from_file_location(f"femsense_own_{file.stem}", file)
     if spec is None or spec.loader is None:
         raise InputError("not a Python file", where=file, expected="a name that ends in .py")

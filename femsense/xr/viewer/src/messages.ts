@@ -1,4 +1,4 @@
-// The bytes of a stream (docs/streaming.md): frames of messages, poses, clouds, documents.
+// The bytes of a stream (docs/guides/streaming.md): frames of messages, poses, clouds, documents.
 
 import type { Contact, Frame, Input, NamedPoint, Vector } from "./data";
 import type { Field } from "./paint";
