@@ -17,7 +17,7 @@ from femsense.model.recording import Recording
 TRIED = 1.5
 """A pose is fitted where it could take a third of the residual away, inputs as they are; and spoken of where it does."""
 DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
-"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/forces.md has the trial)."""
+"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/appendix/forces-before-0.2.md has the trial)."""
 Fitted = tuple[float, Sequence[FloatArray]]
 """What is left [m], and the poses."""
 

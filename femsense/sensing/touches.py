@@ -20,9 +20,9 @@ DENT = 0.04
 """Markers do not show over what area a force acts at a given place: it is spread over so much of the body's diagonal, so that a marker beside it
 does not feel a dent that is not there (the beam of the beam study: 1 mm at the marker on its upper edge)."""
 ALIKE = 0.05
-"""Patches whose radii differ by less than this share are alike: any other value changes forces by 0.1 % (docs/forces.md)."""
+"""Patches whose radii differ by less than this share are alike: any other value changes forces by 0.1 % (docs/appendix/forces-before-0.2.md)."""
 HERTZ = float(np.sqrt(4.0 / 3.0))
-"""Radius of a cone of pressure over that of Hertz's pressure with the same root mean square radius: √(10/3) of it over √(5/2) of it. docs/forces.md has what
+"""Radius of a cone of pressure over that of Hertz's pressure with the same root mean square radius: √(10/3) of it over √(5/2) of it. docs/appendix/forces-before-0.2.md has what
 other values give."""
 
 
