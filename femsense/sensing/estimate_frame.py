@@ -167,7 +167,7 @@ def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
-    if not at_surface and not (latent and best.contacts):
+    if not at_surface and not latent:
         return best
     again = fit(
         model,

@@ -307,7 +307,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
     scale, at = whitened(model, here, trust=False)
     A = np.hstack([J * scale, here.N])
     H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
-    P = np.linalg.inv(H)
+    P, q = np.linalg.inv(H), model.nuisance.root.shape[1]
     evidence = phi + _prior(model, here) + float(np.linalg.slogdet(H)[1])
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
@@ -336,6 +336,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
         odds,
         covariance,
         places,
+        LATENT * np.column_stack([eta[q:], np.sqrt(np.diag(P)[5 * m + q :])]),
         gain,
         converged,
     )

@@ -221,6 +221,8 @@ class Fit:
     """Of all force components [N²], shape (3m, 3m)."""
     place_covariance: FloatArray
     """Of each contact point [m²], shape (m, 3, 3)."""
+    latent_force: FloatArray
+    """Force at each object of `Frame.latent` and its standard deviation [N], shape (l, 2)."""
     drop_gain: FloatArray
     """−2 log evidence ratio of each contact against its absence (Savage–Dickey), shape (m,)."""
     converged: bool = True

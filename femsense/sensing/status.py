@@ -24,6 +24,8 @@ MARKERS_MISFIT = 9.0
 """Mean square of the whitened residuals of markers above which a frame is not explained: three standard deviations everywhere."""
 UNDETERMINED = 3.0
 """A force below so many standard deviations has no determined size."""
+UNKNOWN = 0.1
+"""An object in touch whose force is known no better than this may hide a touch [N]."""
 OVERLAP = 3.0
 """Objects overlap the body by more than so many standard deviations of their gap."""
 
@@ -42,6 +44,7 @@ class Status(Enum):
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
     OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
+    MAY_TOUCH = "an object may touch whose force is not known, up to {force_n:.2f} N at [{where}] mm of the body at rest"
     UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
     CAMERA_MOVED = (
         "{who} seems to have moved by {shift_mm:.1f} mm and {turn_deg:.1f}°, since the background did: that fits the frame better"
@@ -51,7 +54,7 @@ class Status(Enum):
     )
 
 
-TRUSTED = (Status.OK, Status.UNDETERMINED)
+TRUSTED = (Status.OK, Status.UNDETERMINED, Status.MAY_TOUCH)
 """Frames from which the next one starts."""
 
 
@@ -96,6 +99,10 @@ def checked(model: Model, best: Fit) -> Verdict:
         force, std = float(np.linalg.norm(best.forces[i])), _std_along(best, i)
         if contact.source != "given" and force < UNDETERMINED * std:
             return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
+    for one, (mean, std) in zip(best.frame.latent, best.latent_force):
+        if std > UNKNOWN:
+            where = ", ".join(f"{1e3 * x:.0f}" for x in one.place)
+            return verdict(Status.MAY_TOUCH, force_n=max(mean, 0.0) + 2.0 * std, where=where)
     return verdict(Status.OK)
 
 
