@@ -22,8 +22,8 @@ does not feel a dent that is not there (the beam of the beam study: 1 mm at the 
 ALIKE = 0.05
 """Patches whose radii differ by less than this share are alike: any other value changes forces by 0.1 % (docs/appendix/forces-before-0.2.md)."""
 HERTZ = float(np.sqrt(4.0 / 3.0))
-"""Radius of a cone of pressure over that of Hertz's pressure with the same root mean square radius: √(10/3) of it over √(5/2) of it. docs/appendix/forces-before-0.2.md has what
-other values give."""
+"""Radius of a cone of pressure over that of Hertz's pressure with the same root mean square radius: √(10/3) of it over √(5/2) of it.
+docs/appendix/forces-before-0.2.md has what other values give."""
 
 
 def make_touch(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from femsense.pointcloud.primitives import find_shapes, fit_shape
+from femsense.sensing.places import fit_again
 
 CAMERA = np.array([0.0, 0.0, 0.5])
 NOISE = 5e-4
@@ -108,3 +112,32 @@ def test_what_lies_within_the_edge_of_a_body_is_no_object():
     assert sorted(shape.kind for shape in find_shapes(**asked)) == ["points", "sphere"]
     kept = find_shapes(**asked, edge=np.full(len(points), 0.0015))
     assert [shape.kind for shape in kept] == ["sphere"]
+
+
+def cap(seed: int, radius: float = 0.01, count: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return noisy points of the upper side of a ball about the origin, their noise, and the camera half a metre above."""
+    rng = np.random.default_rng(seed)
+    height, turn = rng.uniform(0.5, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    across = np.sqrt(1.0 - height**2)
+    points = radius * np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
+    origins, std = np.tile([0.0, 0.0, 0.5], (count, 1)), np.full(count, 3e-4)
+    ray = (points - origins) / np.linalg.norm(points - origins, axis=1, keepdims=True)
+    return points + std[:, None] * rng.normal(size=(count, 1)) * ray, std, origins
+
+
+def test_each_side_of_a_ball_is_known_as_well_as_draws_of_noise_scatter_it() -> None:
+    shapes = [fit_shape(*cap(seed)) for seed in range(40)]
+    assert {shape.kind for shape in shapes} == {"sphere"}
+    for side in (1.0, -1.0):  # that which is seen, and the hidden one
+        place = np.array([[0.0, 0.0, 0.02 * side]])
+        surface = [shape.center[2] + side * shape.radius for shape in shapes]
+        stated = np.mean([shape.towards(place).std_m for shape in shapes])
+        assert stated == pytest.approx(np.std(surface), rel=0.5)
+    assert shapes[0].towards(np.array([[0.0, 0.0, -0.02]])).std_m > 5.0 * shapes[0].towards(np.array([[0.0, 0.0, 0.02]])).std_m
+
+
+def test_a_ball_keeps_the_radius_of_the_frame_that_showed_it_better() -> None:
+    well, badly = fit_shape(*cap(1, count=400)), cap(2, count=14)
+    again = fit_again([well], *badly)
+    assert again.kind == "sphere" and again.radius == well.radius and again.radius_std == pytest.approx(well.radius_std, rel=1e-6)
+    assert fit_again([replace(well, center=well.center + 0.1)], *badly).radius != well.radius  # another ball
