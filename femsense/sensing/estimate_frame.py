@@ -14,6 +14,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
+from femsense.inference.mixture import misfit
 from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
@@ -149,12 +150,26 @@ def _with_objects(model: Model, best: Fit) -> Fit:
     frame = best.frame
     if frame.coloured or frame.scan is None:
         return best
-    pixels = best.rows.pixel
-    other = ~inliers(best)[pixels] & (best.rows.residual[pixels] > 0.0)
-    scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
-    seen = replace(frame, objects=tuple(objects_near(model.sensor, scan, best.state, frame.seen_before)))
+    objects = _in_front(model, frame, best.rows, inliers(best), best.state)
+    if len(objects) == len(frame.objects) and all(_is_alike(a, b) for a, b in zip(objects, frame.objects)):
+        return best
+    seen = replace(frame, objects=objects)
     again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
     return best if again is None else again
+
+
+def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: Equilibrium) -> tuple[Shape, ...]:
+    """Return the objects that the pixels in front of a state show that are not the robot's, robot (r,)."""
+    assert frame.scan is not None
+    pixels = rows.pixel
+    other = ~robot[pixels] & (rows.residual[pixels] > 0.0)
+    scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
+    return tuple(objects_near(model.sensor, scan, state, frame.seen_before))
+
+
+def _is_alike(first: Shape, second: Shape) -> bool:
+    """Return whether two shapes are one up to what is not known of it."""
+    return first.kind == second.kind and float(np.linalg.norm(first.center - second.center)) < max(first.std_m, second.std_m)
 
 
 def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
@@ -214,12 +229,19 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
         raise DataError(
             f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
         )
-    objects: list[Shape] = []
     seen = () if previous is None else previous.objects
+    frame = Frame(k, model.pixels(scan), scan, predicted, tensions, seen_before=seen)
+    objects: tuple[Shape, ...] = ()
     if not len(model.sensor.places) and not said_free(model.sensor, k):
-        objects = objects_near(model.sensor, scan, expected, seen)
+        if scan.segmented:
+            objects = tuple(objects_near(model.sensor, scan, expected, seen))
+        elif expected is not predicted:
+            rows = model.rows(frame, expected)
+            objects = _in_front(
+                model, frame, rows, misfit(rows.residual / rows.std, rows.log_other, rows.share)[1] > 0.5, expected
+            )
     clock.lap("objects")
-    return Frame(k, model.pixels(scan), scan, predicted, tensions, objects=tuple(objects), seen_before=seen)
+    return replace(frame, objects=objects)
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
