@@ -97,11 +97,12 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     start = _carried_over(model, frame, previous)
     best = start if start is not None else _without_contacts(model, frame)
     clock.lap("fit")
-    if given := given_touches(model.sensor):
+    if said_free(model.sensor, k):
+        pass
+    elif given := given_touches(model.sensor):
         best = _at_given_places(model, frame, given, best, previous)
-    elif not said_free(model.sensor, k):
-        best = _searched(model, best)
-        best = _with_objects_in_touch(model, best)
+    else:
+        best = _with_objects_in_touch(model, _searched(model, best))
     clock.lap("search")
     exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
     best = best if exact is None else replace(best, state=exact)
