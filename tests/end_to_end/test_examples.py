@@ -47,7 +47,7 @@ def test_forces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "calibration: converged" in capsys.readouterr().out
     run = fs.read_run(tmp_path / "out")
     assert [frame.frame for frame in run.frames] == list(example.FRAMES)
-    assert all(frame.status == "ok" for frame in run.frames)
+    assert all(frame.status.startswith(("ok", "contact, size not determined")) for frame in run.frames)
     assert {contact.frame for contact in run.contacts} == set(example.FRAMES[-2:])
     assert (tmp_path / "out" / "robot.glb").read_bytes()[:4] == b"glTF"
 
