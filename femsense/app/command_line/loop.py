@@ -71,7 +71,7 @@ def improve(
     if (many := several(context, recordings, one_each=False)) is not None:
         return many
     robot = required(context, robot, "'ROBOT'", "argument")
-    set_workers(workers)
+    set_workers(workers or None)
     if plan and recordings:
         raise InputError(
             "recordings are not asked with --plan",
