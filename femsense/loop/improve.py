@@ -25,7 +25,7 @@ from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
 from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
-from femsense.loop.search.all_recordings import Ask, Submitter, asked_by, asked_here, in_all_recordings, recordings_to_search
+from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.element_order import linear_suffice, need_quadratic, seeks_with_quadratic, with_quadratic
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
@@ -63,8 +63,8 @@ class ImproveOptions:
     """What decides; other values than these are for experiments with the loop itself."""
     effort: Effort = EFFORT
     """How much is tried."""
-    engine: Submitter | None = None
-    """Many recordings: what looks at each of them (`femsense.many.engines`); None: this process, one after the other."""
+    spread: Spread | None = None
+    """Runs what is asked of each of many recordings (`femsense.many.engines.spread`); None: this process does, one after the other."""
     keep: tuple[str | Path, Mapping[str, Any]] | None = None
     """A file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
     something else is not used. It is removed at the end."""
@@ -97,6 +97,7 @@ def improve(
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
     say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
+    searched: Sequence[Recording]
     searched, others = _split(recordings, validation, how)
     names, forms = _asked(robot, searched, effects, without, how, apart=not others)
     searched, validation = _less_references(robot, searched, validation, how, say)
@@ -148,10 +149,10 @@ def _split(
 
 
 def _ask(how: ImproveOptions, forms: Sequence[Effect]) -> Ask:
-    if how.engine is None:
+    if how.spread is None:
         return asked_here(forms)
     folder = Path(tempfile.gettempdir()) if how.keep is None else Path(how.keep[0]).parent
-    return asked_by(how.engine, forms, how.user_effects, folder)
+    return asked_elsewhere(how.spread, forms, how.user_effects, folder)
 
 
 def _less_references(

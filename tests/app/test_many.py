@@ -136,7 +136,7 @@ def test_captures_are_imported_by_a_pattern(run: Any, tmp_path: Path) -> None:
         (("estimate", "robot", "recordings/a", "--jobs", "recordings/*", "-o", "out"), "--jobs says what the jobs are about"),
         (("estimate", "robot", "--jobs", "none*", "-o", "out"), "nothing matches this pattern"),
         (("estimate", "robot", "recordings", "-o", "out", "--memory", "0"), "not an amount of memory"),
-        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "--dask and --memory are of many jobs"),
+        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "of more than 8 recordings"),
     ],
 )
 def test_wrong_usage_is_said_before_anything_runs(

@@ -13,14 +13,12 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
 from operator import add
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -54,19 +52,10 @@ MOST_STEPS = 4
 """Gauss–Newton steps over all recordings."""
 STILL = 0.1
 """They end where no shared parameter moves by more than this share of its standard error."""
-AHEAD = 2
-"""Recordings for each worker that are handed over at a time."""
-MOST_TRIES = 2
-"""So often a recording may lose its worker."""
 
 
-class Submitter(Protocol):
-    """An engine of `femsense.many.engines`."""
-
-    @property
-    def workers(self) -> int: ...
-    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]: ...
-    def death_in(self, error: BaseException) -> object | None: ...
+Spread = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[Any]]
+"""Yields function(*task) of each task, in order, wherever it runs: `femsense.many.engines.spread` of an engine."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -190,11 +179,11 @@ def asked_here(forms: Sequence[Effect]) -> Ask:
     return lambda question, recordings: (normal_equations(question, r, forms) for r in recordings)
 
 
-def asked_by(engine: Submitter, forms: Sequence[Effect], own: Sequence[str | Path], folder: Path) -> Ask:
-    """Return what asks recordings by an engine: a task is the path of a recording, and that of a file with the question.
+def asked_elsewhere(spread: Spread, forms: Sequence[Effect], own: Sequence[str | Path], folder: Path) -> Ask:
+    """Return what asks recordings wherever `spread` does: a task is the path of a recording, and that of a file with the question.
 
     Arguments:
-        engine: open.
+        spread: runs the tasks.
         forms: of all effects; `own`: files of a user's effects among them.
         folder: where the file stands meanwhile; workers on other machines have to see it.
     """
@@ -205,37 +194,9 @@ def asked_by(engine: Submitter, forms: Sequence[Effect], own: Sequence[str | Pat
             file = Path(place).absolute() / "question"
             Checkpoint((file, {}), forms).keep(question)
             task = str(file), file_hash(file), tuple(str(Path(path).absolute()) for path in own)
-            yield from _in_order(engine, [(*task, str(r.folder)) for r in recordings])
+            yield from spread(answer, ((*task, str(r.folder)) for r in recordings))
 
     return ask
-
-
-def _in_order(engine: Submitter, tasks: Sequence[tuple[Any, ...]]) -> Iterator[NormalEquations]:
-    """Yield the answers to tasks in order; few are handed over ahead, and one that loses its worker is run once more."""
-    waiting, left = deque[tuple[tuple[Any, ...], Future[NormalEquations]]](), iter(tasks)
-    try:
-        while True:
-            for task in left:
-                waiting.append((task, engine.submit(answer, *task)))
-                if len(waiting) >= AHEAD * max(engine.workers, 1):
-                    break
-            if not waiting:
-                return
-            task, future = waiting.popleft()
-            for tried in range(MOST_TRIES):
-                try:
-                    found = future.result()
-                    break
-                except Exception as error:
-                    if engine.death_in(error) is None:
-                        raise
-                    if tried + 1 == MOST_TRIES:
-                        raise DataError(f"{task[-1]}: this recording has killed {MOST_TRIES} workers; leave it out") from error
-                    future = engine.submit(answer, *task)
-            yield found
-    finally:
-        for _, future in waiting:
-            future.cancel()
 
 
 def answer(file: str, digest: str, own: tuple[str, ...], recording: str) -> NormalEquations:
