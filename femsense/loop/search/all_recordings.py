@@ -132,7 +132,10 @@ def normal_equations(question: Question, recording: Recording, forms: Sequence[E
         max_iterations=0,
     )
     rows = sum(jet.residual.size + jet.rest.size + 6 * len(t.poses) for t, jet in zip(data.train, fit.jets))
-    J, r = np.asarray(fit.fit.jacobian)[:rows], np.asarray(fit.fit.residual)[:rows]  # what is known of β beforehand counts once
+    problem = problem_of(data, fit, question.noise)
+    r, jacobian = problem.rows_of(fit.jets, fit.fit.theta, True)
+    assert jacobian is not None
+    J, r = jacobian[:rows], r[:rows]  # what is known of β beforehand counts once
     Q = basis_of(J[:, : fit.own])[0]
     B, r = _beside(Q, J[:, fit.own :]), _beside(Q, r)
     blocks = dict[str, Block]()
@@ -140,7 +143,6 @@ def normal_equations(question: Question, recording: Recording, forms: Sequence[E
         at_rest = any(len(t.scene.rest_marker) for t in data.train)
         todo = candidates_for(fit, data.control, forms=data.forms, names=question.names, has_placements=at_rest)
         fields = effect_fields(fit, data.train, todo)
-        problem = problem_of(data, fit, question.noise)
         for i, one in enumerate(fields.todo):
             C = _beside(Q, whitened_columns(fit, problem, *fields.of(i))[:rows])
             if np.isfinite(C).all():
