@@ -25,7 +25,7 @@ from femsense.many.jobs import RECORDS, Job, Row, expanded, is_glob, names_of, r
 from femsense.many.limits import available_cores, memory_share
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import AGAIN
-from femsense.many.summary import check_summary_folder, read_summary, write_summary
+from femsense.many.summary import check_no_result, check_summary_folder, read_summary, write_summary
 
 Say = Callable[[str], None]
 Run = Callable[..., Outcome]
@@ -60,6 +60,8 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
     command = str(asked.command.name)
     out = _folder_of_all(asked)
     check_summary_folder(out)
+    if asked.output is not None:
+        check_no_result(out)
     jobs = _jobs(asked, command, out)
     workers = None if asked.workers == 0 else asked.workers
     memory = memory_share(workers or available_cores(), asked.memory_gb)
