@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from femsense.app.command_line.answer import Answer, ManyJobs
+from femsense.app.command_line.parameters import run_of
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.folder_lock import only_writer
@@ -151,6 +152,7 @@ def _job(
         place = find_robot(robot).absolute()
         words.append(str(place.parent) if Path(robot).expanduser().exists() else robot)
         reads.append(place.parent)
+    units = [str(run_of(Path(unit))) for unit in units] if command == "report" else units
     words += units
     reads += [Path(unit.rpartition("=")[2] if "=" in unit and not Path(unit).exists() else unit) for unit in units]
     target = out / name
