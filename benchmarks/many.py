@@ -1,6 +1,6 @@
 """Many short recordings over processes and over dask: efficiency, overhead of a task, memory, and what happens when things die.
 
-    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|paper] [--page docs/many.md]
+    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|joint|paper] [--page docs/many.md]
 
 `overhead`: ten times COUNT jobs that write one line, on two processes: time of a worker beside each, and memory of the driver.
 
@@ -13,9 +13,12 @@ the same bytes.
 `trouble`: a worker is killed by a signal, the scheduler is killed, one recording kills its workers, one eats memory, the disk is full
 (a file system of a few megabytes; needs the right to mount), and two drivers work on one folder.
 
+`joint`: `improve` with 8, 20 and 80 recordings at once: its largest resident memory and CPU time; and whether one process, two, and dask give
+the same bytes for 20.
+
 `paper`: 10⁴ recordings on 50 machines, by the constants that `efficiency` has measured.
 
-`--page` puts the tables of `efficiency` and `paper` in the place of those of the page.
+`--page` puts the tables of `efficiency`, `joint` and `paper` in the place of those of the page.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from pathlib import Path
 
 import tomli_w
 
-from femsense.io.files import write_text
+from femsense.io.files import file_hash, write_text
 from femsense.many.drive import Progress, run_jobs
 from femsense.many.engines import processes
 from femsense.many.jobs import RECORDS, Job
@@ -397,6 +400,40 @@ def full_disk(root: Path, recordings: Path, count: int) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
+# One joint question
+
+
+def joint(root: Path) -> str:
+    """Ask `improve` with more and more recordings; return a table."""
+    write_scripts(root / "joint-scripts", 80)
+    recordings = root / "joint-recordings"
+    made = command("simulate", "finger", root / "joint-scripts/*.toml", "-o", recordings, "--workers", 2)
+    subprocess.run(made, check=True, capture_output=True)
+    every, lines, same = sorted(recordings.glob("push-*")), ["| recordings | CPU | largest memory |", "|---|---|---|"], set[str]()
+    for count, engine in (
+        (8, "in process"),
+        (20, "in process"),
+        (80, "in process"),
+        (20, "2 processes"),
+        (20, "dask, 2 processes"),
+    ):
+        out = fresh(root / "joint")
+        words = [*command("improve", "finger", *every[:count], "-o", out, "--effects", "cable_gain"), *ENGINES[engine]]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        run = subprocess.Popen(words, env={**os.environ, **ONE_THREAD}, **quiet)
+        _, status, used = os.wait4(run.pid, 0)
+        run.returncode = os.waitstatus_to_exitcode(status)
+        if run.returncode:
+            raise SystemExit(f"improve ended with {run.returncode}")
+        if count == 20:
+            same.add(file_hash(out / "loop.json"))
+        lines.append(f"| {count}, {engine} | {used.ru_utime + used.ru_stime:.0f} s | {used.ru_maxrss / 1e3:.0f} MB |")
+        print(lines[-1], flush=True)
+    return "\n".join(
+        [*lines, "", f"Of 20, loop.json has {'the same bytes' if len(same) == 1 else 'OTHER bytes'} on all engines."]
+    )
+
+
 # On paper
 
 RECORDINGS, MACHINES, CORES = 10_000, 50, 32
@@ -442,7 +479,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=200)
-    parser.add_argument("--only", choices=("overhead", "efficiency", "trouble", "paper"))
+    parser.add_argument("--only", choices=("overhead", "efficiency", "trouble", "joint", "paper"))
     parser.add_argument("--page", type=Path, help="page whose tables are replaced")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -451,7 +488,8 @@ def main() -> None:
         overhead(root, 10 * given.count)
     if given.only in (None, "trouble"):
         trouble(root, max(given.count // 10, 12))
-    for name, table in {"efficiency": lambda: efficiency(root, given.count), "paper": lambda: paper(root)}.items():
+    tables = {"efficiency": lambda: efficiency(root, given.count), "joint": lambda: joint(root), "paper": lambda: paper(root)}
+    for name, table in tables.items():
         if given.only in (None, name):
             text = table()
             print(text)

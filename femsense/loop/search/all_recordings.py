@@ -11,7 +11,7 @@ same sums.
 from __future__ import annotations
 
 import contextlib
-import json
+import hashlib
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,13 +26,13 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import basis_of
 from femsense.io.checkpoint import Checkpoint
-from femsense.io.files import file_hash, plain
+from femsense.io.files import file_hash, json_text, plain
 from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import NUISANCE, Data, prepare
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.data.sampled_states import Sampled, drive_table
 from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, found_in, keeping, own_of, problem_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, own_of, problem_of
 from femsense.loop.fit.joint_fit import Prior, fit_jointly
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
@@ -50,6 +50,8 @@ from femsense.model.robot import Robot, spread_points
 
 MOST_STEPS = 4
 """Gauss–Newton steps over all recordings."""
+KEY = 6
+"""Bytes of the name of a candidate."""
 STILL = 0.1
 """They end where no shared parameter moves by more than this share of its standard error."""
 
@@ -102,7 +104,16 @@ def recordings_to_search(recordings: Sequence[Recording], most: int) -> tuple[li
 
 
 def normal_equations(question: Question, recording: Recording, forms: Sequence[Effect] = FORMS) -> NormalEquations:
-    """Return the normal equations of a recording at a model, its own parameters fitted. Raises FemsenseError."""
+    """Return the normal equations of a recording at a model, its own parameters fitted. Raises DataError, which names the recording."""
+    try:
+        return _normal_equations(question, recording, forms)
+    except FemsenseError as error:
+        raise DataError(
+            f"{recording.folder or 'a recording'}: {error}; leave it out, or look at it with femsense calibrate"
+        ) from error
+
+
+def _normal_equations(question: Question, recording: Recording, forms: Sequence[Effect]) -> NormalEquations:
     at = question.hypothesis.robot_at(question.coordinates)
     data = replace(
         prepare(question.hypothesis.robot, [recording], [], "markers"),
@@ -162,11 +173,12 @@ def _squares(data: Data, fitted: FittedModel) -> Squares:
 
 
 def _key(one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> str:
-    """Return the name that a candidate has in all recordings."""
+    """Return the short name that a candidate has in all recordings."""
     effect, seed, parameters = one
-    return json.dumps(
-        [effect.name, effect.discrete, plain(seed), [[p.key, str(p.part), p.scale] for p in parameters]], sort_keys=True
+    whole = json_text(
+        [effect.name, effect.discrete, plain(seed), [[p.key, str(p.part), p.scale] for p in parameters]], indent=None
     )
+    return hashlib.blake2b(whole.encode(), digest_size=KEY).hexdigest()
 
 
 # All recordings
@@ -249,9 +261,8 @@ def in_all_recordings(
     here = [t.scene.recording for t in data.train]
     question = _question_of(data, fitted, noise, screened)
     total, own = reduce(add, ask(question, others)), reduce(add, (normal_equations(question, r, data.forms) for r in here))
-    scores = _scores(data, fitted, total + own)
-    names_left = found_in(fitted)
-    history = [h for h in search.history if h[0] in ("", *names_left) or h[0] in fitted.fit.hypothesis.names]
+    scores = _scores(data, fitted, screened, total + own)
+    history = [h for h in search.history if h[0] in ("", *fitted.fit.hypothesis.names)]
     history = [*history[:-1], (history[-1][0], fitted)]
     seen = AllRecordings(
         recordings=len(others) + len(here),
@@ -295,10 +306,10 @@ def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise
     return fitted, records
 
 
-def _scores(data: Data, fitted: FittedModel, total: NormalEquations) -> dict[str, float]:
+def _scores(data: Data, fitted: FittedModel, names: Sequence[str], total: NormalEquations) -> dict[str, float]:
     """Return the linear dBIC of the best form of each effect that a model lacks, in all recordings."""
     prior = 1.0 / fitted.fit.prior.std**2
-    todo = candidates_for(fitted.fit, data.control, forms=data.forms, names=_names_in(total), has_placements=False)
+    todo = candidates_for(fitted.fit, data.control, forms=data.forms, names=names, has_placements=False)
     effects, best = max(len({e.name for e, _, _ in todo}), 1), dict[str, float]()
     for effect, seed, parameters in todo:
         key = _key((effect, seed, parameters))
@@ -312,7 +323,3 @@ def _scores(data: Data, fitted: FittedModel, total: NormalEquations) -> dict[str
         score = gain - penalty(len(parameters), seed, alone, effects, total.observations)
         best[effect.name] = max(score, best.get(effect.name, -np.inf))
     return best
-
-
-def _names_in(total: NormalEquations) -> list[str]:
-    return list(dict.fromkeys(json.loads(key)[0] for key in total.candidates))
