@@ -37,7 +37,7 @@ from femsense.loop.fit.joint_fit import Prior, fit_jointly
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.normal_equations import Block, NormalEquations, Squares
-from femsense.loop.result.records import AllRecordings, RefitRecord
+from femsense.loop.result.records import AllRecordings
 from femsense.loop.search.calibration import calibrated_pose
 from femsense.loop.search.effect_fields import candidates_for, effect_fields
 from femsense.loop.search.screening import best_step, penalty, whitened_columns
@@ -255,7 +255,7 @@ def in_all_recordings(
         fitted = made
         if moved.max(initial=0.0) < STILL:
             break
-    fitted, refits = _with_evidence(data, fitted, search, noise)
+    fitted, dropped = _with_evidence(data, fitted, search, noise)
     say("screening effects in all recordings")
     screened = [n for n in names if n not in NUISANCE]
     here = [t.scene.recording for t in data.train]
@@ -274,7 +274,8 @@ def in_all_recordings(
         },
         dbic={name: score for name, score in scores.items() if np.isfinite(score)},
     )
-    return replace(search, history=history, final=fitted, refits=[*search.refits, *refits], everywhere=seen)
+    refits = [replace(r, verdict=dropped.get(r.name, r.verdict)) if r.is_named else r for r in search.refits]
+    return replace(search, history=history, final=fitted, refits=refits, everywhere=seen)
 
 
 def _question_of(data: Data, fitted: FittedModel, noise: Noise, names: Sequence[str]) -> Question:
@@ -290,20 +291,17 @@ def _with_others(data: Data, fitted: FittedModel, noise: Noise, total: NormalEqu
     return fit_model(data, fitted.fit.hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
 
 
-def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise) -> tuple[FittedModel, list[RefitRecord]]:
-    """Return a model less the effects, the last one first, that have no evidence in all recordings, and what became of these."""
-    records = list[RefitRecord]()
+def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise) -> tuple[FittedModel, dict[str, str]]:
+    """Return a model less the effects, the last one first, that have no evidence in all recordings, and the verdict on these."""
+    verdicts = dict[str, str]()
     for name in reversed([effect.name for effect, _, _ in fitted.fit.hypothesis.terms if effect.name not in NUISANCE]):
-        kept = [n for n in fitted.fit.hypothesis.names if n != name]
         with contextlib.suppress(FemsenseError):  # without it there is no equilibrium
-            without = keeping(data, fitted, kept, noise)
+            without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
             cost = next((c.cost for c in (*search.last, *search.first) if c.effect.name == name), 0.0)
             gain = without.fit.chi2 - fitted.fit.chi2
             if gain - cost <= data.thresholds.evidence:
-                fitted = without
-                verdict = f"too little evidence in all recordings (dBIC {gain - cost:.1f})"
-                records.append(RefitRecord(name, verdict=verdict, dchi2=gain, dbic=gain - cost, step=len(search.history)))
-    return fitted, records
+                fitted, verdicts[name] = without, f"too little evidence in all recordings (dBIC {gain - cost:.1f})"
+    return fitted, verdicts
 
 
 def _scores(data: Data, fitted: FittedModel, names: Sequence[str], total: NormalEquations) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cache, partial, reduce
 from operator import add
@@ -17,8 +17,16 @@ from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.fitted_model import fit_model, keeping, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.improve import ImproveOptions, improve
-from femsense.loop.search.all_recordings import Question, asked_elsewhere, asked_here, normal_equations, recordings_to_search
+from femsense.loop.fit.normal_equations import NormalEquations
+from femsense.loop.improve import ImproveOptions, improve, search_recordings
+from femsense.loop.search.all_recordings import (
+    Question,
+    asked_elsewhere,
+    asked_here,
+    in_all_recordings,
+    normal_equations,
+    recordings_to_search,
+)
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.screening import screen_model
 from femsense.loop.thresholds import DEFAULTS, Effort
@@ -128,3 +136,20 @@ def test_improve_names_what_all_recordings_lack_from_some_of_them() -> None:
     assert loop.everywhere is not None and (loop.everywhere.recordings, loop.everywhere.searched) == (5, 3)
     assert loop.everywhere.after_validation_rms_m < 0.8 * loop.everywhere.before_validation_rms_m
     assert "Effects were sought in 3 of 5 recordings" in loop.sentence
+
+
+def test_an_effect_of_the_searched_recordings_alone_is_taken_out() -> None:
+    searched = [recordings()[0], recordings()[-1]]
+    data, search = search_recordings(body(), searched, effects=["cable_gain"])
+    inputs, labels = sweeps(1.5, each=2)
+    plain, _ = record(inputs + 0.5, labels=labels, noise=0.0, truth=body())
+    assert "cable_gain" in search.final.fit.hypothesis.names
+
+    def many_like_it(question: Question, others: Iterable[Recording]) -> Iterator[NormalEquations]:
+        one = normal_equations(question, plain)
+        yield replace(one, normal=5000 * one.normal, slope=5000 * one.slope, chi2=5000 * one.chi2)
+
+    found = in_all_recordings(data, search, [plain], ["cable_gain"], many_like_it, lambda text: None)
+    assert "cable_gain" not in found.final.fit.hypothesis.names and [name for name, _ in found.history] == [""]
+    assert any(r.verdict.startswith("too little evidence in all recordings") for r in found.refits)
+    assert found.everywhere is not None and "cable_gain" in found.everywhere.dbic
