@@ -62,7 +62,7 @@ def read_document(file: Path, expected: str) -> dict[str, Any]:
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         raise InputError(
-            "there is no such file" if missing else "cannot be read",
+            "cannot be read",
             where=file,
             found=error.strerror,
             expected=f"a file of format {expected}",
