@@ -14,8 +14,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import multiprocessing
-import os
 import sys
 import time
 import warnings
@@ -37,6 +35,7 @@ from femsense.loop.result.tables import table_of
 from femsense.loop.thresholds import Effort, Thresholds
 from femsense.loop.verdict.returned_model import HeldOutComparison
 from femsense.loop.verdict.verdict import conclude
+from femsense.many.engines import open_engine, spread
 
 INF = float("inf")
 
@@ -352,6 +351,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--only", default=None, help="names of switches, with commas between them")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--dask", help="as of femsense estimate")
     parser.add_argument("--limit", type=float, default=INF, help="stop after so many seconds")
     parser.add_argument("--out", type=Path, default=Path("ablation.jsonl"))
     options = parser.parse_args()
@@ -359,23 +359,20 @@ def main() -> None:
     if options.what == "run":
         known = {(r["case"], r["switch"]) for r in records}
         jobs = list(jobs_of(options.cases, known, None if options.only is None else options.only.split(",")))
-        records += _run(jobs, options.workers, options.limit, options.out)
+        records += _run(jobs, options)
     table(records)
 
 
-def _run(jobs: Sequence[Job], workers: int, limit: float, out: Path) -> list[dict[str, Any]]:
+def _run(jobs: Sequence[Job], options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the records of jobs, as many as there is time for, and append them to a file as they come."""
-    for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(threads, "1")
-    records, end = list[dict[str, Any]](), time.monotonic() + limit
-    with multiprocessing.get_context("spawn").Pool(workers) as pool, out.open("a") as file:
-        for found in pool.imap_unordered(run_job, jobs):
+    records, end = list[dict[str, Any]](), time.monotonic() + options.limit
+    with open_engine(options.workers, options.dask, None) as engine, options.out.open("a") as file:
+        for found in spread(engine, run_job, ((job,) for job in jobs)):
             records += found
             file.writelines(json.dumps(r, default=float) + "\n" for r in found)
             file.flush()
             if time.monotonic() > end:
                 break
-        pool.terminate()
     return records
 
 

@@ -12,7 +12,6 @@ search that the latter go on with. Some minutes.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import sys
 import warnings
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.thresholds import DEFAULTS
+from femsense.many.engines import open_engine, spread
 
 Scores = dict[str, float]
 """Effect → its best linear score [dBIC]."""
@@ -76,8 +76,8 @@ def main() -> None:
     options = parser.parse_args()
     cases = [c for c in make_cases(SEEDS["tune"], COUNTS) if c.kind != "null"][:: options.every]
     models, far, missed, near = 0, [], 0, []
-    with multiprocessing.get_context("spawn").Pool() as pool:
-        for found in pool.imap_unordered(compared, cases):
+    with open_engine(None, None, None) as engine:
+        for found in spread(engine, compared, ((case,) for case in cases)):
             for case, names, hinted, own in found:
                 models += 1
                 print(

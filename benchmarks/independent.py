@@ -1,6 +1,6 @@
 """Recordings of touched soft robots by an independent generator, and how far the program's forces are from their truth.
 
-    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--method NAME …] [--law] [--diamond FOLDER]
+    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--method NAME …] [--law] [--diamond FOLDER] [--workers N]
     python benchmarks/independent.py --list
 
 Below OUT, each case has `robot/`, `recording/` and `truth.json`; with `--run` the installed `femsense` calibrates and estimates
@@ -13,12 +13,31 @@ import argparse
 from collections import defaultdict
 from pathlib import Path
 
-from independent.cases import CASES
+from independent.cases import CASES, Case
 from independent.declared import declare_law
 from independent.grade import Row, grade, heading, results_of, run, summary
 from independent.make import make
 
+from femsense.many.engines import open_engine, spread
+
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
+
+
+def asked(given: argparse.Namespace, case: Case) -> tuple[str, dict[str, Row]]:
+    """Make a case unless it is there, and run and grade it where that is asked for; return how it was made, and the grade by method."""
+    folder, note = given.out / case.name, f"{case.name}:"
+    if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():
+        return f"{note} left out, no diamond.vtu in {given.diamond}", {}
+    if not (folder / "truth.json").exists():
+        truth = make(case, folder, given.seed, diamond=given.diamond, plain=given.plain)
+        note += f" made in {truth['made_in_s']} s, {truth['mesh']}, residual {truth['certificate']['worst_residual_n']:.1e} N"
+    if not given.run:
+        return note, {}
+    place, graded = declare_law(folder, folder / "law") if given.law else folder, dict[str, Row]()
+    for method in given.method or ["rays"]:
+        said = run(place, at=given.at, method=method, timeout=given.timeout)
+        graded[method] = grade(results_of(place, at=given.at, method=method), folder / "truth.json", note=f"{method}, {said}")
+    return note, graded
 
 
 def main() -> int:
@@ -42,6 +61,10 @@ def main() -> int:
     )
     ask.add_argument("--law", action="store_true", help="with --run: the robot declares the law of the truth")
     ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
+    ask.add_argument(
+        "--workers", type=int, default=0, help="cases at a time, in processes of their own; 0: one after the other, here"
+    )
+    ask.add_argument("--dask", help="as of femsense estimate")
     ask.add_argument("--list", action="store_true", help="name the cases")
     given = ask.parse_args()
     if given.list or given.out is None:
@@ -50,30 +73,15 @@ def main() -> int:
     unknown = set(given.case) - {c.name for c in CASES}
     if unknown:
         ask.error(f"no such case: {', '.join(sorted(unknown))}")
+    usual = [c for c in CASES if not (c.calm or c.near_clamp or c.nudges)]
+    chosen = [c for c in CASES if c.name in given.case] if given.case else usual
     rows: dict[str, list[Row]] = defaultdict(list)
-    for case in CASES:
-        if case.name not in given.case if given.case else case.calm or case.near_clamp or case.nudges:
-            continue
-        folder = given.out / case.name
-        if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():
-            print(f"{case.name}: left out, no diamond.vtu in {given.diamond}")
-            continue
-        if not (folder / "truth.json").exists():
-            truth = make(case, folder, given.seed, diamond=given.diamond, plain=given.plain)
-            print(
-                f"{case.name}: made in {truth['made_in_s']} s, {truth['mesh']}, ",
-                f"residual {truth['certificate']['worst_residual_n']:.1e} N",
-                sep="",
-                flush=True,
-            )
-        if given.run:
-            asked = declare_law(folder, folder / "law") if given.law else folder
-            for method in given.method or ["rays"]:
-                note = run(asked, at=given.at, method=method, timeout=given.timeout)
-                row = grade(results_of(asked, at=given.at, method=method), folder / "truth.json", note=f"{method}, {note}")
-                print("" if any(rows.values()) else f"{heading()}\n", end="")
+    print(heading() if given.run else "", end="\n" * given.run)
+    with open_engine(given.workers, given.dask, None) as engine:
+        for note, graded in spread(engine, asked, ((given, case) for case in chosen)):
+            print("\n".join([note, *(row.line() for row in graded.values())]), flush=True)
+            for method, row in graded.items():
                 rows[method].append(row)
-                print(row.line(), flush=True)
     for method, graded in rows.items():
         print(f"{method}:\n{summary(graded)}")
     return 0

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -32,6 +30,7 @@ from femsense.loop.data.trial import Groups
 from femsense.loop.fit.marker_placement import placement_turns
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.tables import table_of
+from femsense.many.engines import open_engine, spread
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import solve_path
 
@@ -361,6 +360,7 @@ def main() -> None:
     parser.add_argument("--linear", action="store_true", help="declare linear elements")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--dask", help="as of femsense estimate")
     parser.add_argument("--table", action="store_true", help="print from the file, run nothing")
     options = parser.parse_args()
     kind = ("" if options.finer is None else f"-finer-{options.finer}") + ("-linear" if options.linear else "")
@@ -375,13 +375,11 @@ def main() -> None:
             jobs.append((options.which, case))
     np.random.default_rng(0).shuffle(jobs)  # so that a part of the cases is a fair sample
     if not options.table:
-        for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # of each worker; more of them would wait for each other
-            os.environ.setdefault(threads, "1")
-        with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
-            for record in pool.imap_unordered(run_case, jobs):
+        with open_engine(options.workers, options.dask, None) as engine, out.open("a") as file:
+            for record in spread(engine, run_case, ((job,) for job in jobs)):
                 records.append(record)
-                with out.open("a") as file:
-                    file.write(json.dumps(record, default=float) + "\n")
+                file.write(json.dumps(record, default=float) + "\n")
+                file.flush()
                 print(
                     (
                         f"{len(records)} {record['kind']} {record['label']} {record.get('verdict', record.get('failed'))} "

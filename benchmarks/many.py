@@ -1,18 +1,24 @@
 """Many short recordings over processes and over dask: efficiency, overhead of a task, memory, and what happens when things die.
 
-    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|paper]
+    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|joint|paper] [--page docs/many.md]
 
 `overhead`: ten times COUNT jobs that write one line, on two processes: time of a worker beside each, and memory of the driver.
 
-`efficiency`: COUNT recordings of the finger are simulated, and each fifth of them is calibrated, on one process, on two, and on a local
-dask cluster of two. Printed for each: wall time, efficiency (time inside the tasks over workers × wall time), overhead of a task
-(workers × wall time minus time inside, without the start of the workers), memory of the driver at a tenth of the tasks and at the end,
-and whether all results are the same bytes.
+`efficiency`: COUNT recordings of the finger are simulated, and each tenth of them is calibrated: in process, on one process, on two, and
+on a local dask cluster of two. Printed for each: CPU time of all processes and that of `in process` over it, which other programs hardly
+change; wall time, and efficiency by it (time inside the tasks over workers × wall time, without the start of the workers); CPU time of a
+task beside that in process, without the start; memory of the driver at a tenth of the tasks and at the end; and whether all results are
+the same bytes.
 
 `trouble`: a worker is killed by a signal, the scheduler is killed, one recording kills its workers, one eats memory, the disk is full
 (a file system of a few megabytes; needs the right to mount), and two drivers work on one folder.
 
+`joint`: `improve` with 8, 20 and 80 recordings at once: its largest resident memory and CPU time; and whether one process, two, and dask give
+the same bytes for 20.
+
 `paper`: 10⁴ recordings on 50 machines, by the constants that `efficiency` has measured.
+
+`--page` puts the tables of `efficiency`, `joint` and `paper` in the place of those of the page.
 """
 
 from __future__ import annotations
@@ -22,26 +28,29 @@ import contextlib
 import hashlib
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tomli_w
 
-from femsense.io.files import write_text
+from femsense.io.files import file_hash, write_text
 from femsense.many.drive import Progress, run_jobs
 from femsense.many.engines import processes
 from femsense.many.jobs import RECORDS, Job
+from femsense.many.limits import ONE_THREAD
 from femsense.many.outcome import Outcome, Status
 from femsense.many.work import Result, work_on
 
 WORDS = [sys.executable, "-m", "femsense"]
 ENGINES = {
+    "in process": ["--workers", "0"],
     "1 process": ["--workers", "1"],
     "2 processes": ["--workers", "2"],
     "dask, 2 processes": ["--dask", "local", "--workers", "2"],
@@ -68,6 +77,10 @@ class Measured:
     """… and before the last one; then the summary is written, for which pyarrow is loaded."""
     sent_bytes: int
     """Largest record of a task, which holds more than what is sent."""
+    cpu_s: float
+    """CPU time of all its processes, the start included."""
+    load: float
+    """How many processes wanted a core meanwhile, on average over the last minute."""
 
     @property
     def efficiency(self) -> float:
@@ -75,9 +88,15 @@ class Measured:
         return self.inside_s / (self.workers * (self.wall_s - self.start_s))
 
     @property
-    def overhead_ms(self) -> float:
-        """Time of a worker beside each task."""
-        return 1e3 * (self.workers * (self.wall_s - self.start_s) - self.inside_s) / self.jobs
+    def row(self) -> str:
+        """The row of a table."""
+        mb = f"{self.early_mb:.0f}, {self.late_mb:.0f} MB"
+        return f"{self.cpu_s:.0f} s | {self.wall_s:.0f} s | {self.efficiency:.2f} | {mb} | {self.load:.1f}"
+
+
+def task_ms(many: Measured, few: Measured) -> float:
+    """Return the CPU time of one task more [ms]: the start is in both runs."""
+    return 1e3 * (many.cpu_s - few.cpu_s) / (many.jobs - few.jobs)
 
 
 def write_scripts(folder: Path, count: int) -> None:
@@ -111,9 +130,12 @@ def done_in(out: Path, name: str) -> list[Path]:
 
 def measured(engine: str, name: str, words: list[str], out: Path, count: int) -> Measured:
     """Run a command over many recordings and watch it."""
-    began, started, early, late = time.perf_counter(), 0.0, float("nan"), float("nan")
+    began, started, early, late, cpu = time.perf_counter(), 0.0, float("nan"), float("nan"), cpu_of_children()
     run = subprocess.Popen(
-        [*command(name), *words, "-o", str(out), *ENGINES[engine]], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command(name), *words, "-o", str(out), *ENGINES[engine]],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, **ONE_THREAD},
     )
     while run.poll() is None:
         time.sleep(0.05)
@@ -123,13 +145,19 @@ def measured(engine: str, name: str, words: list[str], out: Path, count: int) ->
         done = len(done_in(out, name))
         early = now if early != early and done >= count / 10 else early
         late = now if done < count else late
-    wall = time.perf_counter() - began
+    wall, cpu = time.perf_counter() - began, cpu_of_children() - cpu
     if run.returncode:
         raise SystemExit(f"{name} ended with {run.returncode}")
     records = done_in(out, name)
     inside = sum(json.loads(file.read_text(encoding="utf-8"))["outcome"]["seconds"] for file in records)
-    workers = int(ENGINES[engine][-1])
-    return Measured(engine, len(records), workers, wall, started, inside, early, late, max(f.stat().st_size for f in records))
+    workers, largest = max(int(ENGINES[engine][-1]), 1), max(file.stat().st_size for file in records)
+    return Measured(engine, len(records), workers, wall, started, inside, early, late, largest, cpu, os.getloadavg()[0])
+
+
+def cpu_of_children() -> float:
+    """Return the CPU time of all processes that were started here and have ended, with those that these started [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def content(folder: Path) -> str:
@@ -141,32 +169,46 @@ def content(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def efficiency(root: Path, count: int) -> list[Measured]:
-    """Simulate and calibrate all recordings on each engine; print a table."""
-    write_scripts(root / "scripts", count)
-    found, hashes = list[Measured](), dict[str, set[str]]()
-    print(
-        f"{'command':10s} {'engine':18s}  jobs  wall s  start s  efficiency  overhead ms  driver MB, early and late  record bytes"
-    )
-    recordings = root / "recordings"
-    for name in ("simulate", "calibrate"):
-        for engine in ENGINES:
-            out = root / f"{name}-{engine.replace(', ', '-').replace(' ', '-')}"
-            shutil.rmtree(out, ignore_errors=True)
-            words = ["finger", str(root / "scripts/*.toml") if name == "simulate" else str(recordings / "push-*[05]")]
-            m = measured(engine, name, words, out, count if name == "simulate" else count // 5)
-            found.append(m)
-            hashes.setdefault(name, set()).add(content(out))
-            print(
-                f"{name:10s} {engine:18s} {m.jobs:5d} {m.wall_s:7.1f} {m.start_s:8.1f} {m.efficiency:11.2f} {m.overhead_ms:12.0f} "
-                f"{m.early_mb:14.0f} {m.late_mb:11.0f} {m.sent_bytes:13d}",
-                flush=True,
+def efficiency(root: Path, count: int) -> str:
+    """Simulate and calibrate all recordings on each engine; return a table."""
+    scripts, recordings, few = root / "scripts", root / "recordings", count // 10
+    write_scripts(scripts, count)
+    found, same = dict[tuple[str, str], Measured](), list[str]()
+    lines = [
+        "| | CPU | of that in process | wall | efficiency | driver, early and late | load |",
+        "|---|---|---|---|---|---|---|",
+    ]
+
+    def run(name: str, pattern: Path, jobs: int, engine: str) -> Path:
+        out = fresh(root / f"{name}-{jobs}-{engine.replace(', ', '-').replace(' ', '-')}")
+        m = found[f"{name} {jobs}", engine] = measured(engine, name, ["finger", str(pattern)], out, jobs)
+        share, (cpu, rest) = m.cpu_s / found[f"{name} {jobs}", "in process"].cpu_s, m.row.split(" | ", 1)
+        lines.append(f"| {name} {jobs}, {engine} | {cpu} | {share:.2f} | {rest} |")
+        print(lines[-1], flush=True)
+        return out
+
+    for name, jobs in (("simulate", few), ("simulate", count), ("calibrate", few)):
+        outs = [
+            run(
+                name,
+                scripts / ("*0.toml" if jobs == few else "*.toml") if name == "simulate" else recordings / "push-*5",
+                jobs,
+                engine,
             )
-            if name == "simulate" and not recordings.exists():
-                shutil.copytree(out, recordings, ignore=shutil.ignore_patterns(RECORDS))
-        print(f"{name}: {'the same bytes on all engines' if len(hashes[name]) == 1 else 'OTHER bytes'}", flush=True)
-    (root / "measured.json").write_text(json.dumps([asdict(m) for m in found], indent=2), encoding="utf-8")
-    return found
+            for engine in ENGINES
+        ]
+        if jobs == count:
+            shutil.copytree(outs[0], recordings, ignore=shutil.ignore_patterns(RECORDS), dirs_exist_ok=True)
+        same.append(f"{name} {jobs}: {'the same bytes' if len({content(out) for out in outs}) == 1 else 'OTHER bytes'}")
+    alone, *others = {
+        engine: task_ms(found[f"simulate {count}", engine], found[f"simulate {few}", engine]) for engine in ENGINES
+    }.items()
+    overheads = {engine: ms - alone[1] for engine, ms in others}
+    constants = {"overhead_ms": overheads["dask, 2 processes"], "sent_bytes": max(m.sent_bytes for m in found.values())}
+    (root / "measured.json").write_text(json.dumps(constants), encoding="utf-8")
+    beside = ", ".join(f"{ms:.0f} ms on {engine}" for engine, ms in overheads.items())
+    lines += ["", f"CPU time of one task more, beside the {alone[1]:.0f} ms of it in process: {beside}."]
+    return "\n".join([*lines, f"On all engines: {', '.join(same)}. The largest record has {constants['sent_bytes']} bytes."])
 
 
 # Overhead
@@ -358,6 +400,40 @@ def full_disk(root: Path, recordings: Path, count: int) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
+# One joint question
+
+
+def joint(root: Path) -> str:
+    """Ask `improve` with more and more recordings; return a table."""
+    write_scripts(root / "joint-scripts", 80)
+    recordings = root / "joint-recordings"
+    made = command("simulate", "finger", root / "joint-scripts/*.toml", "-o", recordings, "--workers", 2)
+    subprocess.run(made, check=True, capture_output=True)
+    every, lines, same = sorted(recordings.glob("push-*")), ["| recordings | CPU | largest memory |", "|---|---|---|"], set[str]()
+    for count, engine in (
+        (8, "in process"),
+        (20, "in process"),
+        (80, "in process"),
+        (20, "2 processes"),
+        (20, "dask, 2 processes"),
+    ):
+        out = fresh(root / "joint")
+        words = [*command("improve", "finger", *every[:count], "-o", out, "--effects", "cable_gain"), *ENGINES[engine]]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        run = subprocess.Popen(words, env={**os.environ, **ONE_THREAD}, **quiet)
+        _, status, used = os.wait4(run.pid, 0)
+        run.returncode = os.waitstatus_to_exitcode(status)
+        if run.returncode:
+            raise SystemExit(f"improve ended with {run.returncode}")
+        if count == 20:
+            same.add(file_hash(out / "loop.json"))
+        lines.append(f"| {count}, {engine} | {used.ru_utime + used.ru_stime:.0f} s | {used.ru_maxrss / 1e3:.0f} MB |")
+        print(lines[-1], flush=True)
+    return "\n".join(
+        [*lines, "", f"Of 20, loop.json has {'the same bytes' if len(same) == 1 else 'OTHER bytes'} on all engines."]
+    )
+
+
 # On paper
 
 RECORDINGS, MACHINES, CORES = 10_000, 50, 32
@@ -367,27 +443,35 @@ SCHEDULER_TASKS_S = 1000.0
 """What one dask scheduler hands out at most (its own documentation: about 200 µs to 1 ms a task)."""
 
 
-def paper(root: Path) -> None:
-    """Print what 10⁴ recordings on 50 machines cost, by measured constants and those above."""
+def paper(root: Path) -> str:
+    """Return what 10⁴ recordings on 50 machines cost, by measured constants and those above."""
     found = json.loads((root / "measured.json").read_text(encoding="utf-8"))
-    dask = next(m for m in found if m["engine"].startswith("dask"))
-    one = Measured(**dask)
+    overhead_s, sent = found["overhead_ms"] / 1e3, found["sent_bytes"]
     workers = MACHINES * CORES
-    compute = RECORDINGS * (JOB_S + one.overhead_ms / 1e3) / workers
-    waves = -(-RECORDINGS // workers)
+    waves, read = -(-RECORDINGS // workers), workers * JOB_READ_MB / JOB_S
     rows = {
         "workers": f"{workers}",
-        "compute, if recordings were infinitely divisible": f"{compute / 60:.0f} min",
-        "compute, in whole waves of workers": f"{waves * (JOB_S + one.overhead_ms / 1e3) / 60:.0f} min ({waves} waves)",
-        "overhead of the tasks": f"{one.overhead_ms:.0f} ms each, {100 * one.overhead_ms / 1e3 / JOB_S:.2f} % of a task",
-        "tasks a second at the scheduler": f"{workers / JOB_S:.1f} of about {SCHEDULER_TASKS_S:.0f}",
-        "messages": f"{RECORDINGS * one.sent_bytes * 2 / 1e6:.0f} MB at most",
-        "read from the shared disk": f"{RECORDINGS * JOB_READ_MB / 1e6:.1f} TB, {workers * JOB_READ_MB / JOB_S:.0f} MB/s of {DISK_MB_S:.0f}",
-        "written": f"{RECORDINGS * JOB_WRITE_MB / 1e3:.0f} GB, {workers * JOB_WRITE_MB / JOB_S:.0f} MB/s",
+        "compute": f"{RECORDINGS * (JOB_S + overhead_s) / workers / 60:.0f} min; {waves * (JOB_S + overhead_s) / 60:.0f} min in whole waves of workers",
+        "overhead of the tasks": f"{1e3 * overhead_s:.0f} ms each, {100 * overhead_s / JOB_S:.2f} % of a task",
+        "tasks a second at the scheduler": f"{workers / JOB_S:.0f} of about {SCHEDULER_TASKS_S:.0f}",
+        "messages": f"{RECORDINGS * sent * 2 / 1e6:.0f} MB at most",
+        "read from the shared disk": f"{RECORDINGS * JOB_READ_MB / 1e6:.0f} TB, {read / 1e3:.1f} GB/s of {DISK_MB_S / 1e3:.0f} GB/s: "
+        f"**{RECORDINGS * JOB_READ_MB / min(read, DISK_MB_S) / 60:.0f} min**",
+        "workers that the disk feeds": f"{DISK_MB_S * JOB_S / JOB_READ_MB:.0f}",
+        "written": f"{RECORDINGS * JOB_WRITE_MB / 1e3:.0f} GB, {workers * JOB_WRITE_MB / JOB_S / 1e3:.2f} GB/s",
+        "shortest task that the scheduler keeps up with": f"{workers / SCHEDULER_TASKS_S:.1f} s",
         "cost": f"{RECORDINGS * JOB_S / 3600 * CORE_HOUR_EUR:.0f} EUR",
     }
-    for name, value in rows.items():
-        print(f"{name:50s} {value}")
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+def put(page: Path, name: str, text: str) -> None:
+    """Put a text between the marks of its name in a page."""
+    begin, end = f"<!-- {name} -->\n", f"\n<!-- /{name} -->"
+    before, _, rest = page.read_text(encoding="utf-8").partition(begin)
+    if not rest:
+        raise SystemExit(f"{page} has no mark {begin.strip()}")
+    page.write_text(before + begin + text + end + rest.partition(end)[2], encoding="utf-8")
 
 
 def main() -> None:
@@ -395,18 +479,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=200)
-    parser.add_argument("--only", choices=("overhead", "efficiency", "trouble", "paper"))
+    parser.add_argument("--only", choices=("overhead", "efficiency", "trouble", "joint", "paper"))
+    parser.add_argument("--page", type=Path, help="page whose tables are replaced")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     root = given.out.absolute()
     if given.only in (None, "overhead"):
         overhead(root, 10 * given.count)
-    if given.only in (None, "efficiency"):
-        efficiency(root, given.count)
     if given.only in (None, "trouble"):
         trouble(root, max(given.count // 10, 12))
-    if given.only in (None, "paper"):
-        paper(root)
+    tables = {"efficiency": lambda: efficiency(root, given.count), "joint": lambda: joint(root), "paper": lambda: paper(root)}
+    for name, table in tables.items():
+        if given.only in (None, name):
+            text = table()
+            print(text)
+            if given.page is not None:
+                put(given.page, name, text)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from femsense.app.command_line.answer import Answer, ManyJobs
+from femsense.app.command_line.parameters import run_of
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.folder_lock import only_writer
@@ -25,7 +26,7 @@ from femsense.many.jobs import RECORDS, Job, Row, expanded, is_glob, names_of, r
 from femsense.many.limits import available_cores, memory_share
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import AGAIN
-from femsense.many.summary import check_summary_folder, read_summary, write_summary
+from femsense.many.summary import check_no_result, check_summary_folder, read_summary, write_summary
 
 Say = Callable[[str], None]
 Run = Callable[..., Outcome]
@@ -60,6 +61,8 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
     command = str(asked.command.name)
     out = _folder_of_all(asked)
     check_summary_folder(out)
+    if asked.output is not None:
+        check_no_result(out)
     jobs = _jobs(asked, command, out)
     workers = None if asked.workers == 0 else asked.workers
     memory = memory_share(workers or available_cores(), asked.memory_gb)
@@ -149,6 +152,7 @@ def _job(
         place = find_robot(robot).absolute()
         words.append(str(place.parent) if Path(robot).expanduser().exists() else robot)
         reads.append(place.parent)
+    units = [str(run_of(Path(unit))) for unit in units] if command == "report" else units
     words += units
     reads += [Path(unit.rpartition("=")[2] if "=" in unit and not Path(unit).exists() else unit) for unit in units]
     target = out / name

@@ -60,7 +60,14 @@ def read_document(file: Path, expected: str) -> dict[str, Any]:
     try:
         document = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError("cannot be read", where=file, found=error.strerror, expected=f"a file of format {expected}") from None
+        missing = isinstance(error, FileNotFoundError)
+        raise InputError(
+            "cannot be read",
+            where=file,
+            found=error.strerror,
+            expected=f"a file of format {expected}",
+            hint="if a command was to make it, the summary.csv of that says why it has not" if missing else None,
+        ) from None
     except ValueError as error:
         raise InputError("not valid JSON", where=file, found=error, expected=f"a file of format {expected}") from None
     found = document.get("format") if isinstance(document, dict) else type(document).__name__

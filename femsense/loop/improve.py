@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
 from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
+from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.element_order import linear_suffice, need_quadratic, seeks_with_quadratic, with_quadratic
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
@@ -61,6 +63,8 @@ class ImproveOptions:
     """What decides; other values than these are for experiments with the loop itself."""
     effort: Effort = EFFORT
     """How much is tried."""
+    spread: Spread | None = None
+    """Runs what is asked of each of many recordings (`femsense.many.engines.spread`); None: this process does, one after the other."""
     keep: tuple[str | Path, Mapping[str, Any]] | None = None
     """A file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
     something else is not used. It is removed at the end."""
@@ -93,11 +97,15 @@ def improve(
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
     say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
-    names, forms = _asked(robot, recordings, effects, without, how)
-    recordings, validation = _less_references(robot, recordings, validation, how, say)
+    searched: Sequence[Recording]
+    searched, others = _split(recordings, validation, how)
+    names, forms = _asked(robot, searched, effects, without, how, apart=not others)
+    searched, validation = _less_references(robot, searched, validation, how, say)
     rng = np.random.default_rng(how.seed)
     with Checkpoint(how.keep, forms) as checkpoint, say.watching():
-        data, search = _search(robot, recordings, validation, (names, forms), how, checkpoint, say)
+        data, search = _search(robot, searched, validation, (names, forms), how, checkpoint, say)
+        if others:
+            search = in_all_recordings(data, search, others, names, _ask(how, forms), say)
         say.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
         say("testing what is left")
         result = conclude(data, search, rng, correct=how.correct)
@@ -131,6 +139,22 @@ def search_recordings(
         return _search(robot, recordings, validation, (names, forms), how, checkpoint, WorkPlan(lambda text: None))
 
 
+def _split(
+    recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions
+) -> tuple[list[Recording], list[Recording]]:
+    """Return the recordings in which effects are sought, and the others: none where one is judged on, or compared with references."""
+    if validation or how.references or how.measured not in ("auto", "markers"):
+        return list(recordings), []
+    return recordings_to_search(recordings, how.effort.recordings)
+
+
+def _ask(how: ImproveOptions, forms: Sequence[Effect]) -> Ask:
+    if how.spread is None:
+        return asked_here(forms)
+    folder = Path(tempfile.gettempdir()) if how.keep is None else Path(how.keep[0]).parent
+    return asked_elsewhere(how.spread, forms, how.user_effects, folder)
+
+
 def _less_references(
     robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions, say: Progress
 ) -> tuple[Sequence[Recording], Sequence[Recording]]:
@@ -148,8 +172,10 @@ def _asked(
     effects: Sequence[str] | None,
     without: Sequence[str] | None,
     how: ImproveOptions,
+    *,
+    apart: bool = True,
 ) -> tuple[list[str], tuple[Effect, ...]]:
-    """Return the names of the effects that are tried, and all their forms. Raises InputError."""
+    """Return the names of the effects that are tried, and all their forms, with those that differ between recordings if `apart`. Raises InputError."""
     own = tuple(load_own_effect(file) for file in how.user_effects)
     for effect in own:
         try_own_effect(effect, robot)
@@ -162,7 +188,7 @@ def _asked(
             "no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists"
         )
     _require_one_that_acts(names if effects else [], own, robot, recordings)
-    return names, (*FORMS, *forms_by_recording(FORMS, recordings), *own)
+    return names, (*FORMS, *(forms_by_recording(FORMS, recordings) if apart else ()), *own)
 
 
 def _search(

@@ -98,6 +98,8 @@ class Effort:
     """So many alternatives to an effect are tried."""
     matchings: int = 6
     """Times that the rows of clouds are made again, at most."""
+    recordings: int = 8
+    """Recordings in which effects are sought; where there are more, what is found is fitted to all of them (`search/all_recordings.py`)."""
     work: int = 20_000
     """Tetrahedra × states of a recording that are looked at as they are; where there are more, some states speak for all …"""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from femsense.core.errors import DataError, InputError
 from femsense.many import limits
-from femsense.many.engines import Death, Engine
+from femsense.many.engines import GONE, Death, Engine
 from femsense.many.jobs import Job
 from femsense.many.outcome import Outcome, Status
 from femsense.many.records import Record, Stats, is_valid, log_of, read_record, running_mark, shortened, stamp_of, write_record
@@ -161,7 +161,7 @@ def _check_disk(outcome: Outcome, gathered: _Gathered) -> None:
 def _outcome(job: Job, future: Future[Outcome], engine: Engine) -> Outcome | None:
     """Return the outcome of a job that has ended; None where it is to be run once more. Raises DataError without workers."""
     if future.cancelled():
-        raise DataError("the scheduler is gone, and its workers with it; results so far are kept, and the same command goes on")
+        raise DataError(GONE)
     error = future.exception()
     if error is None:
         return future.result()

@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import DataError, InputError, MissingDependency
 from femsense.many import limits
 
 P = ParamSpec("P")
@@ -31,6 +33,7 @@ FEWEST_DASK = 200
 """… and no fewer jobs than this: a cluster that starts small sees how much there is to do."""
 CONNECT = "10s"
 """A scheduler that does not answer for so long is not there."""
+GONE = "the scheduler is gone, and its workers with it; results so far are kept, and the same command goes on"
 TTL = "1 hour"
 """For so long a dask worker may be silent: compiled code can hold Python's lock for minutes."""
 
@@ -72,6 +75,38 @@ class Engine(Protocol):
 
     def death_in(self, error: BaseException) -> Death | None:
         """Return which death of a worker an error of a future reports; None where it reports none."""
+
+
+def spread(engine: Engine, function: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Iterator[T]:
+    """Yield function(*task) of each task, in order, as an engine has them; few are handed over ahead.
+
+    A task that loses its worker is run once more. Raises DataError where it loses that one, too, or where the scheduler is gone, and what the
+    function raises.
+    """
+    waiting, left = deque[tuple[tuple[Any, ...], Future[T]]](), iter(tasks)
+
+    def submitted() -> Iterator[tuple[tuple[Any, ...], Future[T]]]:
+        return ((task, engine.submit(function, *task)) for task in left)
+
+    waiting.extend(islice(submitted(), engine.ahead))
+    try:
+        while waiting:
+            task, future = waiting.popleft()
+            wait([future])
+            if future.cancelled():
+                raise DataError(GONE)
+            error = future.exception()
+            if error is not None and engine.death_in(error) is not None:
+                future = engine.submit(function, *task)
+                error = future.exception()
+                death = None if error is None else engine.death_in(error)
+                if death is not None:
+                    raise DataError(f"{task[-1]}: this has ended two workers: {death.text}") from error
+            yield future.result()
+            waiting.extend(islice(submitted(), 1))
+    finally:
+        for _, future in waiting:
+            future.cancel()
 
 
 # In process
@@ -118,15 +153,23 @@ class Processes:
 
 
 @contextmanager
-def processes(workers: int) -> Iterator[Processes]:
-    """Open a pool. Processes are spawned, since a fork would copy threads and locks of libraries in whatever state they are.
+def processes(workers: int, memory: int | None = None) -> Iterator[Processes]:
+    """Open a pool; each process may take so much memory [bytes].
+
+    Processes are spawned, since a fork would copy threads and locks of libraries in whatever state they are.
 
     When the block ends by an error, such as Ctrl-C, what still runs is ended.
     """
     from pebble import ProcessPool
 
     with limits.environment(limits.ONE_THREAD):
-        pool: Any = ProcessPool(max_workers=workers, max_tasks=LIFE, context=get_context("spawn"))
+        pool: Any = ProcessPool(
+            max_workers=workers,
+            max_tasks=LIFE,
+            context=get_context("spawn"),
+            initializer=limits.limit_memory,
+            initargs=(memory,),
+        )
         try:
             yield Processes(pool, workers)
             pool.close()
@@ -274,5 +317,5 @@ def open_engine(workers: int | None, where: str | None, memory: int | None) -> c
     if workers == 0:
         chosen = ENGINES["in process"]()
         return chosen
-    chosen = ENGINES["processes"](workers or limits.available_cores())
+    chosen = ENGINES["processes"](workers or limits.available_cores(), memory)
     return chosen

@@ -14,6 +14,7 @@ from typing import Any
 from markupsafe import Markup
 
 import femsense
+from femsense.core.errors import InputError
 from femsense.io.files import check_target, json_text, write_beside, write_csv, write_json, write_text
 from femsense.io.own_files import FileKind, check_files
 from femsense.many.jobs import MANY, RECORDS
@@ -33,6 +34,8 @@ OWN = {
     "poison.csv": FileKind("a list of femsense", ",".join(POISON_COLUMNS).encode()),
 }
 SHOWN_REASON = 300
+RESULTS = ("recording.toml", "robot.toml", "run.json", "calibration.json")
+"""Each is of one result, in a folder of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,13 @@ def check_summary_folder(folder: Path) -> None:
     """Raise InputError where a summary cannot be written, or would replace a file that is none of femsense's."""
     check_target(folder, folder=True)
     check_files(folder, OWN)
+
+
+def check_no_result(folder: Path) -> None:
+    """Raise InputError where a folder holds one result: those of many would be mixed with it."""
+    found = next((name for name in RESULTS if (folder / name).exists()), None)
+    if found is not None:
+        raise InputError("a single result stands where those of many would", where=folder, found=found, hint="another -o")
 
 
 def write_summary(folder: Path, command: str, outcomes: Sequence[Outcome], folders: Mapping[str, Path]) -> None:

@@ -91,7 +91,8 @@ def _called(job: Job, call: Call) -> Outcome:
         result = call(job.words)
         status, reason, row = Status.NO_RESULT if result.reason else Status.DONE, result.reason, result.row
     except Exception as error:
-        status, reason = _kind_of(error), str(error) if isinstance(error, FemsenseError) else _line(error)
+        status, cause = _kind_of(error)
+        reason = str(cause) if isinstance(cause, FemsenseError) else _line(cause)
     if status is Status.OUT_OF_MEMORY:
         reason += "; a worker may not take more memory: --memory, or fewer --workers"
     return Outcome(
@@ -105,16 +106,17 @@ def _called(job: Job, call: Call) -> Outcome:
     )
 
 
-def _kind_of(error: BaseException) -> Status:
-    """Return the status of a job that raised an error: by its causes, since a full disk or memory is reported as what failed."""
+def _kind_of(error: BaseException) -> tuple[Status, BaseException]:
+    """Return the status of a job that raised an error, and the error that says why: a full disk or memory is often the cause of what is raised."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError):
-            return Status.OUT_OF_MEMORY
+            return Status.OUT_OF_MEMORY, error
         if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
-            return Status.DISK_FULL
+            return Status.DISK_FULL, cause
         cause = cause.__cause__ or cause.__context__
-    return Status.NO_RESULT if isinstance(error, FemsenseError) and error.exit_status == 1 else Status.FAILED
+    no_result = isinstance(error, FemsenseError) and error.exit_status == 1
+    return Status.NO_RESULT if no_result else Status.FAILED, error
 
 
 def _line(error: BaseException) -> str:

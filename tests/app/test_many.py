@@ -90,6 +90,16 @@ def test_from_scripts_to_forces_with_one_table_and_a_second_run_that_does_nothin
     assert run("report", lab / "runs", *IN_PROCESS).status == 0
     assert "a/report.html" in (lab / "runs/summary.html").read_text() and len(rows_of(lab / "runs")) == 2
     assert "2 were there" in run(*words, *IN_PROCESS).out
+    shutil.copytree(lab / "runs/a", lab / "sessions/live/run", ignore=shutil.ignore_patterns("report.html"))
+    (lab / "sessions/live/session.json").write_text("{}")
+    asked = ("report", "--jobs", lab / "sessions/*", *IN_PROCESS)
+    assert "1 done" in run(*asked).out and (lab / "sessions/live/run/report.html").is_file()
+    assert "1 were there" in run(*asked).out
+    (lab / "cal/b/calibration.json").unlink()
+    said = run(
+        "estimate", robot, recordings, "-c", lab / "cal", "--at", "0.1,0.015,0.015", "-o", lab / "again", *IN_PROCESS, "--json"
+    )
+    assert said.status == 1 and "summary.csv of that says why" in said.json["jobs"][1]["reason"]
 
 
 def test_processes_make_the_same_bytes(run: Any, lab: Path) -> None:
@@ -121,6 +131,12 @@ def test_a_joint_question_of_each_row(run: Any, lab: Path) -> None:
     assert len(json.loads((lab / "out/both/loop.json").read_text())["inputs"]["recordings"]) == 2
 
 
+def test_improve_works_in_this_process_alone_and_takes_a_folder_of_recordings(run: Any, lab: Path) -> None:
+    said = run("improve", lab / "robot", lab / "recordings", "-o", lab / "out", "--effects", "stiffness", *IN_PROCESS, "--json")
+    assert said.status == 0, said.err
+    assert [Path(one["path"]).name for one in said.json["inputs"]["recordings"]] == ["a", "b"]
+
+
 def test_captures_are_imported_by_a_pattern(run: Any, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.csv").write_text("time_s,tip_x,tip_y,tip_z\n0,0.1,0,0\n0.1,0.1,0,0.01\n", encoding="utf-8")
@@ -136,7 +152,9 @@ def test_captures_are_imported_by_a_pattern(run: Any, tmp_path: Path) -> None:
         (("estimate", "robot", "recordings/a", "--jobs", "recordings/*", "-o", "out"), "--jobs says what the jobs are about"),
         (("estimate", "robot", "--jobs", "none*", "-o", "out"), "nothing matches this pattern"),
         (("estimate", "robot", "recordings", "-o", "out", "--memory", "0"), "not an amount of memory"),
-        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "--dask and --memory are of many jobs"),
+        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "of more than 8 recordings"),
+        (("import", "recordings", "-o", "out"), "--jobs 'recordings/*' makes a recording of each"),
+        (("import", *("recordings/a/frames.csv",) * 9, "-o", "out"), "too many captures for the cameras of one recording"),
     ],
 )
 def test_wrong_usage_is_said_before_anything_runs(
@@ -162,6 +180,12 @@ def test_a_table_with_an_error_says_where(run: Any, lab: Path, table: str, messa
     (lab / "jobs.csv").write_text(table, encoding="utf-8")
     said = run("estimate", lab / "robot", "--jobs", lab / "jobs.csv", "-o", lab / "out", *IN_PROCESS)
     assert said.status == 2 and message in said.err and "jobs" in said.err
+
+
+def test_results_of_many_are_not_mixed_into_one(run: Any, lab: Path) -> None:
+    said = run("calibrate", lab / "robot", lab / "recordings", "-o", lab / "recordings/a", *IN_PROCESS)
+    assert said.status == 2 and "a single result stands where those of many would" in said.err
+    assert not (lab / "recordings/a/many.json").exists()
 
 
 def test_two_drivers_do_not_work_on_one_folder(run: Any, lab: Path) -> None:

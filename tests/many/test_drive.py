@@ -11,11 +11,11 @@ from pathlib import Path
 
 import many_calls
 import pytest
-from many_calls import job, work, work_here
+from many_calls import job, said, work, work_here
 
 from femsense.core.errors import DataError
 from femsense.many.drive import Progress, recorded, run_jobs
-from femsense.many.engines import InProcess, processes
+from femsense.many.engines import InProcess, processes, spread
 from femsense.many.limits import ONE_THREAD
 from femsense.many.outcome import Status
 from femsense.many.records import log_of, running_mark
@@ -75,7 +75,7 @@ def test_each_failure_has_its_kind_and_a_rerun_tries_it_again(tmp_path: Path) ->
 
 def test_a_full_disk_ends_the_run_and_says_what_is_done(tmp_path: Path) -> None:
     jobs = [job(tmp_path, "a", "write"), job(tmp_path, "b", "fill"), job(tmp_path, "c", "write")]
-    with pytest.raises(DataError, match=r"the disk is full.*\n1 of 3 jobs are done; make room"):
+    with pytest.raises(DataError, match=r"the disk is full: OSError: .*No space left.*\n1 of 3 jobs are done; make room"):
         run_jobs(jobs, work_here, InProcess())
     assert set(recorded(jobs)) == {"a"}
 
@@ -152,3 +152,16 @@ def test_parts_that_a_dead_worker_left_are_removed(tmp_path: Path) -> None:
     part.mkdir(parents=True)
     run_jobs([one], work_here, InProcess())
     assert not part.exists()
+
+
+# Tasks without records
+
+
+def test_tasks_are_spread_in_order_and_one_that_loses_its_worker_is_run_once_more(tmp_path: Path) -> None:
+    tasks = [(("write", str(tmp_path / f"{i}")),) for i in range(7)]
+    tasks[3] = (("die once", str(tmp_path / "3")),)
+    with processes(2) as engine:
+        assert list(spread(engine, said, tasks)) == [f"{i}" for i in range(7)]
+        with pytest.raises(DataError, match="this has ended two workers: its worker was ended by SIGKILL"):
+            list(spread(engine, said, [(("die", str(tmp_path / "x")),)]))
+    assert list(spread(InProcess(), said, tasks[:2])) == ["0", "1"]

@@ -54,7 +54,8 @@ def act(words: Sequence[str]) -> Result:
         case "eat":
             np.ones(EATEN // 8)
         case "fill":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+            full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+            raise InputError("internal error") from full  # as a command says it
         case "wait":
             time.sleep(float(words[1]))
             write_text(target / "result.txt", "slow")
@@ -72,3 +73,12 @@ def work(job: Job) -> Outcome:
 def work_here(job: Job) -> Outcome:
     """Run a job of a test in this process."""
     return work_on(job, act, in_process=True)
+
+
+def said(words: Sequence[str]) -> str:
+    """Do what the first word says for a file, whose name is the answer."""
+    what, file = words[0], Path(words[1])
+    if what == "die" or (what == "die once" and not file.exists()):
+        write_text(file, "")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return file.name

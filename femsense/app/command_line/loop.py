@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from femsense.app.command_line.answer import Answer, progress_bar, say
 from femsense.app.command_line.parameters import Json, OneRobot, argument, filled, option, required, split_names
-from femsense.app.command_line.several import Dask, Jobs, Memory, several
+from femsense.app.command_line.several import Dask, Jobs, Memory, several, spread_over
 from femsense.core.errors import InputError
 
 
@@ -46,7 +47,12 @@ def improve(
     again: Annotated[bool, option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[
         int | None,
-        option("--workers", "N", "Threads that work; by default one a core, four at most. With --jobs: processes.", min=0),
+        option(
+            "--workers",
+            "N",
+            "Threads, and processes that many recordings are spread over; 0: this process; by default one a core.",
+            min=0,
+        ),
     ] = None,
     plan: Annotated[
         bool, option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
@@ -66,12 +72,13 @@ def improve(
     from femsense.io.recording_folder import load_recording
     from femsense.loop.files import saved_loop
     from femsense.loop.improve import ImproveOptions
+    from femsense.many.jobs import expanded
     from femsense.report.loop.text import loop_text
 
     if (many := several(context, recordings, one_each=False)) is not None:
         return many
     robot = required(context, robot, "'ROBOT'", "argument")
-    set_workers(workers)
+    set_workers(workers or None)
     if plan and recordings:
         raise InputError(
             "recordings are not asked with --plan",
@@ -85,11 +92,14 @@ def improve(
             return Answer(
                 *plan_into(output, robot, given=given, noise=1e-3 * noise, frames=frames, control=actuation, progress=progress)
             )
-    recordings = required(context, recordings, "'RECORDING...'", "argument")
+    recordings = expanded(required(context, recordings, "'RECORDING...'", "argument"))
     output = required(context, output, "'-o' / '--output'", "option")
     references = [load_recording(path) for path in reference or []]
     options = filled(ImproveOptions, locals(), user_effects=user_effect or [])
-    with progress_bar("improve") as progress:
+    with (
+        progress_bar("improve") as progress,
+        spread_over(len(recordings), options.effort.recordings, workers, dask, memory) as spread,
+    ):
         document = improve_into(
             output,
             robot,
@@ -97,7 +107,7 @@ def improve(
             validation=validation or [],
             effects=split_names(effects),
             without=split_names(without),
-            options=options,
+            options=replace(options, spread=spread),
             again=again,
             say=say,
             progress=progress,

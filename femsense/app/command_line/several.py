@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from femsense.app.command_line.answer import Answer, ManyJobs
 from femsense.app.command_line.parameters import option, required
+
+if TYPE_CHECKING:
+    from femsense.loop.search.all_recordings import Spread
 
 T = TypeVar("T")
 Jobs = Annotated[
@@ -35,7 +40,7 @@ def several(
         context: of the command.
         units: what a job is about, from the command line.
         output: all results go below `-o`.
-        one_each: several units are several jobs. False: they are one joint job, and only `--jobs` asks for more.
+        one_each: several units are several jobs. False: they are one joint job, which has its own use for workers; only `--jobs` asks for more.
     """
     from femsense.many.jobs import is_glob, parts_of
 
@@ -43,8 +48,6 @@ def several(
     asked = [name for name in MANY if given[name] is not None]
     if not one_each:
         if given["jobs"] is None:
-            if given["dask"] is not None or given["memory"] is not None:
-                raise typer.BadParameter("--dask and --memory are of many jobs, and --jobs says which")
             return None
     elif not asked and len(units or []) < 2 and not any(is_glob(unit) or parts_of(Path(unit)) for unit in units or []):
         return None
@@ -74,6 +77,29 @@ def several(
             _options_of_others(context),
         ),
     )
+
+
+@contextlib.contextmanager
+def spread_over(count: int, most: int, workers: int | None, dask: str | None, memory: float | None) -> Iterator[Spread | None]:
+    """Yield what spreads so many recordings of one joint job over workers; None where this process works alone.
+
+    Arguments:
+        count: of recordings; no more than `most` need no engine.
+        workers, dask, memory: as on the command line.
+
+    Raises:
+        BadParameter: a cluster for recordings that this process fits together.
+    """
+    from femsense.many.engines import open_engine, spread
+    from femsense.many.limits import available_cores, memory_share
+
+    if count <= most and (dask is not None or memory is not None):
+        raise typer.BadParameter(f"--dask and --memory are of many jobs, or of more than {most} recordings")
+    if count <= most or (workers == 0 and dask is None):
+        yield None
+        return
+    with open_engine(workers, dask, memory_share(workers or available_cores(), memory)) as engine:
+        yield partial(spread, engine)
 
 
 def only(context: typer.Context, units: Sequence[T] | None) -> T:

@@ -20,6 +20,8 @@ from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.mapping import check_names, check_taken, check_targets, resolved
 
 PACKED = (".zstd", ".zst", ".zip", ".7z", ".tar", ".tgz", ".bz2", ".xz")
+FEW_CAMERAS = 8
+"""More captures than these are hardly the cameras of one recording, unless each has a name."""
 UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is read by its folder, which holds metadata.yaml"
 
 
@@ -74,8 +76,19 @@ def _format(source: Path, said: Options) -> Format:
         where=source,
         found=said.format or source.suffix or "no ending",
         expected="--format " + "|".join(FORMATS),
-        hint=UNPACK if packed else did_you_mean(said.format, FORMATS) if said.format else export_hint(source),
+        hint=UNPACK
+        if packed
+        else did_you_mean(said.format, FORMATS)
+        if said.format
+        else export_hint(source) or _hint_of_many(source),
     )
+
+
+def _hint_of_many(folder: Path) -> str | None:
+    """Return how a folder of captures is imported; None where it is none."""
+    if not folder.is_dir() or not any(format_of(item) for item in sorted(folder.iterdir())[:FEW_CAMERAS]):
+        return None
+    return f"a folder of captures: --jobs '{folder}/*' makes a recording of each"
 
 
 def open_sources(paths: Sequence[str | Path], options: Options | None = None) -> Source:
@@ -89,6 +102,14 @@ def open_sources(paths: Sequence[str | Path], options: Options | None = None) ->
         InputError: as `open_source`; names that stand twice; clocks that do not overlap, also by time of recording.
     """
     said = options or Options()
+    if len(paths) > FEW_CAMERAS and not any("=" in str(path) for path in paths):
+        raise InputError(
+            "too many captures for the cameras of one recording",
+            where=str(paths[0]),
+            found=f"{len(paths)} sources",
+            expected=f"up to {FEW_CAMERAS}, or NAME=SOURCE",
+            hint="--jobs with a pattern in quotation marks makes a recording of each: --jobs 'bags/*'",
+        )
     source = _one_or_joined(paths, said)
     count = None if source.count is None else -(-source.count // said.every)
     return replace(source, frames=lambda: islice(source.frames(), 0, None, said.every), count=count, free=said.free)

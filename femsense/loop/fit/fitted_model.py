@@ -107,7 +107,9 @@ def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
         keep += mask
     kept = np.array(keep, dtype=bool)
     theta = np.concatenate([fit.fit.theta[: fit.own], fit.coordinates[kept]])
-    prior = Prior(fit.prior.mean[kept], fit.prior.std[kept])
+    others = fit.prior.others
+    others = None if others is None else others.keeping(kept[: others.matrix.shape[1]], fit.coordinates)
+    prior = Prior(fit.prior.mean[kept], fit.prior.std[kept], others)
     less = replace(
         fit,
         hypothesis=replace(fit.hypothesis, terms=tuple(terms)),
@@ -123,7 +125,9 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
     terms = fitted.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
     hypothesis = replace(fitted.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
-    return hypothesis, Prior(fitted.fit.prior.mean[mask], fitted.fit.prior.std[mask]), mask
+    others, null = fitted.fit.prior.others, np.array([p.null for p in fitted.fit.hypothesis.parameters])
+    others = None if others is None else others.keeping(mask[: others.matrix.shape[1]], null)
+    return hypothesis, Prior(fitted.fit.prior.mean[mask], fitted.fit.prior.std[mask], others), mask
 
 
 def roughly_keeping(

@@ -15,6 +15,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
+from femsense.loop.fit.normal_equations import Rows
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
 from femsense.model.effects.base import known_length
 from femsense.model.linear_answers import AtPoints
@@ -35,6 +36,8 @@ class Prior:
     mean: FloatArray
     std: FloatArray
     """inf: none."""
+    others: Rows | None = None
+    """What recordings that are not fitted here say of the first of the coordinates."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -278,6 +281,10 @@ class JointProblem:
         r = (coordinates - self.prior.mean)[known] / self.prior.std[known]
         J = np.zeros((len(r), width))
         J[np.arange(len(r)), self.own + np.flatnonzero(known)] = 1.0 / self.prior.std[known]
+        if self.prior.others is not None:
+            more = np.zeros((len(self.prior.others.offset), width))
+            more[:, self.own : self.own + self.prior.others.matrix.shape[1]] = self.prior.others.matrix
+            r, J = np.concatenate([r, self.prior.others.at(coordinates)]), np.vstack([J, more])
         known_vector = known_length(self.hypothesis.parameters)
         if known_vector is None or np.linalg.norm(coordinates[known_vector[0]]) < 1e-3:
             return r, J

@@ -10,6 +10,7 @@ import numpy as np
 
 from femsense.loop.result.evidence import Evidence
 from femsense.loop.result.records import (
+    AllRecordings,
     ConfoundedPair,
     CorrectionRecord,
     DataCard,
@@ -69,6 +70,8 @@ class Loop:
     of it is surely away from what is declared, or held-out data do not need it."""
     correction: CorrectionRecord | None = field(default=None, metadata=LEFT_OUT)
     """An empirical correction of what is left, where one was asked for."""
+    everywhere: AllRecordings | None = field(default=None, metadata=LEFT_OUT)
+    """What all recordings say, where effects were sought in some of them."""
     residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)
     """Held-out residuals before and after, for figures."""
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)

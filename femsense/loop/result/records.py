@@ -331,6 +331,24 @@ class DataCard:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class AllRecordings:
+    """What all recordings say of a model that was sought in some of them: errors of the markers, root mean squares [m]."""
+
+    recordings: int = 0
+    searched: int = 0
+    """Recordings in which effects were sought."""
+    before_train_rms_m: Number = NAN
+    """Of the declared model, the camera of each recording calibrated."""
+    before_validation_rms_m: Number = NAN
+    """On held-out sweeps."""
+    after_train_rms_m: Number = NAN
+    """Of the fitted model."""
+    after_validation_rms_m: Number = NAN
+    dbic: Mapping[str, float] = field(default_factory=dict)
+    """Effect that the model lacks → linear dBIC of its best form in all recordings."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Residuals(Columns):
     """Held-out residuals, one row for each measured point, as columns of equal length."""
 

@@ -99,14 +99,14 @@ def screen(
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
     effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
-    every = np.split(_whitened(base, problem, fields.raw, fields.rest), fields._spans()[1:-1], axis=1)
+    every = np.split(whitened_columns(base, problem, fields.raw, fields.rest), fields._spans()[1:-1], axis=1)
     for i, (effect, seed, parameters) in enumerate(fields.todo):
         (own, rest), whole = fields.of(i), every[i]
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
         absorbed = Q.T @ whole
         left = whole - Q @ absorbed
-        step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
+        step, gain = _whole_step(left, residual) if effect.discrete else best_step(left, residual, parameters)
         alone = sum(e is effect and len(p) == len(parameters) and s == seed for e, s, p in fields.todo)
         cost = penalty(len(parameters), seed, alone, effects, n_effective)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
@@ -118,11 +118,11 @@ def screen(
 
 def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], placements: list[FloatArray]) -> float:
     """Return the decrease of χ² that is predicted of columns of markers and placements (see `Candidate`) beside a fit, without bounds."""
-    more = basis_of(beside(np.asarray(base.fit.jacobian), _whitened(base, problem, raw, placements)))[0]
+    more = basis_of(beside(np.asarray(base.fit.jacobian), whitened_columns(base, problem, raw, placements)))[0]
     return float(np.sum((more.T @ base.fit.residual) ** 2))
 
 
-def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
+def whitened_columns(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
     """Return columns of markers and placements, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
     q = own[0].shape[2]
     result = np.zeros((len(base.fit.residual), q))
@@ -135,7 +135,7 @@ def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest
     return result
 
 
-def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
+def best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
     """Return the bounded step that explains most, and the decrease of χ²."""
     null = np.array([p.null for p in parameters])
     low, high = np.array([p.low for p in parameters]) - null, np.array([p.high for p in parameters]) - null

@@ -9,7 +9,7 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.result.records import RefitRecord
+from femsense.loop.result.records import AllRecordings, RefitRecord
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.screening import Candidate
 
@@ -97,6 +97,8 @@ class Search:
     """What might be in the place of the input offsets."""
     outweighed: list[RefitRecord] = field(default_factory=list)
     """As of `SearchProgress`."""
+    everywhere: AllRecordings | None = None
+    """What all recordings say of the last model, where it was sought in some of them."""
 
 
 Progress = Callable[[str], None]

@@ -12,11 +12,13 @@ from femsense.loop.fit.discretisation_error import mesh_error_rms, mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
-from femsense.loop.result.records import ModelError, NamedEffect, Value
+from femsense.loop.result.records import AllRecordings, ModelError, NamedEffect, Value
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import DEFAULTS, Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
+MOST_LISTED = 3
+"""Effects that are listed."""
 ROUNDED = 1e-6
 """What is so small beside the largest component of a vector, or beside its standard deviation, is said as 0."""
 
@@ -117,6 +119,19 @@ def by_noise(data: Data, measured: Repeatability) -> str:
         f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
         " Look whether inputs belong to their frames and names to their markers and cables."
     )
+
+
+def everywhere_in_words(seen: AllRecordings | None, decides: Thresholds) -> str:
+    """Return what all recordings say of a model that was sought in some; nothing where it was sought in all."""
+    if seen is None:
+        return ""
+    before, after = 1e3 * seen.before_validation_rms_m, 1e3 * seen.after_validation_rms_m
+    said = (
+        f" Effects were sought in {seen.searched} of {seen.recordings} recordings and fitted to all: held-out error in all {before:.2f} mm "
+        f"before, {after:.2f} mm after."
+    )
+    more = [name for name, score in sorted(seen.dbic.items(), key=lambda item: -item[1]) if score > decides.evidence]
+    return said + (f" In all of them there is linear evidence for more: {', '.join(more[:MOST_LISTED])}." if more else "")
 
 
 def values_in_words(parameters: Mapping[str, Value]) -> str:

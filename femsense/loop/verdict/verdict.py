@@ -34,7 +34,7 @@ from femsense.loop.verdict.returned_model import (
     sure_effects,
     surely_handed_back,
 )
-from femsense.loop.verdict.sentences import by_mesh, by_noise, evidence_for, on_linear, verdict_in_words
+from femsense.loop.verdict.sentences import by_mesh, by_noise, everywhere_in_words, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
     chain_of_effects,
     data_card,
@@ -92,7 +92,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         + on_linear(data, back, names, measured.total)
         + evidence_for(data, found, [n for n in added if n not in sure or n in unsure])
         + surprise
-        + _by_prediction(data, robot, back, noise),
+        + _by_prediction(data, robot, back, noise)
+        + everywhere_in_words(search.everywhere, data.thresholds),
         noise_m=measured.total,
         before=errors_of(data, before, rng),
         after=errors_of(data, back, rng),
@@ -110,6 +111,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         model_error=budget,
         fitted_along={e["name"]: values_of(std, back, e["name"]) for e in entries if e["name"] not in names},
         correction=correction,
+        everywhere=search.everywhere,
         residuals=residual_table(data, before, back),
         evidence=gather(data, search, back, shown, tests, rng),
     )
