@@ -12,7 +12,15 @@ from femsense.core.errors import InputError, MissingDependency
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    for page in ("index", "guides/statuses", "guides/forces", "reference/forces", "effects/creep", "effects/README", "_static/creep"):
+    for page in (
+        "index",
+        "guides/statuses",
+        "guides/forces",
+        "reference/forces",
+        "effects/creep",
+        "effects/README",
+        "_static/creep",
+    ):
         file = tmp_path / "site" / f"{page}.html"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("page", encoding="utf-8")
