@@ -155,6 +155,8 @@ for contact in run.contacts:
         )
 
 # %% [markdown]
+# A frame that is not `ok` is not to be trusted, whatever its interval: [All statuses](../guides/statuses.md).
+#
 # ## In the browser
 #
 # ```sh
