@@ -19,6 +19,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from femsense.app.cli import EXAMPLES, app
 
+FIELDS: dict[str, list[str]] = {}
+"""Qualified name of a field → its text."""
 logger = logging.getLogger(__name__)
 SUMMARY = """# femsense
 
@@ -94,7 +96,7 @@ def _default(parameter: Any) -> str:
     return f" Default: `{value}`." if plain else ""
 
 
-def plain_docstring(_: Sphinx, what: str, name: str, __: Any, ___: Any, lines: list[str]) -> None:
+def plain_docstring(sphinx: Sphinx, what: str, name: str, _: Any, __: Any, lines: list[str]) -> None:
     """Escape what reStructuredText would take for markup: docstrings here are plain text with `names` in backquotes."""
     for i, line in enumerate(lines):
         parts = re.split(r"(``[^`]*``|`[^`]*`)", line)
@@ -102,12 +104,29 @@ def plain_docstring(_: Sphinx, what: str, name: str, __: Any, ___: Any, lines: l
             part if part.startswith("`") else re.sub(r"(?<=\w)_(?=\W|$)", r"\_", re.sub(r"([*|])", r"\\\1", part))
             for part in parts
         )
+    if what in ("attribute", "property", "data"):
+        FIELDS[name] = list(lines)
+
+
+def plain_field(_: Sphinx, what: str, name: str, __: Any, ___: Any, lines: list[str]) -> None:
+    """Put the text of a field back: napoleon takes what stands before a colon for its type."""
+    if what in ("attribute", "property", "data"):
+        lines[:] = FIELDS.pop(name)
 
 
 def plain_signature(*event: Any) -> tuple[str | None, str | None]:
-    """Return a signature with the names of array types as the source has them."""
+    """Return a signature with the names of array types as the source has them, and ... for defaults that are not literals."""
     *_, signature, returns = event
-    return tuple(text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returns))  # type: ignore[return-value]
+    return _plain(signature), _plain(returns)
+
+
+def _plain(text: str | None) -> str | None:
+    if text is None:
+        return None
+    text = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
+    text = re.sub(r", ~?[\w.]*(?:Before|After|Plain|Wrap)Validator\((?:[^()]|\([^()]*\))*\)", "", text)
+    text = re.sub(r"~?[\w.]*Annotated\[([^\[\],]+(?:\[[^\[\]]*\])?)\]", r"\1", text)
+    return re.sub(r"= <(?:[^<>]|<[^<>]*>)*>", "= ...", text)
 
 
 def write_llms(sphinx: Sphinx, failure: Exception | None) -> None:
@@ -144,6 +163,7 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
     sphinx.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
     sphinx.add_directive("commands", Commands)
     sphinx.connect("autodoc-process-docstring", plain_docstring, priority=400)
+    sphinx.connect("autodoc-process-docstring", plain_field, priority=600)
     sphinx.connect("autodoc-process-signature", plain_signature)
     sphinx.connect("build-finished", write_llms)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
