@@ -104,8 +104,6 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     else:
         best = _with_objects_in_touch(model, _searched(model, best))
     clock.lap("search")
-    exact = model.solve(frame, best.contacts, best.forces, best.state, exact=True)
-    best = best if exact is None else replace(best, state=exact)
     before = rms_of(model.rows(frame, frame.predicted), inliers(best))
     clock.lap("state")
     return Estimate(best, before, clock.stages)

@@ -97,11 +97,9 @@ class Model:
             more.append(marker_rows(self.sensor, frame.index, state, len(self.skin.field)))
         return stacked([rows, *more])
 
-    def solve(
-        self, frame: Frame, contacts: Sequence[Touch], forces: FloatArray, start: Equilibrium, *, exact: bool = False
-    ) -> Equilibrium | None:
+    def solve(self, frame: Frame, contacts: Sequence[Touch], forces: FloatArray, start: Equilibrium) -> Equilibrium | None:
         """Return the equilibrium under the inputs and contact forces (m, 3) [N]; None where there is none near the start."""
-        return loaded_state(self.sensor, frame.index, contacts, forces, start, frame.previous_tensions, exact=exact)
+        return loaded_state(self.sensor, frame.index, contacts, forces, start, frame.previous_tensions)
 
     def answers_near(self, state: Equilibrium) -> FloatArray:
         """Return the displacements by unit forces along x, y, z at each candidate [m/N], shape (n, 3, 3c), at this state or one near by."""
