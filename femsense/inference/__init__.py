@@ -1,1 +1,1 @@
-"""One inference problem: residual rows, their noise, parameters with priors, evidence and covariance. docs/estimator.md has the equations."""
+"""One inference problem: residual rows, their noise, parameters with priors, evidence and covariance. docs/method/estimator.md has the equations."""

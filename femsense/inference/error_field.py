@@ -15,7 +15,7 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.model.robot import spread_points
 
 CENTRES = 24
-"""Degrees of freedom of the field along the body (docs/estimator.md)."""
+"""Degrees of freedom of the field along the body (docs/method/estimator.md)."""
 OVERLAP = 0.7
 """Correlation length over the median distance of neighbouring centres."""
 ACROSS_EDGES = 2.0

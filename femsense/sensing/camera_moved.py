@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -26,6 +27,8 @@ MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
 EQUAL = 16.3
 """Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
+LEAST_MM, LEAST_DEG = 0.05, 0.05
+"""A camera that has moved by less has not moved: its pose is known no better."""
 CLEAR = 2.0
 """A moved camera whose J is higher to first order by more than so many times EQUAL is not fitted."""
 STEPS, FIRST, STILL = 8, 1, 1e-3
@@ -63,7 +66,7 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
     if stood is None or moved is None:
         return found
     numbers = _in_words(model, moved)
-    if moved.criterion > bound:
+    if moved.criterion > bound or (numbers["shift_mm"] < LEAST_MM and numbers["turn_deg"] < LEAST_DEG):
         return found
     shown = _misfit_of_background(model, best) - _misfit_of_background(_at(model, moved.step), best) > EQUAL
     return verdict(Status.CAMERA_MOVED if shown else Status.CAMERA_MAY_HAVE_MOVED, **numbers)
@@ -131,7 +134,7 @@ def _misfit_of_background(model: Model, best: Fit) -> float:
     return 0.0 if rows is None else misfit(rows.residual, rows.log_other, rows.share)[0]
 
 
-def _in_words(model: Model, moved: Moved) -> dict[str, float | str]:
+def _in_words(model: Model, moved: Moved) -> dict[str, Any]:
     """Return which camera moved farthest and how far."""
     steps = moved.step.reshape(-1, 6)
     farthest = int(np.argmax(np.linalg.norm(steps / np.repeat([1.0, model.sensor.size], 3), axis=1)))

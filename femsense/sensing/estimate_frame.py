@@ -1,6 +1,6 @@
 """Contacts and forces of one frame: predict, propose, fit, keep the best, stop.
 
-docs/estimator.md has the objective J, the proposals and the posterior check.
+docs/method/estimator.md has the objective J, the proposals and the posterior check.
 """
 
 from __future__ import annotations

@@ -36,10 +36,10 @@ class Status(Enum):
     OK = "ok"
     NOT_CONVERGED = "not converged: the forces still changed after the last step"
     SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: use a finer mesh or the effect hyperelastic"
-    NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.1f} times what contact-free frames let expect"
+    NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.2f} times what contact-free frames let expect"
     NOT_EXPLAINED_MARKERS = "not explained: the markers are off by {times:.1f} standard deviations"
     LARGE_ERROR_FIELD = (
-        "not explained: a smooth error takes up the residual, {times:.1f} times what contact-free frames let expect"
+        "not explained: a smooth error takes up the residual, {times:.2f} times what contact-free frames let expect"
     )
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
@@ -111,8 +111,9 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
     if limits is not None:
         misfit, nuisance, behind = check_values(model, best)
         if misfit > limits.misfit:
-            rms = 1e3 * float(np.sqrt(np.mean(best.rows.residual[best.rows.pixel] ** 2)))
-            return verdict(Status.NOT_EXPLAINED, rms_mm=rms, times=float(np.sqrt(misfit / limits.misfit)))
+            own = best.weight * best.rows.std**2 / best.rows.share * best.rows.pixel
+            rms = float(np.sqrt(own @ best.rows.residual**2 / max(own.sum(), 1.0)))
+            return verdict(Status.NOT_EXPLAINED, rms_mm=1e3 * rms, times=float(np.sqrt(misfit / limits.misfit)))
         if nuisance > limits.nuisance:
             return verdict(Status.LARGE_ERROR_FIELD, times=float(np.sqrt(nuisance / limits.nuisance)))
         if not best.frame.coloured and behind > limits.behind:

@@ -29,7 +29,7 @@ class SensingOptions:
     """What the data cannot say."""
 
     method: str = "rays"
-    """"rays": every point a measurement, one objective (docs/estimator.md); "paper": the published method, feature points along their normals and one
+    """"rays": every point a measurement, one objective (docs/method/estimator.md); "paper": the published method, feature points along their normals and one
     linear step."""
     friction: float | None = 1.0
     """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
