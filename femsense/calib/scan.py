@@ -50,9 +50,7 @@ class Scan:
     segmented: bool = True
     """Whether colour separated the robot from the rest; else all points stand among those that may be of the robot."""
     count: FloatArray | None = None
-    """How many measured points each point of the robot is the mean of, shape (k,); None: each is one (see `condensed_scan`)."""
-    scatter: FloatArray | None = None
-    """Mean square of the distances of these along the surface's normal from their mean [m²], shape (k,)."""
+    """How many measured points each point of the robot is the mean of, shape (k,); None: each is one (see `in_blocks`)."""
 
     @property
     def measured(self) -> FloatArray:

@@ -44,8 +44,6 @@ class Model:
     """Factor on that noise: what contact-free frames scatter."""
     overdispersion: float = 1.0
     """T: variance of sums of whitened residuals over neighbouring pixels, relative to independent ones."""
-    slant: float = 0.0
-    """Power of 1/cos(incidence) with which the noise along the ray grows beyond what is declared."""
     inferred_odds: float = 0.0
     """L of an inferred contact: −2 log of its prior odds, raised by what the search gains in contact-free frames."""
     modulus_shift: float = 0.0
