@@ -61,7 +61,7 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
         stood = _stood(model, best)
         bound = np.inf if stood is None else stood + (EQUAL if inferred else 0.0)
         moved = moved_cameras(model, best, bound)
-    except FemsenseError:
+    except (FemsenseError, np.linalg.LinAlgError):
         return found
     if stood is None or moved is None:
         return found
@@ -107,7 +107,7 @@ def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | Non
 
 def _stood(model: Model, best: Fit) -> float | None:
     """Return J of the best hypothesis with the background from where the cameras stood."""
-    frame = replace(best.frame, background=background_rows(model, best.frame.index))
+    frame = replace(best.frame, objects=(), background=background_rows(model, best.frame.index))
     again = fit(model, frame, best.contacts, best.forces, best.state, tau=best.tau, linearised=best.linearised)
     return None if again is None else again.criterion
 

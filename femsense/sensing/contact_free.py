@@ -53,7 +53,9 @@ def learn(sensor: Sensor) -> Model:
         if turn == 0:
             model = _at_the_mean(model, [one.fit for one in frames])
     frames = _contact_free(model)
-    background = background_of(model.sensor, frames[0].frame.index) if frames else None  # from where the cameras are known to be
+    if not frames:
+        return model
+    background = background_of(model.sensor, frames[0].frame.index)  # from where the cameras are known to be
     return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.mixture import first_width
 from femsense.inference.nuisance import columns, fit_nuisance
@@ -95,7 +96,10 @@ def fit(
         return None
     q = model.nuisance.root.shape[1]
     near = linearised is not None and _near(model, linearised.positions, state.positions)
-    linear = linearised if near and linearised is not None else model.linearised(state)
+    try:
+        linear = linearised if near and linearised is not None else model.linearised(state)
+    except FemsenseError:  # unstable there
+        return None
     here = _point(model, frame, contacts, forces, np.full(m, FIRST_TAU) if tau is None else np.array(tau), state, linear)
     eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:

@@ -14,6 +14,7 @@ which is negative where the object lies at the surface: there a contact needs no
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -156,7 +157,7 @@ def _row(
     slope = shape.distance(place + step) - shape.distance(place - step)
     direction = slope / max(float(np.linalg.norm(slope)), 1e-12)
     view = 0 if frame.scan is None or not len(frame.scan.others_view) else int(np.bincount(frame.scan.others_view).argmax())
-    return rows_on(
+    rows = rows_on(
         model.skin,
         positions,
         np.array([triangle]),
@@ -171,3 +172,7 @@ def _row(
         model.views,
         pixel=False,
     )
+    corners = positions[model.skin.triangles[triangle]]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    # The error field lies along the outward normal of the body, this row about against it.
+    return replace(rows, field=rows.field * float(direction @ normal) / max(float(np.linalg.norm(normal)), 1e-12))

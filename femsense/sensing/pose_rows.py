@@ -58,15 +58,19 @@ def background_rows(model: Model, k: int) -> Rows | None:
 def pose_gain(model: Model, best: Fit) -> float:
     """Return by how much pose steps of any size would lower −2 log evidence next to the contacts of a fit, to first order."""
     J = contact_columns(model, best, best.axes, best.linearised)
-    beside = np.hstack([J * whitened(model, best, trust=False)[0], best.N])
+    scale, at = whitened(model, best, trust=False)
+    X, p = np.hstack([J * scale, best.N]), np.append(at, best.eta)
     W, P = best.weight[:, None], best.C[:, : 6 * model.views] * far(model)
-    own = P - beside @ np.linalg.solve(np.eye(beside.shape[1]) + (beside * W).T @ beside, (beside * W).T @ P)
-    gain = _lowered(own, own * W, best.left(model.nuisance) * best.rows.std)
+    WX, left = X * W, best.left(model.nuisance) * best.rows.std
+    S = WX.T @ P
+    Y = np.linalg.solve(np.eye(X.shape[1]) + WX.T @ X, np.column_stack([S, WX.T @ left - p]))
+    gain = _lowered((P * W).T @ left - S.T @ Y[:, -1], P.T @ (P * W) - S.T @ Y[:, :-1])
     background = background_rows(model, best.frame.index)
     if background is not None:
         B = background.by_pose * far(model)
         weight = background.share / np.maximum(1.0, np.abs(background.residual) / HUBER)
-        gain += _lowered(B, B * weight[:, None], background.residual)
+        WB = B * weight[:, None]
+        gain += _lowered(WB.T @ background.residual, WB.T @ B)
     return gain
 
 
@@ -100,7 +104,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
     return phi + float(np.linalg.slogdet(np.eye(A.shape[1]) + (A * weight[:, None]).T @ A)[1]) - before
 
 
-def _lowered(A: FloatArray, WA: FloatArray, residual: FloatArray) -> float:
-    """Return by how much columns A (r, q) with unit priors lower −2 log evidence, to first order."""
-    right, H = WA.T @ residual, np.eye(A.shape[1]) + WA.T @ A
-    return float(right @ np.linalg.solve(H, right) - np.linalg.slogdet(H)[1])
+def _lowered(gradient: FloatArray, curvature: FloatArray) -> float:
+    """Return by how much parameters with unit priors lower −2 log evidence, to second order; gradient (q,), curvature (q, q)."""
+    H = np.eye(len(gradient)) + curvature
+    return float(gradient @ np.linalg.solve(H, gradient) - np.linalg.slogdet(H)[1])

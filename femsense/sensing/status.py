@@ -13,7 +13,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.sensing.contact_free import check_values
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.model import Fit, Model
-from femsense.sensing.no_penetration import is_rigid
+from femsense.sensing.no_penetration import OVERLAPPING
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -44,6 +44,7 @@ class Status(Enum):
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
     OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
+    OR_UNSEEN = "a contact that no camera sees would fit as well as the one at the object that is seen"
     MAY_TOUCH = "an object may touch whose force is not known, up to {force_n:.2f} N at [{where}] mm of the body at rest"
     UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
     CAMERA_MOVED = (
@@ -54,7 +55,7 @@ class Status(Enum):
     )
 
 
-TRUSTED = (Status.OK, Status.UNDETERMINED, Status.MAY_TOUCH)
+TRUSTED = (Status.OK, Status.OR_UNSEEN, Status.UNDETERMINED, Status.MAY_TOUCH)
 """Frames from which the next one starts."""
 
 
@@ -79,8 +80,8 @@ def verdict(status: Status, **numbers: float | str) -> Verdict:
     return Verdict(status, tuple(numbers.items()))
 
 
-def checked(model: Model, best: Fit) -> Verdict:
-    """Return the verdict of the posterior check on a fitted frame."""
+def checked(model: Model, best: Fit, *, or_unseen: bool = False) -> Verdict:
+    """Return the verdict of the posterior check on a fitted frame; `or_unseen`: an unseen contact would fit as well as a seen one."""
     if best.contacts and not best.converged:
         return verdict(Status.NOT_CONVERGED)
     carrying = np.unique([node for contact in best.contacts for node in contact.patch.nodes])
@@ -99,6 +100,8 @@ def checked(model: Model, best: Fit) -> Verdict:
         force, std = float(np.linalg.norm(best.forces[i])), _std_along(best, i)
         if contact.source != "given" and force < UNDETERMINED * std:
             return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
+    if or_unseen:
+        return verdict(Status.OR_UNSEEN)
     for one, (mean, std) in zip(best.frame.latent, best.latent_force):
         if std > UNKNOWN:
             where = ", ".join(f"{1e3 * x:.0f}" for x in one.place)
@@ -118,10 +121,10 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
             return verdict(Status.LARGE_ERROR_FIELD, times=float(np.sqrt(nuisance / limits.nuisance)))
         if not best.frame.coloured and behind > limits.behind:
             return verdict(Status.BEHIND_BODY, percent=100.0 * behind)
-    for i in np.flatnonzero(~best.rows.pixel):
-        gap = float(-best.rows.residual[i])
-        if gap < -OVERLAP * float(best.rows.std[i]) and not any(is_rigid(model, c) for c in best.contacts):
-            return verdict(Status.OVERLAP, overlap_mm=-1e3 * gap)
+    without_contact = ~best.rows.pixel & np.isclose(best.rows.log_other, np.log(OVERLAPPING))
+    deep = best.rows.residual[without_contact & (best.rows.residual > OVERLAP * best.rows.std)]
+    if len(deep):
+        return verdict(Status.OVERLAP, overlap_mm=1e3 * float(deep.max()))
     try:
         off = marker_rows(model.sensor, best.frame.index, best.state, 0).residual
     except DataError:

@@ -155,3 +155,15 @@ def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path)
     assert found is not None
     gained = start.criterion - found.criterion
     assert gained > 0.0 and best.gain == pytest.approx(gained, rel=0.5, abs=6.0)
+
+
+def test_an_error_that_body_and_ball_share_leaves_their_gap(tmp_path: Path):
+    """A camera that sees all surfaces too high by 0.1 mm moves the rows of the body's upper side and that of its gap to a ball above alike: by opposite amounts."""
+    recording = replace(touched(tmp_path, PUSH, ball=True), tools=(Tool("ball", "ball", 0.006),))
+    model = model_of(recording)
+    best = estimate_frame(model, 3, None).best
+    (gap,) = gap_rows(model, best.frame, best.contacts, best.state.positions)
+    near = best.rows.pixel & (np.linalg.norm(best.rows.rest - gap.rest, axis=1) < 0.004) & (best.rows.direction[:, 2] > 0.9)
+    upwards = best.rows.direction[near] @ gap.direction[0]
+    assert near.sum() > 3 and (upwards < -0.9).all()
+    assert gap.field[0] @ best.rows.field[near].mean(axis=0) < -0.5
