@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -19,8 +18,8 @@ from femsense.inference.mixture import misfit
 from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
-from femsense.sensing.camera_moved import EQUAL, camera_verdict
-from femsense.sensing.fit import FIRST_TAU, TOLERANCE, fit
+from femsense.sensing.camera_moved import camera_verdict
+from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
@@ -49,8 +48,6 @@ class Estimate:
     rms_before_m: float
     """Residual of the predicted state, along the normal or of markers in 3-D."""
     stages_ms: dict[str, float]
-    or_unseen: bool = False
-    """Whether a contact that no camera sees would fit as well as one at an object that is seen."""
 
 
 def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
@@ -58,7 +55,7 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     found = estimate_frame(model, k, previous)
     best, sensor = found.best, model.sensor
     began = time.perf_counter()
-    status = camera_verdict(model, best, checked(model, best, or_unseen=found.or_unseen))
+    status = camera_verdict(model, best, checked(model, best))
     stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     covariances = [covariance_of(model, best, i) for i in range(len(best.contacts))]
     contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, best.place_covariance, best.state, previous)
@@ -100,18 +97,16 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     start = _carried_over(model, frame, previous)
     best = start if start is not None else _without_contacts(model, frame)
     clock.lap("fit")
-    or_unseen = False
     if said_free(model.sensor, k):
         pass
     elif given := given_touches(model.sensor):
         best = _at_given_places(model, frame, given, best, previous)
     else:
-        best, or_unseen = _seen_rather_than_inferred(model, _searched(model, best))
-        best = _with_objects_in_touch(model, best)
+        best = _with_objects_in_touch(model, _searched(model, best))
     clock.lap("search")
     before = rms_of(model.rows(frame, frame.predicted), inliers(best))
     clock.lap("state")
-    return Estimate(best, before, clock.stages, or_unseen)
+    return Estimate(best, before, clock.stages)
 
 
 def covariance_of(model: Model, best: Fit, i: int) -> FloatArray:
@@ -174,24 +169,6 @@ def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: E
 def _is_alike(first: Shape, second: Shape) -> bool:
     """Return whether two shapes are one up to what is not known of it."""
     return first.kind == second.kind and float(np.linalg.norm(first.center - second.center)) < max(first.std_m, second.std_m)
-
-
-def _seen_rather_than_inferred(model: Model, best: Fit) -> tuple[Fit, bool]:
-    """Return the hypothesis with an inferred contact at an object in touch instead, where that fits nearly as well, and whether it does.
-
-    Errors of the model move J by a few units: below EQUAL it does not decide between what is seen and what is not.
-    """
-    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(best.frame.objects), best.state))
-    seen = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
-    inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
-    for i, touch in product(inferred, seen):
-        contacts, forces, tau = list(best.contacts), best.forces.copy(), best.tau.copy()
-        contacts[i], forces[i], tau[i] = touch, 0.0, FIRST_TAU
-        start = best.state if len(contacts) > 1 else best.frame.predicted
-        found = fit(model, best.frame, contacts, forces, start, tau=tau)
-        if found is not None and found.criterion < best.criterion + EQUAL:
-            return found, True
-    return best, False
 
 
 def _with_objects_in_touch(model: Model, best: Fit) -> Fit:

@@ -91,7 +91,8 @@ def fit(
     m, contacts = len(contacts), tuple(contacts)
     forces = np.array(forces, dtype=np.float64).reshape(-1, 3)
     contacts = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, forces))
-    state = model.solve(frame, contacts, forces, start) if m and forces.any() else start
+    free = start is frame.predicted and not forces.any()
+    state = start if not m or free else model.solve(frame, contacts, forces, start)
     if state is None:
         return None
     q = model.nuisance.root.shape[1]

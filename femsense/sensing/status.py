@@ -44,7 +44,7 @@ class Status(Enum):
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
     OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
-    OR_UNSEEN = "a contact that no camera sees would fit as well as the one at the object that is seen"
+    SEEN_ELSEWHERE = "an object is seen to touch at [{where}] mm of the body at rest where no contact was found: the contact that only the shape shows may be its own"
     MAY_TOUCH = "an object may touch whose force is not known, up to {force_n:.2f} N at [{where}] mm of the body at rest"
     UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
     CAMERA_MOVED = (
@@ -55,7 +55,7 @@ class Status(Enum):
     )
 
 
-TRUSTED = (Status.OK, Status.OR_UNSEEN, Status.UNDETERMINED, Status.MAY_TOUCH)
+TRUSTED = (Status.OK, Status.SEEN_ELSEWHERE, Status.UNDETERMINED, Status.MAY_TOUCH)
 """Frames from which the next one starts."""
 
 
@@ -80,8 +80,8 @@ def verdict(status: Status, **numbers: float | str) -> Verdict:
     return Verdict(status, tuple(numbers.items()))
 
 
-def checked(model: Model, best: Fit, *, or_unseen: bool = False) -> Verdict:
-    """Return the verdict of the posterior check on a fitted frame; `or_unseen`: an unseen contact would fit as well as a seen one."""
+def checked(model: Model, best: Fit) -> Verdict:
+    """Return the verdict of the posterior check on a fitted frame."""
     if best.contacts and not best.converged:
         return verdict(Status.NOT_CONVERGED)
     carrying = np.unique([node for contact in best.contacts for node in contact.patch.nodes])
@@ -100,11 +100,12 @@ def checked(model: Model, best: Fit, *, or_unseen: bool = False) -> Verdict:
         force, std = float(np.linalg.norm(best.forces[i])), _std_along(best, i)
         if contact.source != "given" and force < UNDETERMINED * std:
             return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
-    if or_unseen:
-        return verdict(Status.OR_UNSEEN)
+    inferred = any(contact.source == "shape" for contact in best.contacts)
     for one, (mean, std) in zip(best.frame.latent, best.latent_force):
+        where = ", ".join(f"{1e3 * x:.0f}" for x in one.place)
+        if inferred:
+            return verdict(Status.SEEN_ELSEWHERE, where=where)
         if std > UNKNOWN:
-            where = ", ".join(f"{1e3 * x:.0f}" for x in one.place)
             return verdict(Status.MAY_TOUCH, force_n=max(mean, 0.0) + 2.0 * std, where=where)
     return verdict(Status.OK)
 
