@@ -44,7 +44,10 @@ class Status(Enum):
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"
     OVERLAP = "an object overlaps the body by {overlap_mm:.1f} mm: its contact is missing or displaced"
-    SEEN_ELSEWHERE = "an object is seen to touch at [{where}] mm of the body at rest where no contact was found: the contact that only the shape shows may be its own"
+    SEEN_ELSEWHERE = (
+        "an object is seen to touch at [{where}] mm of the body at rest where no contact was found:"
+        " the contact that only the shape shows may be its own"
+    )
     MAY_TOUCH = "an object may touch whose force is not known, up to {force_n:.2f} N at [{where}] mm of the body at rest"
     UNDETERMINED = "contact, size not determined ({force_n:.2f} ± {std_n:.2f} N)"
     CAMERA_MOVED = (

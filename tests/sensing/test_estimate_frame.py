@@ -24,7 +24,7 @@ from femsense.sensing.odds import VISIBLE, odds_of
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.proposals import proposals
-from femsense.sensing.status import Status, verdict
+from femsense.sensing.status import Status, checked, verdict
 from femsense.sensing.types import Run, SensingOptions
 
 PUSH = np.array([0.0, 0.0, -0.15])
@@ -108,6 +108,18 @@ def test_a_status_is_an_enum_with_a_text():
     assert not verdict(Status.NOT_CONVERGED).trusted and str(verdict(Status.OK)) == "ok"
 
 
+def test_an_object_in_touch_without_a_contact_is_said(tmp_path: Path):
+    model = model_of(touched(tmp_path, PUSH, ball=True))
+    best = estimate_frame(model, 3, None).best
+    beside = replace(best.frame, latent=best.contacts)
+    unsure = replace(best, frame=beside, latent_force=np.array([[0.02, 0.15]]))
+    known = replace(unsure, latent_force=np.array([[0.0, 0.01]]))
+    hidden = replace(known, contacts=(replace(best.contacts[0], source="shape"),))
+    found = [checked(model, one).status for one in (best, unsure, known, hidden)]
+    assert found == [Status.OK, Status.MAY_TOUCH, Status.OK, Status.SEEN_ELSEWHERE]
+    assert "up to 0.32 N" in str(checked(model, unsure))
+
+
 def test_contact_free_clouds_correct_the_pose_of_the_camera(tmp_path: Path):
     recording = touched(tmp_path, np.zeros(3), ball=False)
     calibration = calibrate(arm(), recording)
@@ -158,7 +170,7 @@ def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path)
 
 
 def test_an_error_that_body_and_ball_share_leaves_their_gap(tmp_path: Path):
-    """A camera that sees all surfaces too high by 0.1 mm moves the rows of the body's upper side and that of its gap to a ball above alike: by opposite amounts."""
+    """A camera that sees all surfaces too high moves the rows of the body's upper side, and that of its gap to a ball above, by opposite amounts."""
     recording = replace(touched(tmp_path, PUSH, ball=True), tools=(Tool("ball", "ball", 0.006),))
     model = model_of(recording)
     best = estimate_frame(model, 3, None).best
