@@ -26,8 +26,10 @@ from femsense.sensing.prepare import pose_covariance
 from femsense.sensing.proposals import inferred_gain
 from femsense.sensing.types import Sensor
 
-MODULUS_STD, MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.03, 0.01, 0.05
-"""Prior of the relative modulus: σ = 0.03, or 0.01 where cable pulls are nuisance parameters too, because the two are nearly collinear; of each pull 0.05."""
+MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.01, 0.05
+"""Prior σ of the relative modulus at most where cable pulls are nuisance parameters too, because the two are nearly collinear, and of each pull."""
+FEWEST = 30
+"""Fewer pixels of the robot say nothing of its shape."""
 SEVERAL = 4
 """Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
 FLAG = 1e-3
@@ -77,13 +79,13 @@ def _contact_free(model: Model) -> list[ContactFree]:
     for k, state in free_path(model.sensor.driven, free_clouds(model.sensor.recording)):
         try:
             scan = pixels_of(model, k, state)
+            if scan is None or len(scan.view) < FEWEST:
+                continue
+            marked = model.drives > 0 and bool((model.sensor.recording.marker_frame == k).any())
+            frame = Frame(k, model.pixels(scan), scan, state, None, with_markers=marked)
+            found = fit(model, frame, (), np.zeros((0, 3)), state)
         except FemsenseError:
             continue
-        if scan is None or len(scan.view) < 30:
-            continue
-        marked = model.drives > 0 and bool((model.sensor.recording.marker_frame == k).any())
-        frame = Frame(k, model.pixels(scan), scan, state, None, with_markers=marked)
-        found = fit(model, frame, (), np.zeros((0, 3)), state)
         if found is not None:
             result.append(ContactFree(frame, found))
     return result

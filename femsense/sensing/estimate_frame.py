@@ -19,6 +19,7 @@ from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.camera_moved import camera_verdict
+from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
@@ -36,8 +37,6 @@ UNDETERMINED_TAU = 2.0
 """Prior scale of the force at an object in touch that the data do not determine [N]: what hands and grippers press with."""
 MANY = 30
 """Pixels of an object without a known shape that may carry a latent force."""
-FEWEST = 30
-"""Fewer pixels of the robot say nothing of its shape."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -300,6 +299,8 @@ def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: 
     tried = [fit(model, frame, given, forces, start, tau=tau)]
     if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
         tried.append(fit(model, frame, given, forces, start, tau=tau, catch=np.inf))
+        if (near := tried[-1]) is not None:  # the noise is widened anew from where that ends
+            tried.append(fit(model, frame, near.contacts, near.forces, near.state, tau=near.tau, catch=np.inf))
     found = [one for one in tried if one is not None]
     return min(found, key=lambda one: one.criterion) if found else alone
 
