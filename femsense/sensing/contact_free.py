@@ -186,7 +186,7 @@ def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
     """
     pixels, q = found.rows.pixel, model.nuisance.root.shape[1]
     z = found.left(model.nuisance)[pixels]
-    robot = np.ones(len(z)) if found.frame.coloured else (found.weight * found.rows.std**2 / found.rows.share)[pixels]
+    robot = np.ones(len(z)) if found.frame.coloured else found.responsibility[pixels]
     N = found.N[:, :q]
     seen = np.maximum(np.linalg.eigvalsh((N * found.weight[:, None]).T @ N), 0.0)
     share = seen / (1.0 + seen)

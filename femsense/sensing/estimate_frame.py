@@ -117,8 +117,7 @@ def covariance_of(model: Model, best: Fit, i: int) -> FloatArray:
 
 def inliers(best: Fit) -> BoolArray:
     """Return which rows of the measurements are the robot's with probability above one half, shape (r,)."""
-    responsibility = best.weight * best.rows.std**2 / best.rows.share
-    return np.asarray((responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
+    return np.asarray((best.responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
 
 
 def rms_of(rows: Rows, robot: BoolArray) -> float:

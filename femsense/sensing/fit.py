@@ -336,7 +336,6 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
         here.N,
         eta,
         weight,
-        phi,
         evidence,
         odds,
         covariance,

@@ -207,8 +207,6 @@ class Fit:
     """Whitened nuisance η̃, shape (q,)."""
     weight: FloatArray
     """W [1/m²], shape (r,)."""
-    phi: float
-    """Φ at the minimum."""
     evidence: float
     """E = Φ + log det A."""
     odds: FloatArray
@@ -227,6 +225,11 @@ class Fit:
     def criterion(self) -> float:
         """J = E + Σ L."""
         return self.evidence + float(self.odds.sum())
+
+    @property
+    def responsibility(self) -> FloatArray:
+        """Probability that each row is the robot's, shape (r,)."""
+        return np.asarray(self.weight * self.rows.std**2 / self.rows.share)
 
     def left(self, nuisance: Nuisance) -> FloatArray:
         """Return the whitened residual with η fitted, shape (r,)."""

@@ -118,9 +118,8 @@ def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origin
     if ball is None or ball.covariance is None:
         return shape
     look = (points - origins).mean(axis=0)
-    by_radius = np.append(
-        look / np.linalg.norm(look), 1.0
-    )  # what is seen stays where it is: a larger ball has its centre farther away
+    # What is seen stays where it is: a larger ball has its centre farther away.
+    by_radius = np.append(look / np.linalg.norm(look), 1.0)
     return replace(ball, covariance=ball.covariance + near.radius_std**2 * np.outer(by_radius, by_radius))
 
 

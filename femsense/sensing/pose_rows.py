@@ -88,6 +88,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
         own = slice(5 * i, 5 * i + 3)
         residual = residual + J[:, own] @ (at[own] * scale[own])
     J, at = J[:, kept] * scale[kept], at[kept]
+    residual = residual + J @ at
     P = best.C[:, : 6 * model.views] * far(model)
     rows, A = best.rows, np.hstack([best.N, J, P])
     start = np.concatenate([best.eta, at, np.zeros(P.shape[1])])
@@ -97,9 +98,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
         B = np.hstack([np.zeros((len(background), best.N.shape[1] + J.shape[1])), background.by_pose * far(model)])
         before += misfit(background.residual / background.std, background.log_other, background.share)[0]
         rows, A = stacked([rows, background]), np.vstack([A, B])
-        residual = np.append(residual + J @ at, background.residual)
-    else:
-        residual = residual + J @ at
+        residual = np.append(residual, background.residual)
     _, phi, weight = fit_nuisance(rows, residual, A, start)
     return phi + float(np.linalg.slogdet(np.eye(A.shape[1]) + (A * weight[:, None]).T @ A)[1]) - before
 

@@ -118,7 +118,7 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
     if limits is not None:
         misfit, nuisance, behind = check_values(model, best)
         if misfit > limits.misfit:
-            own = best.weight * best.rows.std**2 / best.rows.share * best.rows.pixel
+            own = best.responsibility * best.rows.pixel
             rms = float(np.sqrt(own @ best.rows.residual**2 / max(own.sum(), 1.0)))
             return verdict(Status.NOT_EXPLAINED, rms_mm=1e3 * rms, times=float(np.sqrt(misfit / limits.misfit)))
         if nuisance > limits.nuisance:
