@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from threading import Event, Thread
@@ -19,7 +20,7 @@ Message = tuple[str, str, Any]
 """Topic, type and the decoded message."""
 
 
-class RosSource:
+class RosSource(ABC):
     """What sources of ROS 2 messages share; each says in `messages` where they come from."""
 
     kind = "messages"
@@ -31,9 +32,9 @@ class RosSource:
         self._lost: SourceLost | None = None
         self._thread: Thread | None = None
 
+    @abstractmethod
     def messages(self, stop: Event, frames: TopicFrames) -> Iterator[Message]:
         """Yield messages until `stop` is set; of the topics that `frames` wants. Raises SourceLost, OSError."""
-        raise NotImplementedError
 
     def open(self, opening: Opening) -> SourceInfo:
         """Start to read, and wait for the first frame: it tells the camera."""

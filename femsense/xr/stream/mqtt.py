@@ -8,6 +8,7 @@ import logging
 import socket
 import ssl
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -87,7 +88,7 @@ class Refusal:
         self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
 
 
-class MqttLink:
+class MqttLink(ABC):
     """A client of a broker that comes back by itself where the broker goes away."""
 
     def __init__(self, address: BrokerAddress, topics: Sequence[str]) -> None:
@@ -116,9 +117,9 @@ class MqttLink:
         self._client.disconnect()
         self._client.loop_stop()
 
+    @abstractmethod
     def _hear(self, message: Message, *, kept: bool) -> None:
         """Take a message; `kept`: the broker had it from earlier."""
-        raise NotImplementedError
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
         if self._refusal.refused(reason):
