@@ -15,21 +15,26 @@ STEEPEST = 4.0
 """Surfaces are averaged whose depth changes by less than so many times the way along the image: 76° of incidence."""
 
 
-def in_blocks(scan: Scan, noises: Sequence[CameraNoise], most: int) -> Scan:
-    """Return the scan with neighbouring pixels of the robot averaged, about so many at most, where their depth is continuous.
+def block_side(points: int, most: int) -> int:
+    """Return the side of square blocks [pixels] whose means are about `most` at most, of so many points; 1: none are averaged."""
+    return int(np.ceil(np.sqrt(points / most))) if points > most else 1
+
+
+def in_blocks(scan: Scan, noises: Sequence[CameraNoise], side: int) -> Scan:
+    """Return the scan with neighbouring pixels of the robot averaged where their depth is continuous.
 
     Pixels are grouped in square blocks of the image of each camera. The mean of points of a plane is a point of the plane.
 
     Arguments:
         noises: of the cameras.
-        most: points with fewer stay as they are.
+        side: of a block [pixels], see `block_side`.
     """
-    if len(scan.view) <= most:
+    if side == 1 or not len(scan.view):
         return scan
     rays = scan.camera_points[:, :2] / scan.camera_points[:, 2:]
     pixel = np.array([pixel_of(scan, view) for view in range(len(noises))])[scan.view]
-    side = np.ceil(np.sqrt(len(scan.view) / most)) * np.maximum(pixel, 1e-9)
-    cell = np.floor(rays / side[:, None]).astype(np.int64)
+    angle = side * np.maximum(pixel, 1e-9)
+    cell = np.floor(rays / angle[:, None]).astype(np.int64)
     cell -= cell.min(axis=0)
     key = (scan.view * (int(cell[:, 0].max()) + 1) + cell[:, 0]) * (int(cell[:, 1].max()) + 1) + cell[:, 1]
     order = np.argsort(key, kind="stable")
@@ -37,7 +42,7 @@ def in_blocks(scan: Scan, noises: Sequence[CameraNoise], most: int) -> Scan:
     number = np.diff(np.append(start, len(order)))
     z = scan.camera_points[order, 2]
     deep = np.maximum.reduceat(z, start) - np.minimum.reduceat(z, start)
-    allowed = 6.0 * scan.ray_std(noises)[order][start] + STEEPEST * (side * scan.camera_points[:, 2])[order][start]
+    allowed = 6.0 * scan.ray_std(noises)[order][start] + STEEPEST * (angle * scan.camera_points[:, 2])[order][start]
     one = deep <= allowed
     members = np.repeat(one, number)
     middle = np.add.reduceat(scan.camera_points[order], start, axis=0)[one] / number[one, None]

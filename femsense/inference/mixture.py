@@ -1,9 +1,8 @@
 """The noise of a row: a mixture of the robot (Gaussian) and of something else (uniform), with its responsibilities.
 
-    −2 log[ exp(−z²/2κ²) + o ],   z = r/σ,   o = (1 − π) √(2π) σ b / (π · size)
+    −2 log[ exp(−z²/2κ²) + o ],   z = r/σ,   o = ω √(2π) σ / size
 
-π: probability that the pixel shows the robot; size: length over which a pixel that shows something else may lie; b: how likely such a pixel lies on
-this side of the surface. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
+ω: odds that a pixel shows something else on its side of the surface, in front or behind, rather than the robot; size: length over which that may lie. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
 Source of the mixture: Verbeek, Vlassis & Kröse 2003 for EM; Aitkin & Wilson 1980 for outliers as a mixture component.
 """
 
@@ -35,16 +34,24 @@ def _misfit(z, log_other, share, weight):  # type: ignore[no-untyped-def]
     return total
 
 
-def log_odds_of_other(robot_share: FloatArray, std: FloatArray, length: float, seen_through: FloatArray) -> FloatArray:
-    """Return log o of pixels.
+@dataclass(frozen=True, slots=True)
+class Others:
+    """Odds ω that a pixel shows something else rather than the robot."""
 
-    Arguments:
-        robot_share: π, shape (r,).
-        std: σ along the ray [m], shape (r,).
-        length: over which something else may lie [m].
-        seen_through: b, shape (r,).
-    """
-    return np.asarray(np.log((1.0 - robot_share) * np.sqrt(2.0 * np.pi) * std * seen_through / (robot_share * length)))
+    front: float
+    """In front of the surface."""
+    behind: float
+    """Behind it: nobody sees through a robot, but pixels at edges of depth mix both sides."""
+
+    def log_odds(self, std: FloatArray, length: float, behind: BoolArray) -> FloatArray:
+        """Return log o of pixels, shape (r,).
+
+        Arguments:
+            std: σ along the ray [m], shape (r,).
+            length: over which something else may lie [m].
+            behind: whether a pixel lies behind the surface that its ray meets, shape (r,).
+        """
+        return np.asarray(np.log(np.where(behind, self.behind, self.front) * np.sqrt(2.0 * np.pi) * std / length))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Nuisance parameters η: what moves the rows besides contact forces, with a Gaussian prior that contact-free frames teach.
 
-    η = (pose step of each camera, relative softness, relative pull of each cable and chamber, error field b of the cameras, error field m of the model)
-    r = C(x) η + noise,   C = [∂r/∂pose, d·∂x/∂softness, d·∂x/∂pulls, k, |x − x_rest| k]
+    η = (pose step of each camera, relative softness, relative pull of each cable and chamber, error field b of each camera, error field m of the model)
+    r = C(x) η + noise,   C = [∂r/∂pose, d·∂x/∂softness, d·∂x/∂pulls, k by camera, |x − x_rest| k]
 
 Contact-free frames i have η_i = (θ, e + e_i): θ and e are common to all, e_i is each frame's own error. With b = s_b·unit, m = s_m·unit
 and the share a of their variance that is common, θ and e have the posterior of a linear Gaussian model in which e_i is marginalised;
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.inference.mixture import misfit
 from femsense.inference.rows import Rows
 
@@ -40,9 +40,11 @@ class Nuisance:
     first_covariance: FloatArray
     """Its covariance, shape (c, c)."""
     mean: FloatArray
-    """μ, shape (c + 2p,)."""
+    """μ, shape (c + (v + 1) p,)."""
     root: FloatArray
-    """R, shape (c + 2p, q)."""
+    """R, shape (c + (v + 1) p, q)."""
+    centres: int
+    """p of the error field."""
     sizes: tuple[float, float, float] = (1e-4, 0.01, 0.0)
     """s_b [m], s_m [1], a [1]."""
 
@@ -51,16 +53,24 @@ class Nuisance:
         """Number of parameters that are not of the error field."""
         return len(self.first_mean)
 
+    @property
+    def fields(self) -> IntArray:
+        """Which size, s_b or s_m, each parameter of the error fields has, shape ((v + 1) p,)."""
+        count = len(self.mean) - self.common
+        return np.repeat([0, 1], [count - self.centres, self.centres])
 
-def first_nuisance(mean: FloatArray, covariance: FloatArray, centres: int) -> Nuisance:
-    """Return the prior before any contact-free frame is seen, with an error field of so many centres."""
-    root = block_diag(root_of(covariance), np.diag(np.repeat(EXPECTED, centres)))
-    return Nuisance(freeze(mean), freeze(covariance), freeze(np.append(mean, np.zeros(2 * centres))), freeze(root))
+
+def first_nuisance(mean: FloatArray, covariance: FloatArray, centres: int, views: int) -> Nuisance:
+    """Return the prior before any contact-free frame is seen, with error fields of so many centres of so many cameras and the model."""
+    root = block_diag(root_of(covariance), np.diag(np.repeat(EXPECTED, [views * centres, centres])))
+    full = freeze(np.append(mean, np.zeros((views + 1) * centres)))
+    return Nuisance(freeze(mean), freeze(covariance), full, freeze(root), centres)
 
 
 def columns(rows: Rows, softening: FloatArray) -> FloatArray:
-    """Return C, shape (r, c + 2p); `softening`: node displacements for unit softness and pulls [m], shape (1 + a, n, 3)."""
-    return np.hstack([rows.by_pose, rows.of(softening), rows.field, rows.way[:, None] * rows.field])
+    """Return C, shape (r, c + (v + 1) p); `softening`: node displacements for unit softness and pulls [m], shape (1 + a, n, 3)."""
+    by_camera = (rows.camera[:, :, None] * rows.field[:, None]).reshape(len(rows), -1)
+    return np.hstack([rows.by_pose, rows.of(softening), by_camera, rows.way[:, None] * rows.field])
 
 
 def fit_nuisance(
@@ -89,7 +99,7 @@ def fit_nuisance(
 
 
 def gram_of(rows: Rows, C: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the inner products of (C, r) under weights W of the rows, shape (c + 2p + 1,) squared."""
+    """Return the inner products of (C, r) under weights W of the rows, one more than columns of C, squared."""
     A = np.hstack([C, rows.residual[:, None]])
     return np.asarray((A * weight[:, None]).T @ A)
 
@@ -136,20 +146,19 @@ def root_of(covariance: FloatArray) -> FloatArray:
 def _normal_equations(
     nuisance: Nuisance, grams: Sequence[FloatArray], sizes: tuple[float, float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float, FloatArray]:
-    """Return the sizes of each frame's own errors (2p,), prior mean and root of (θ, e), and the normal equations of its whitened form: matrix and right-hand
-    side; the log determinant of the marginalised errors; and the summed inner products."""
+    """Return the sizes of each frame's own errors ((v + 1) p,), prior mean and root of (θ, e), and the normal equations of its whitened form: matrix
+    and right-hand side; the log determinant of the marginalised errors; and the summed inner products."""
     c = nuisance.common
-    p = (len(nuisance.mean) - c) // 2
-    spread = np.repeat(sizes[:2], p)
+    spread = np.array(sizes[:2])[nuisance.fields]
     own, shared = np.sqrt(1.0 - sizes[2]) * spread, np.sqrt(sizes[2]) * spread
     total, logdet = np.zeros_like(grams[0]), 0.0
     for gram in grams:
         side = own[:, None] * gram[c:-1]
-        core = np.eye(2 * p) + side[:, c:-1] * own
+        core = np.eye(len(spread)) + side[:, c:-1] * own
         total += gram - side.T @ np.linalg.solve(core, side)
         logdet += float(np.linalg.slogdet(core)[1])
     root = block_diag(root_of(nuisance.first_covariance), np.diag(shared))
-    mean = np.append(nuisance.first_mean, np.zeros(2 * p))
+    mean = np.append(nuisance.first_mean, np.zeros(len(spread)))
     inner = np.eye(root.shape[1]) + root.T @ total[:-1, :-1] @ root
     right = root.T @ (total[:-1, -1] - total[:-1, :-1] @ mean)
     return own, mean, root, inner, right, logdet, total

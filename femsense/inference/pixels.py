@@ -14,15 +14,13 @@ from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
 from femsense.inference.error_field import ErrorField
-from femsense.inference.mixture import log_odds_of_other
+from femsense.inference.mixture import Others
 from femsense.inference.rows import Rows
 
 GRAZING = 0.25
 """Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
 FAR = 6.0
 """Pixels in front of the surface by more than this many σ are compared with its closest point."""
-BEHIND = 1e-3
-"""b of a pixel behind the modelled surface: nobody sees through a robot, but a model may be off by a fold."""
 ON_SURFACE = 1e-5
 """Nearer than this the direction to the closest point is the face's normal [m]."""
 
@@ -39,8 +37,8 @@ class Pixels:
     """Camera of each, shape (m,)."""
     ray_std: FloatArray
     """Noise along the ray [m], shape (m,)."""
-    robot_share: FloatArray
-    """π: probability that it shows the robot, shape (m,)."""
+    others: Others
+    """Odds that it shows something else."""
     share: float
     """1/T: how many independent measurements a pixel counts for."""
     coloured: bool
@@ -112,8 +110,7 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
             triangle,
             on,
         )
-    through = np.where(on & (residual < 0.0), BEHIND, 1.0)
-    other = log_odds_of_other(pixels.robot_share, pixels.ray_std, skin.size, through)
+    other = pixels.others.log_odds(pixels.ray_std, skin.size, on & (residual < 0.0))
     return rows_on(
         skin,
         positions,
@@ -170,6 +167,7 @@ def rows_on(
         direction,
         by_pose.reshape(len(residual), -1),
         field,
+        np.eye(views)[view],
         way,
         rest,
         np.full(len(residual), pixel),

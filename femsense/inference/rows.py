@@ -39,6 +39,8 @@ class Rows:
     """Derivative of the measured side with (rotation about the pivot [rad], shift [m]) of each camera, shape (r, 6 v)."""
     field: FloatArray
     """Weights of the error field's centres (see `error_field`), shape (r, p); 0 where the row has no correlated error."""
+    camera: FloatArray
+    """Share of each camera in the measured side, shape (r, v); 0 where no camera's error field is part of it."""
     way: FloatArray
     """Distance of the point from its place at rest [m], shape (r,)."""
     rest: FloatArray

@@ -70,11 +70,32 @@ class Shape:
     """Where its points lie within this of a body's surface, a camera may have seen that body's edge [m]."""
     covariance: FloatArray | None = field(default=None, repr=False)
     """Of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
+    seen_by: FloatArray = field(default_factory=lambda: np.ones(1), repr=False)
+    """Share of its points that each camera showed, shape (v,)."""
 
     @property
     def radius_std(self) -> float:
         """Standard deviation of a radius that was fitted [m]; inf where none was."""
         return np.inf if self.covariance is None else float(np.sqrt(self.covariance[3, 3]))
+
+    def moved(self, T: FloatArray) -> Shape:
+        """Return the shape moved by a rigid motion, shape (4, 4)."""
+        R, t = T[:3, :3], T[:3, 3]
+        points = self.points @ R.T + t
+        covariance = self.covariance
+        if covariance is not None:
+            turn = np.eye(4)
+            turn[:3, :3] = R
+            covariance = turn @ covariance @ turn.T
+        return replace(
+            self,
+            center=R @ self.center + t,
+            axes=self.axes @ R.T,
+            points=points,
+            tree=None if self.tree is None else cKDTree(points),
+            surface=None if self.surface is None else Surface(self.surface.positions @ R.T + t, self.surface.triangles),
+            covariance=covariance,
+        )
 
     def towards(self, body: FloatArray) -> Shape:
         """Return the shape with the side that faces a body, and how well that side is known; places of the body's surface [m], shape (k, 3).
@@ -145,6 +166,7 @@ def find_shapes(
     fit: Fit | None = None,
     edge: FloatArray | None = None,
     halo: BoolArray | None = None,
+    view: IntArray | None = None,
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -157,8 +179,11 @@ def find_shapes(
         fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
         edge: how far off the surface a camera may have put points of its edge [m], shape (o,): what lies within that is no object.
         halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
+        view: camera of each point, shape (o,); one camera if not given.
     """
     fit = fit or fit_shape
+    view = np.zeros(len(points), dtype=np.int64) if view is None else view
+    cameras = int(view.max(initial=0)) + 1
     result: list[Shape] = []
     left = _groups(points, std)
     while left:
@@ -180,7 +205,8 @@ def find_shapes(
             close = np.concatenate([close, *more])
             own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
             shape = _completed(fit, points[close], std[close], origins[close], own)
-        result.append(shape if edge is None else replace(shape, edge_m=float(np.median(edge[close]))))
+        seen_by = np.bincount(view[close], minlength=cameras) / len(close)
+        result.append(replace(shape, seen_by=seen_by, edge_m=0.0 if edge is None else float(np.median(edge[close]))))
     return result
 
 

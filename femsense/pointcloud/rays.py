@@ -89,8 +89,9 @@ class Surface:
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
         return hits.pick((gap <= reach) & looking)
 
-    def beside_rays(self, points: FloatArray, origins: FloatArray) -> FloatArray:
-        """Return how far the rays through points (k, 3) pass the surface near them [m], shape (k,); 0 where they meet it.
+    def beside_rays(self, points: FloatArray, origins: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far the rays through points (k, 3) pass the surface near them [m], 0 where they meet it, and how far behind each point they do so
+        [m]; both of shape (k,).
 
         The closest point of the surface is projected onto the ray, and again from there (alternating projections).
         """
@@ -100,7 +101,8 @@ class Surface:
         for _ in range(ALTERNATIONS):
             closest = self._scene.compute_closest_points(_tensor(at))["points"].numpy().astype(np.float64)
             at = origins + np.einsum("kc,kc->k", closest - origins, ray)[:, None] * ray
-        return np.where(self._scene.compute_occupancy(_tensor(at)).numpy() > 0.5, 0.0, self.gap(at))
+        met = np.isfinite(self._scene.cast_rays(_tensor(np.hstack([origins, ray])))["t_hit"].numpy())
+        return np.where(met, 0.0, self.gap(at)), np.einsum("kc,kc->k", at - points, ray)
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""

@@ -22,6 +22,7 @@ from femsense.sensing.fit import fit
 from femsense.sensing.model import Fit, Frame, Model
 from femsense.sensing.pose_rows import background_rows, cost_of_moving, far, pose_gain
 from femsense.sensing.status import Status, Verdict, verdict
+from femsense.sensing.types import Touch
 
 MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
@@ -92,7 +93,7 @@ def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | Non
     for i in range(STEPS):
         there = _at(model, step)
         frame = _seen_from(there, best.frame)
-        fitted = fit(there, frame, contacts, forces, start, tau=tau)
+        fitted = fit(there, frame, [_seen_at(model, there, contact) for contact in contacts], forces, start, tau=tau)
         if fitted is None:
             return found
         change = (there.nuisance.mean + there.nuisance.root @ fitted.eta[: there.nuisance.root.shape[1]])[: len(step)]
@@ -127,6 +128,15 @@ def _at(model: Model, step: FloatArray) -> Model:
 def _seen_from(model: Model, frame: Frame) -> Frame:
     assert frame.scan is not None
     return replace(frame, pixels=model.pixels(frame.scan), objects=(), background=background_rows(model, frame.index))
+
+
+def _seen_at(model: Model, there: Model, contact: Touch) -> Touch:
+    """Return a contact whose object has moved with the camera that shows most of it."""
+    if contact.shape is None:
+        return contact
+    view = int(np.argmax(contact.shape.seen_by))
+    before, after = (one.sensor.calibration.poses[view] for one in (model, there))
+    return replace(contact, shape=contact.shape.moved(after @ np.linalg.inv(before)))
 
 
 def _misfit_of_background(model: Model, best: Fit) -> float:

@@ -20,7 +20,7 @@ from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
 from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
-from femsense.sensing.model import Fit, Frame, Limits, Model, pixels_of
+from femsense.sensing.model import STRAY, Fit, Frame, Limits, Model, block_of, pixels_of
 from femsense.sensing.odds import INFERRED
 from femsense.sensing.prepare import pose_covariance
 from femsense.sensing.proposals import inferred_gain
@@ -32,6 +32,8 @@ FEWEST = 30
 """Fewer pixels of the robot say nothing of its shape."""
 SEVERAL = 4
 """Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
+AWAY = (5.0, 15.0)
+"""Pixels so many standard deviations off show something else; nearer ones, which decide, are as dense."""
 FLAG = 1e-3
 """How often the nuisance of a contact-free frame may be as large by noise alone."""
 
@@ -67,10 +69,10 @@ def prior_model(sensor: Sensor) -> Model:
     skin = Skin(triangles, nodes, freeze(facing_of(nodes[triangles])), sensor.error_field, sensor.pivot, sensor.size)
     pulls = sensor.recording.actuation == "displacement" and sensor.recording.has_clouds
     drives = len(sensor.robot.body.cables) + len(sensor.robot.body.chambers) if pulls else 0
-    modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if pulls else sensor.options.modulus_std
+    modulus = min(sensor.options.modulus_std, MODULUS_STD_BESIDE_PULLS) if drives else sensor.options.modulus_std
     covariance = block_diag(pose_covariance(sensor.recording, sensor.calibration), np.diag([modulus**2] + [PULL_STD**2] * drives))
-    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(sensor.error_field))
-    return Model(sensor, skin, nuisance, sensor.knowledge.noises, inferred_odds=INFERRED)
+    nuisance = first_nuisance(np.zeros(len(covariance)), covariance, len(sensor.error_field), len(sensor.calibration.poses))
+    return Model(sensor, skin, nuisance, sensor.knowledge.noises, inferred_odds=INFERRED, block=block_of(sensor))
 
 
 def _contact_free(model: Model) -> list[ContactFree]:
@@ -95,22 +97,36 @@ def _taught(model: Model, frames: Sequence[Fit], *, sizes: tuple[float, float, f
     """Return the model with noise, overdispersion and prior as some contact-free frames show them."""
     nuisance, scale, T = model.nuisance, 1.0, model.overdispersion
     for _ in range(2):
-        grams, left = [], []
+        grams, left, seen = [], [], np.zeros(3)
         for one in frames:
             rows = _rescaled(one.rows, scale, T)
             N, residual = one.C @ nuisance.root, rows.residual - one.C @ nuisance.mean
             eta, _, weight = fit_nuisance(rows, residual, N, np.zeros(N.shape[1]))
             grams.append(gram_of(rows, one.C, weight))
             z = (residual - N @ eta) / rows.std
-            left.append((np.where(weight * T * rows.std**2 > 0.5, z, np.nan), rows.rest))
+            seen += _stray(rows, z, weight * T * rows.std**2, model.skin.size)
+            left.append((np.where(rows.pixel & (weight * T * rows.std**2 > 0.5), z, np.nan), rows.rest))
         scale *= float(np.clip(1.4826 * np.nanmedian(np.abs(np.concatenate([z for z, _ in left]))), 0.3, 30.0))
         T = _overdispersion(left, 0.5 * model.skin.field.length)
         nuisance = learnt(nuisance, grams, sizes=sizes)
-    return replace(model, nuisance=nuisance, scale=model.scale * scale, overdispersion=T)
+    front, behind = (1.0 + seen[:2]) / (1.0 + seen[2])  # posterior mean of a Poisson rate under an exponential prior of mean 1
+    # Objects that touch add mixed pixels in front of the body.
+    return replace(model, nuisance=nuisance, scale=model.scale * scale, overdispersion=T, stray=(max(front, 1.0), behind))
+
+
+def _stray(rows: Rows, z: FloatArray, robot: FloatArray, length: float) -> FloatArray:
+    """Return how many pixels lie between AWAY standard deviations in front and behind, and how many STRAY lets expect there, shape (3,).
+
+    z, robot: whitened residuals and probability that a row is the robot's, shape (r,).
+    """
+    near, far = AWAY
+    expected = (far - near) * STRAY / length * float(robot[rows.pixel] @ rows.std[rows.pixel])
+    return np.array([(rows.pixel & (near < side) & (side < far)).sum() for side in (z, -z)] + [expected])
 
 
 def _rescaled(rows: Rows, scale: float, T: float) -> Rows:
-    return replace(rows, std=rows.std * scale, share=np.full(len(rows), 1.0 / T))
+    """Return rows whose pixels have another noise and overdispersion; markers keep their own."""
+    return replace(rows, std=np.where(rows.pixel, scale, 1.0) * rows.std, share=np.where(rows.pixel, 1.0 / T, rows.share))
 
 
 def _overdispersion(left: Sequence[tuple[FloatArray, FloatArray]], cell: float) -> float:
@@ -144,7 +160,7 @@ def _at_the_mean(model: Model, frames: Sequence[Fit]) -> Model:
         driven=replace(sensor.driven, robot=robot),
         calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
     )
-    nuisance = first_nuisance(first, model.nuisance.first_covariance, len(model.skin.field))
+    nuisance = first_nuisance(first, model.nuisance.first_covariance, len(model.skin.field), model.views)
     return replace(model, sensor=sensor, nuisance=nuisance, modulus_shift=float(shown[v]))
 
 

@@ -143,16 +143,29 @@ def _searched(model: Model, best: Fit) -> Fit:
 
 
 def _with_objects(model: Model, best: Fit) -> Fit:
-    """Return a fit with the objects near the body: where colour does not separate them, of the pixels in front that it does not take for the robot."""
+    """Return a fit with the objects near the body where it stands now; where colour does not separate them, of the pixels in front that it does not take
+    for the robot."""
     frame = best.frame
-    if frame.coloured or frame.scan is None:
+    if frame.scan is None or said_free(model.sensor, frame.index):
         return best
-    objects = _in_front(model, frame, best.rows, inliers(best), best.state)
+    if not frame.coloured:
+        objects = _in_front(model, frame, best.rows, inliers(best), best.state)
+    elif _moved_by(frame.objects_at, best.state) > model.sensor.surface.edge:
+        objects = tuple(objects_near(model.sensor, frame.scan, best.state, frame.seen_before))
+        frame = replace(frame, objects_at=best.state.positions)
+        best = replace(best, frame=frame)
+    else:
+        return best
     if len(objects) == len(frame.objects) and all(_is_alike(a, b) for a, b in zip(objects, frame.objects)):
         return best
     seen = replace(frame, objects=objects)
     again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
     return best if again is None else again
+
+
+def _moved_by(positions: FloatArray | None, state: Equilibrium) -> float:
+    """Return how far any node is from a position [m]; 0 where nothing was looked for yet."""
+    return 0.0 if positions is None else float(np.linalg.norm(state.positions - positions, axis=1).max())
 
 
 def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: Equilibrium) -> tuple[Shape, ...]:
@@ -229,16 +242,17 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
     seen = () if previous is None else previous.objects
     frame = Frame(k, model.pixels(scan), scan, predicted, tensions, seen_before=seen)
     objects: tuple[Shape, ...] = ()
+    objects_at: FloatArray | None = None
     if not len(model.sensor.places) and not said_free(model.sensor, k):
         if scan.segmented:
-            objects = tuple(objects_near(model.sensor, scan, expected, seen))
+            objects, objects_at = tuple(objects_near(model.sensor, scan, expected, seen)), expected.positions
         elif expected is not predicted:
             rows = model.rows(frame, expected)
             objects = _in_front(
                 model, frame, rows, misfit(rows.residual / rows.std, rows.log_other, rows.share)[1] > 0.5, expected
             )
     clock.lap("objects")
-    return replace(frame, objects=objects)
+    return replace(frame, objects=objects, objects_at=objects_at)
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:

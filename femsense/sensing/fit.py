@@ -17,7 +17,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.inference.mixture import first_width
+from femsense.inference.mixture import Width, first_width
 from femsense.inference.nuisance import columns, fit_nuisance
 from femsense.inference.rows import Rows, stacked
 from femsense.sensing.cone import within_cones
@@ -105,51 +105,35 @@ def fit(
     eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
-        return _finished(model, frame, here, linear, eta, True)
+        return _finished(model, frame, here, _contact_columns(model, here, linear), linear, eta, True)
     wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=30.0, steps=1)[0]
-    z = (here.residual - here.N @ wide) / here.rows.std
-    kappa = first_width(z, here.rows.pixel, frame.coloured, catch)
-    converged = False
+    kappa = _width(here, wide, frame, catch)
+    J, converged = _contact_columns(model, here, linear), False
     for _ in range(STEPS):
-        eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
-        phi += _prior(model, here)
-        step, eta_there, tau, decrease = _step(model, here, linear, eta, weight)
-        if decrease < TOLERANCE:
+        step = _step(model, here, J, eta, kappa)
+        here = replace(here, tau=step.tau)
+        lower, settled = _descended(model, frame, here, linear, step, kappa)
+        if lower is None:
             if kappa.narrow:
-                converged = True
+                converged = settled
                 break
             kappa = kappa.narrowed()
             continue
-        phi += _prior(model, replace(here, tau=tau)) - _prior(model, here)
-        here = replace(here, tau=tau)
-        there = None
-        for length in LENGTHS:
-            if length < 1.0 and length * decrease < JUMP:
-                break
-            there = _moved(model, frame, here, linear, length * step)
-            if there is None:
-                continue
-            eta_new, phi_there, _ = fit_nuisance(there.rows, there.residual, there.N, eta_there, kappa=kappa.of(there.rows.pixel))
-            phi_there += _prior(model, there)
-            if phi_there < phi:
-                break
-            there = None
-        if there is None:
-            if kappa.narrow:
-                converged = True
-                break
-            kappa = kappa.narrowed()
-            continue
-        here, eta = there, eta_new
+        here, eta = lower.point, lower.eta
         if not _near(model, linear.positions, here.state.positions):
             linear = model.linearised(here.state)
             here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
-        if kappa.narrow and phi - phi_there < TOLERANCE:
+        J = _contact_columns(model, here, linear)
+        if kappa.narrow and step.phi - lower.phi < TOLERANCE:
             converged = True
             break
-        left = (here.residual - here.N @ eta) / here.rows.std
-        kappa = kappa.narrowed(first_width(left, here.rows.pixel, frame.coloured, catch))
-    return _in_cones(model, frame, _finished(model, frame, here, linear, eta, converged), here)
+        kappa = kappa.narrowed(_width(here, eta, frame, catch))
+    return _in_cones(model, frame, _finished(model, frame, here, J, linear, eta, converged), here)
+
+
+def _width(here: Point, eta: FloatArray, frame: Frame, catch: float) -> Width:
+    """Return κ for what is left of the rows."""
+    return first_width((here.residual - here.N @ eta) / here.rows.std, here.rows.pixel, frame.coloured, catch)
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
@@ -241,27 +225,49 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
     return np.concatenate(scales), np.concatenate(at)
 
 
-def contact_columns(model: Model, here: Point | Fit, axes: FloatArray, linear: Linearised) -> FloatArray:
+def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
     """Return J: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
     n = len(here.state.positions)
     loads = []
-    for contact, force, own in zip(here.contacts, here.forces, axes):
+    for contact, force, own in zip(here.contacts, here.forces, here.axes):
         loads += [contact.patch.spread(axis, n) for axis in own]
         loads += [nodal_forces_by_shift(model.sensor, contact, way, force) for way in ways_of(contact)[0]]
     return here.rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(here.rows), 0))
 
 
-def _step(
-    model: Model, here: Point, linear: Linearised, eta: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return the Gauss–Newton step of (forces along their axes [N], contact points [m]), shape (5m,), η̃ there, the prior scales τ, shape (m,), and by
-    how much Φ falls in the linear problem.
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """A Gauss–Newton step from a point."""
+
+    change: FloatArray
+    """Of (forces along their axes [N], contact points [m]), shape (5m,)."""
+    eta: FloatArray
+    """η̃ there."""
+    tau: FloatArray
+    """Prior scales that maximise the evidence of the linear problem [N], shape (m,)."""
+    decrease: float
+    """By how much Φ falls in the linear problem."""
+    phi: float
+    """Φ where it begins, with these prior scales."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lower:
+    """A point of lower Φ."""
+
+    point: Point
+    eta: FloatArray
+    phi: float
+
+
+def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Width) -> Step:
+    """Return the Gauss–Newton step from a point.
 
     τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
     expected under the posterior (MacKay 1992).
     """
     m = len(here.contacts)
-    J = contact_columns(model, here, here.axes, linear)
+    eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
     A = np.hstack([J, here.N])
     WA = A * weight[:, None]
     gram, tau = A.T @ WA, here.tau.copy()
@@ -279,7 +285,28 @@ def _step(
             break
     change = u - np.append(at, eta)
     decrease = float(change @ (np.eye(len(full)) + full[:, None] * gram * full) @ change)
-    return (u[: 5 * m] - at) * scale, u[5 * m :], last, decrease
+    return Step((u[: 5 * m] - at) * scale, u[5 * m :], last, decrease, phi + _prior(model, replace(here, tau=last)))
+
+
+def _descended(
+    model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width
+) -> tuple[Lower | None, bool]:
+    """Return a point of lower Φ along a step, or none; and whether Φ is least here, to TOLERANCE: else no point had an equilibrium."""
+    if step.decrease < TOLERANCE:
+        return None, True
+    refused = False
+    for length in LENGTHS:
+        if refused and length * step.decrease < JUMP:
+            break
+        there = _moved(model, frame, here, linear, length * step.change)
+        if there is None:
+            continue
+        eta, phi, _ = fit_nuisance(there.rows, there.residual, there.N, step.eta, kappa=kappa.of(there.rows.pixel))
+        phi += _prior(model, there)
+        if phi < step.phi:
+            return Lower(there, eta, phi), False
+        refused = True
+    return None, refused
 
 
 def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: FloatArray) -> Point | None:
@@ -299,11 +326,12 @@ def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: Fl
 # --- the optimum --------------------------------------------------------------------------------------------------------
 
 
-def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: FloatArray, converged: bool) -> Fit:
+def _finished(
+    model: Model, frame: Frame, here: Point, J: FloatArray, linear: Linearised, eta: FloatArray, converged: bool
+) -> Fit:
     """Return the Laplace approximation at a point."""
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta)
-    J = contact_columns(model, here, here.axes, linear)
     scale, at = whitened(model, here, trust=False)
     A = np.hstack([J * scale, here.N])
     H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
@@ -329,6 +357,7 @@ def _finished(model: Model, frame: Frame, here: Point, linear: Linearised, eta: 
         linear,
         here.C,
         here.N,
+        J,
         eta,
         weight,
         evidence,
@@ -350,4 +379,5 @@ def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:
     if state is None:
         return found
     there = _point(model, frame, found.contacts, inside, found.tau, state, found.linearised)
-    return _finished(model, frame, there, found.linearised, found.eta, found.converged)
+    J = _contact_columns(model, there, found.linearised)
+    return _finished(model, frame, there, J, found.linearised, found.eta, found.converged)

@@ -58,6 +58,7 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
         direction=np.tile(np.eye(3), (len(rows), 1)),
         by_pose=by_pose.reshape(r, -1),
         field=np.zeros((r, centres)),
+        camera=np.zeros((r, len(calibration.poses))),
         way=np.repeat(way, 3),
         rest=np.repeat(rest, 3, axis=0),
         pixel=np.zeros(r, dtype=np.bool_),

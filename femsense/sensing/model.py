@@ -7,12 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from femsense.calib.condensed_scan import in_blocks
-from femsense.calib.scan import Scan
+from femsense.calib.condensed_scan import block_side, in_blocks
+from femsense.calib.scan import Scan, read_scan
 from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium
+from femsense.inference.mixture import Others
 from femsense.inference.nuisance import Nuisance
 from femsense.inference.pixels import Pixels, Skin, pixel_rows
 from femsense.inference.rows import Rows, stacked
@@ -23,12 +25,12 @@ from femsense.sensing.prepare import scan_of
 from femsense.sensing.states import loaded_state
 from femsense.sensing.types import Sensor, Touch
 
-ROBOT = 0.99
-"""π of a pixel that has the robot's colour; 0.5 where colour does not separate it."""
+STRAY, UNTOLD = 0.01, 1.0
+"""ω of a pixel before contact-free frames are seen: a depth mixed of both sides of an edge, or of something in front where colour does not tell it."""
 STALE = 0.03
 """Answers at the candidates serve while no node has moved farther than this share of the diagonal: they rank, and do not estimate."""
 PIXELS = 6000
-"""Neighbouring pixels of the robot are averaged beyond about so many a frame."""
+"""Neighbouring pixels of the robot are averaged beyond about so many in the first frame."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,6 +52,10 @@ class Model:
     """Relative softness that contact-free frames asked for and that the body has been given."""
     limits: Limits | None = None
     """What the posterior check compares with; None before contact-free frames are seen."""
+    stray: tuple[float, float] = (1.0, 1.0)
+    """How many times more than STRAY pixels of contact-free frames are mixed ones, in front and behind."""
+    block: int = 1
+    """Side of the blocks of pixels that are averaged, the same in all frames: their noise is one."""
     candidates: Candidates = field(default_factory=lambda: Candidates())
 
     @property
@@ -67,11 +73,12 @@ class Model:
         """Relative standard deviation of the compliance at a contact [1].
 
         Gravity and cables pull as declared, and yet the model needs another modulus or other pulls to move as the body does (law, mesh, ties): what it
-        needs there, it needs at a contact. The root mean square of the pulls that contact-free frames ask for, and that of the modulus.
+        needs there, it needs at a contact. The root mean square of the pulls that contact-free frames ask for, and that of the modulus; how well the
+        modulus is known is part of A.
         """
-        asked = np.arange(6 * self.views, self.nuisance.common)
-        square = self.nuisance.mean[asked] ** 2 + (self.nuisance.root[asked] ** 2).sum(axis=1)
-        return float(np.sqrt(self.modulus_shift**2 + square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
+        softness, pulls = 6 * self.views, np.arange(6 * self.views + 1, self.nuisance.common)
+        asked = self.nuisance.mean[pulls] ** 2 + (self.nuisance.root[pulls] ** 2).sum(axis=1)
+        return float(np.sqrt(self.modulus_shift**2 + self.nuisance.mean[softness] ** 2 + (asked.mean() if len(pulls) else 0.0)))
 
     @property
     def drives(self) -> int:
@@ -81,9 +88,10 @@ class Model:
     def pixels(self, scan: Scan) -> Pixels:
         """Return the pixels of a scan with their noise."""
         poses = self.sensor.calibration.poses
-        share = np.full(len(scan.view), ROBOT if scan.segmented else 0.5)
+        front, behind = self.stray
+        others = Others(STRAY * front if scan.segmented else UNTOLD, STRAY * behind)
         std = self.scale * scan.ray_std(self.noises) / np.sqrt(scan.measured)
-        return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, share, 1.0 / self.overdispersion, scan.segmented)
+        return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, others, 1.0 / self.overdispersion, scan.segmented)
 
     def rows(self, frame: Frame, state: Equilibrium) -> Rows:
         """Return the rows of a frame at a state: its pixels, or its markers where it has none. Raises DataError."""
@@ -130,9 +138,22 @@ class Model:
 
 
 def pixels_of(model: Model, k: int, state: Equilibrium) -> Scan | None:
-    """Return what the cameras see in frame k near a state, about PIXELS of the robot; None where the recording has no clouds. Raises FemsenseError."""
+    """Return what the cameras see in frame k near a state, the robot's pixels in blocks; None where the recording has no clouds. Raises FemsenseError."""
     scan = scan_of(model.sensor, k, state)
-    return None if scan is None else in_blocks(scan, model.noises, PIXELS)
+    return None if scan is None else in_blocks(scan, model.noises, model.block)
+
+
+def block_of(sensor: Sensor) -> int:
+    """Return the side of blocks that leaves about PIXELS pixels of the robot in the first frame that can be read; 1 without clouds."""
+    nodes = sensor.robot.body.mesh.nodes
+    for k in range(len(sensor.recording.time_s)):
+        try:
+            scan = read_scan(sensor.robot, sensor.recording, k, sensor.calibration.poses, nodes)
+        except FemsenseError:
+            continue
+        if scan is not None:
+            return block_side(len(scan.view), PIXELS)
+    return 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -172,6 +193,8 @@ class Frame:
     """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
     objects: tuple[Shape, ...] = ()
     """Rigid objects seen or declared near the body, completed."""
+    objects_at: FloatArray | None = None
+    """Nodes of the body where these were told from what a camera adds around its silhouette [m], shape (n, 3)."""
     seen_before: tuple[Shape, ...] = ()
     """Objects of the frame before."""
     latent: tuple[Touch, ...] = ()
@@ -203,6 +226,8 @@ class Fit:
     """Derivatives of the rows with η, shape (r, p)."""
     N: FloatArray
     """C R, shape (r, q)."""
+    J: FloatArray
+    """Derivatives of the modelled rows with (force along its axes [N], contact point [m]) of each contact, shape (r, 5m)."""
     eta: FloatArray
     """Whitened nuisance η̃, shape (q,)."""
     weight: FloatArray

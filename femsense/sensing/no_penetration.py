@@ -54,14 +54,14 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
             shared = sum(is_with(other, contact.shape) for other in contacts) > 1
             at = _closest(model, shape, positions, contact.place if shared else None)
             if at is not None:
-                rows.append(_row(model, frame, shape, *at, positions, odds=_density(model, contact)[1]))
+                rows.append(_row(model, shape, *at, positions, odds=_density(model, contact)[1]))
     for own in frame.objects:
         stands = any(same_object(own, one) for one in model.sensor.overlapping)
         if _is_known(model, own) and not stands and not any(is_with(contact, own) for contact in contacts):
             shape = own.towards(positions[model.sensor.surface.nodes])
             at = _closest(model, shape, positions, None)
             if at is not None and at[2] < 0.0 and shape.behind_m == 0.0:
-                rows.append(_row(model, frame, shape, *at, positions, odds=float(np.log(OVERLAPPING))))
+                rows.append(_row(model, shape, *at, positions, odds=float(np.log(OVERLAPPING))))
     return rows
 
 
@@ -142,7 +142,6 @@ def _free_triangles(model: Model) -> IntArray:
 
 def _row(
     model: Model,
-    frame: Frame,
     shape: Shape,
     triangle: int,
     weights: FloatArray,
@@ -156,7 +155,6 @@ def _row(
     step = SLOPE * np.eye(3)
     slope = shape.distance(place + step) - shape.distance(place - step)
     direction = slope / max(float(np.linalg.norm(slope)), 1e-12)
-    view = 0 if frame.scan is None or not len(frame.scan.others_view) else int(np.bincount(frame.scan.others_view).argmax())
     rows = rows_on(
         model.skin,
         positions,
@@ -168,11 +166,14 @@ def _row(
         np.array([odds]),
         np.ones(1),
         (place - gap * direction)[None],
-        np.array([view]),
-        model.views,
+        np.zeros(1, dtype=np.int64),
+        1,
         pixel=False,
     )
+    seen_by = np.pad(shape.seen_by, (0, model.views - len(shape.seen_by)))
     corners = positions[model.skin.triangles[triangle]]
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     # The error field lies along the outward normal of the body, this row about against it.
-    return replace(rows, field=rows.field * float(direction @ normal) / max(float(np.linalg.norm(normal)), 1e-12))
+    facing = float(direction @ normal) / max(float(np.linalg.norm(normal)), 1e-12)
+    by_pose = (seen_by[:, None] * rows.by_pose).reshape(1, -1)
+    return replace(rows, field=rows.field * facing, camera=seen_by[None], by_pose=by_pose)

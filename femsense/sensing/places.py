@@ -37,6 +37,8 @@ WINDOWED = 2.0
 """A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
+IN_FRONT = 3.0
+"""A point is in front of the body where it lies nearer to the camera by more standard deviations."""
 AGAIN = 2.0
 """A ball is the one of the frame before where its points are nearer than so many radii to where that one's centre was."""
 FLOOR_STD = 0.0007
@@ -74,7 +76,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
     std = sensor.knowledge.depth_std(np.linalg.norm(points - origins, axis=1), view)
-    edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
+    edge, halo = _edge_of(sensor, scan, body, points, gap, std, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
@@ -86,25 +88,36 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
         fit=partial(fit_tool, tools) if tools else partial(fit_again, seen),
         edge=edge + 3.0 * std,
         halo=halo,
+        view=view,
     )
 
 
 def _edge_of(
-    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, gap: FloatArray, origins: FloatArray, view: IntArray
+    sensor: Sensor,
+    scan: Scan,
+    body: Surface,
+    points: FloatArray,
+    gap: FloatArray,
+    std: FloatArray,
+    origins: FloatArray,
+    view: IntArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Return how far beside the body a camera may show points of its edge [m], shape (o,), and which points are a stereo camera's halo, shape (o,).
 
-    A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely.
+    A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely. What lies in front of
+    the body is none.
     """
     cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
     pixel = np.array([pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
     depth = np.linalg.norm(points - origins, axis=1)
     edge = np.asarray(BLEEDING * pixel[view] * depth)
     matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (sensor.knowledge.together > WINDOWED)
-    halo, off = matched & (gap < edge), np.flatnonzero(matched & (gap >= edge))
-    beside = body.beside_rays(points[off], origins[off])
-    halo[off] = (beside > 0.0) & (beside < edge[off])
-    return edge, np.asarray(halo)
+    halo, asked = np.zeros(len(points), dtype=np.bool_), np.flatnonzero(matched)
+    beside, behind = body.beside_rays(points[asked], origins[asked])
+    edge_asked = edge[asked]
+    passes = (gap[asked] < edge_asked) | ((beside > 0.0) & (beside < edge_asked))
+    halo[asked] = passes & (behind < IN_FRONT * std[asked])
+    return edge, halo
 
 
 def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:

@@ -11,7 +11,7 @@ from femsense.inference.mixture import misfit
 from femsense.inference.nuisance import fit_nuisance
 from femsense.inference.rows import Rows, stacked
 from femsense.sensing.background import look, off_background
-from femsense.sensing.fit import contact_columns, whitened
+from femsense.sensing.fit import whitened
 from femsense.sensing.model import Fit, Model
 
 FAR = 0.1
@@ -49,6 +49,7 @@ def background_rows(model: Model, k: int) -> Rows | None:
         zeros,
         by_pose,
         np.zeros((r, len(model.skin.field))),
+        np.zeros((r, model.views)),
         np.zeros(r),
         zeros,
         np.zeros(r, dtype=np.bool_),
@@ -57,7 +58,7 @@ def background_rows(model: Model, k: int) -> Rows | None:
 
 def pose_gain(model: Model, best: Fit) -> float:
     """Return by how much pose steps of any size would lower −2 log evidence next to the contacts of a fit, to first order."""
-    J = contact_columns(model, best, best.axes, best.linearised)
+    J = best.J
     scale, at = whitened(model, best, trust=False)
     X, p = np.hstack([J * scale, best.N]), np.append(at, best.eta)
     W, P = best.weight[:, None], best.C[:, : 6 * model.views] * far(model)
@@ -79,7 +80,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
 
     Pixels are reweighted: what a moved camera does not explain may pass for something else.
     """
-    J = contact_columns(model, best, best.axes, best.linearised)
+    J = best.J
     scale, at = whitened(model, best, trust=False)
     kept = np.ones(len(scale), dtype=bool)
     residual = best.left(model.nuisance) * best.rows.std + best.N @ best.eta

@@ -15,7 +15,7 @@ from femsense.core.arrays import BoolArray, FloatArray
 from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
 from femsense.inference.rows import Rows
-from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, contact_columns, force_scale, whitened
+from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, force_scale, whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
@@ -116,7 +116,7 @@ def vicinity(model: Model, best: Fit) -> Vicinity:
     kappa = first_width(z, rows.pixel, best.frame.coloured, CATCH).of(rows.pixel)
     weight = misfit(z, rows.log_other, rows.share, kappa)[1] * rows.share / (kappa * rows.std) ** 2
     scale, at = whitened(model, best, trust=False)
-    X = np.hstack([best.N, contact_columns(model, best, best.axes, best.linearised) * scale])
+    X = np.hstack([best.N, best.J * scale])
     mean = rows.averaged(weight)
     X, left, weight = mean.of_rows(X), mean.of_rows((z * rows.std)[:, None])[:, 0], mean.weight
     K = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X
@@ -202,7 +202,7 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
             found += [
                 _replaced(best, i, one, f, g - L + best.odds[i] - best.drop_gain[i])
                 for one, g, f, L in zip(new, gains, forces, odds)
-                if g - L + best.odds[i] > -SHORT
+                if g - L + best.odds[i] - best.drop_gain[i] > -SHORT
             ]
     return found
 
@@ -275,7 +275,7 @@ def _inferred(
     c = len(at.normals)
     axes = axes_of(np.broadcast_to(model.upward, (c, 3)) if pulls else at.normals)
     gains, forces = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
-    gains = gains - model.inferred_odds - (HANGING if pulls else IN_SIGHT * at.seen)
+    gains = gains - model.inferred_odds - HANGING * pulls - IN_SIGHT * at.seen
     if not np.isfinite(gains).any():
         return -np.inf, []
     top = float(gains.max())

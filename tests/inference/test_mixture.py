@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from femsense.inference.mixture import Width, first_width, log_odds_of_other, misfit
+from femsense.inference.mixture import Others, Width, first_width, misfit
 
 Z = np.linspace(-8.0, 8.0, 41)
 ONES = np.ones(len(Z))
@@ -47,6 +47,6 @@ def test_wide_noise_reaches_far_pixels_and_narrows_to_its_own():
     assert width == Width() and width.narrow
 
 
-def test_a_pixel_that_surely_shows_the_robot_has_small_odds():
-    odds = log_odds_of_other(np.array([0.99, 0.5]), np.full(2, 1e-3), 0.1, np.ones(2))
-    assert np.exp(odds[1] - odds[0]) == pytest.approx(99.0)
+def test_odds_of_something_else_are_those_of_its_side_over_a_length():
+    odds = Others(0.5, 0.01).log_odds(np.full(2, 1e-3), 0.1, np.array([False, True]))
+    assert np.exp(odds) == pytest.approx([0.5 * np.sqrt(2 * np.pi) * 0.01, 0.01 * np.sqrt(2 * np.pi) * 0.01])

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm import arm
 
 from femsense.inference.error_field import spread_field
+from femsense.inference.mixture import Others
 from femsense.inference.nuisance import columns, first_nuisance, fit_nuisance, gram_of, learnt, without_poses
 from femsense.inference.pixels import Pixels, Skin, pixel_rows
 from femsense.inference.rows import stacked
@@ -28,7 +31,7 @@ def skin() -> Skin:
 
 def pixels_of(points: np.ndarray) -> Pixels:
     m = len(points)
-    return Pixels(points, np.tile(CAMERA, (m, 1)), np.zeros(m, dtype=np.int64), np.full(m, 1e-3), np.full(m, 0.99), 1.0, True)
+    return Pixels(points, np.tile(CAMERA, (m, 1)), np.zeros(m, dtype=np.int64), np.full(m, 1e-3), Others(0.01, 1e-5), 1.0, True)
 
 
 def upper_points(offset: float) -> np.ndarray:
@@ -81,7 +84,7 @@ def test_contact_free_frames_teach_a_common_pose(skin: Skin):
     rows = [pixel_rows(pixels_of(upper_points(4e-4)), skin, BODY.mesh.nodes, 1) for _ in range(3)]
     softening = np.zeros((1, *BODY.mesh.nodes.shape))
     C = [columns(one, softening) for one in rows]
-    first = first_nuisance(np.zeros(7), np.diag([1e-8] * 3 + [1e-6] * 3 + [1e-4]), len(skin.field))
+    first = first_nuisance(np.zeros(7), np.diag([1e-8] * 3 + [1e-6] * 3 + [1e-4]), len(skin.field), 1)
     grams = []
     for one, own in zip(rows, C):
         eta, _, weight = fit_nuisance(one, one.residual, own @ first.root, np.zeros(first.root.shape[1]))
@@ -90,6 +93,20 @@ def test_contact_free_frames_teach_a_common_pose(skin: Skin):
     after = learnt(first, [without_poses(gram, 6, 7) for gram in grams])
     assert after.mean[5] == pytest.approx(4e-4, rel=0.1)
     assert np.sqrt((after.root[5] ** 2).sum()) < 0.3 * 1e-3
+
+
+def test_each_camera_has_its_own_error_field(skin: Skin):
+    """Two cameras that see one face 0.2 mm too high and too low leave nothing behind, and the model needs no error of its own."""
+    points = np.vstack([upper_points(2e-4), upper_points(-2e-4)])
+    pixels = replace(pixels_of(points), view=np.repeat([0, 1], 40), ray_std=np.full(80, 7e-5))
+    rows = pixel_rows(pixels, skin, BODY.mesh.nodes, 2)
+    C = columns(rows, np.zeros((1, *BODY.mesh.nodes.shape)))
+    prior = first_nuisance(np.zeros(13), 1e-16 * np.eye(13), len(skin.field), 2)
+    eta, _, _ = fit_nuisance(rows, rows.residual, C @ prior.root, np.zeros(prior.root.shape[1]))
+    found = prior.root @ eta
+    assert np.abs(rows.residual - C @ found).max() < 5e-5
+    first, second, model = np.split(found[13:], 3)
+    assert first == pytest.approx(-second, abs=1e-5) and np.abs(first).max() > 5e-5 > 10.0 * np.abs(model).max()
 
 
 def test_field_weights_have_unit_norm_and_fall_off(skin: Skin):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from femsense.core.pose import move_pose, transform_points
 from femsense.pointcloud.primitives import find_shapes, fit_shape
 from femsense.sensing.places import fit_again
 
@@ -45,6 +47,26 @@ def test_a_ball_is_completed_from_the_half_that_is_seen():
     assert abs(wall[np.argmin(shape.distance(wall)), 2]) < 1e-3
     visible = np.linalg.norm(wall[:, None] - points[None], axis=2).min(axis=1)
     assert wall[np.argmin(visible), 2] > 1e-3  # the closest visible points lie towards the camera
+
+
+@pytest.mark.parametrize("make", [ball, rod])
+def test_a_shape_that_moves_keeps_its_distances_and_what_is_known_of_it(make: Callable[..., tuple[np.ndarray, np.ndarray]]):
+    rng = np.random.default_rng(1)
+    size = (0.01,) if make is ball else (0.01, 0.02)
+    shape = fit_shape(*seen(*make(*size, rng), rng))
+    T = move_pose(np.eye(4), np.array([0.3, -0.2, 0.5, 0.01, -0.02, 0.03]))
+    places = rng.normal(scale=0.03, size=(50, 3))
+    there, moved = transform_points(T, places), shape.moved(T)
+    np.testing.assert_allclose(moved.distance(there), shape.distance(places), atol=1e-9)
+    np.testing.assert_allclose(moved.towards(there).std_m, shape.towards(places).std_m, rtol=1e-6)
+
+
+def test_objects_say_which_camera_shows_them():
+    rng = np.random.default_rng(3)
+    points, std, origins = seen(*ball(0.01, rng), rng)
+    view = (rng.random(len(points)) < 0.25).astype(np.int64)
+    (shape,) = find_shapes(points, std, origins, np.abs(points[:, 0] - 0.01), local_m=0.1, view=view)
+    assert shape.seen_by == pytest.approx([1.0 - view.mean(), view.mean()])
 
 
 def test_a_rod_is_a_cylinder_whose_ends_are_where_it_was_seen():

@@ -36,6 +36,20 @@ def test_a_ray_that_misses_counts_by_the_closest_face_that_looks_at_the_camera()
     assert len(surface.near(beside, -camera, reach=0.05).index) == 0
 
 
+def test_rays_that_meet_the_surface_pass_it_at_no_distance_and_others_beside_or_behind_their_point():
+    camera = np.array([0.0, 0.0, 1.0])
+    met, beside, in_front = (
+        np.array([0.1, 0.2, 0.5]),
+        np.array([1.05, 0.0, 0.0]),
+        0.05 * camera + 0.95 * np.array([1.05, 0.0, 0.0]),
+    )
+    far, behind = Surface(SQUARE, TRIANGLES).beside_rays(np.array([met, beside, in_front]), np.tile(camera, (3, 1)))
+    along = np.array([1.05, 0.0, -1.0]) / np.hypot(1.05, 1.0)
+    foot = (np.array([1.0, 0.0, 0.0]) - beside) @ along  # of the edge of the square on the ray, from the point beside it
+    np.testing.assert_allclose(far, [0.0, *np.full(2, 0.05 / np.hypot(1.05, 1.0))], rtol=1e-3)
+    np.testing.assert_allclose(behind[1:], [foot, foot + 0.05 * np.hypot(1.05, 1.0)], atol=2e-3)
+
+
 def test_points_inside_have_a_negative_distance_and_those_far_off_are_outside():
     corner = Surface(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     points = np.array([[0.1, 0.2, 0.2], [-0.2, 0.2, 0.2]])

@@ -15,6 +15,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
+from femsense.sensing.cone import within_cones
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import estimate_frame, sense
 from femsense.sensing.fit import fit
@@ -167,6 +168,31 @@ def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path)
     assert found is not None
     gained = start.criterion - found.criterion
     assert gained > 0.0 and best.gain == pytest.approx(gained, rel=0.5, abs=6.0)
+
+
+def test_a_gap_moves_with_the_cameras_that_show_its_object(tmp_path: Path):
+    recording = replace(touched(tmp_path, PUSH, ball=True), tools=(Tool("ball", "ball", 0.006),))
+    model = model_of(recording)
+    best = estimate_frame(model, 3, None).best
+    (alone,) = gap_rows(model, best.frame, best.contacts, best.state.positions)
+    (contact,) = best.contacts
+    assert contact.shape is not None
+    calibration = model.sensor.calibration
+    two = replace(model, sensor=replace(model.sensor, calibration=replace(calibration, poses=2 * calibration.poses)))
+    seen = replace(contact, shape=replace(contact.shape, seen_by=np.array([0.25, 0.75])))
+    (shared,) = gap_rows(two, best.frame, [seen], best.state.positions)
+    np.testing.assert_allclose(shared.by_pose, np.hstack([0.25 * alone.by_pose, 0.75 * alone.by_pose]))
+    assert shared.camera.tolist() == [[0.25, 0.75]]
+
+
+def test_a_weight_does_not_pull_upwards(tmp_path: Path):
+    """A force that lifts becomes none, one that sways stays as it is."""
+    best = estimate_frame(model := model_of(touched(tmp_path, PUSH, ball=False)), 3, None).best
+    hangs = replace(best, contacts=(replace(best.contacts[0], pulls=True),))
+    axes = np.eye(3)[None, [2, 0, 1]]
+    assert within_cones(model.sensor, replace(hangs, forces=np.array([[0.05, 0.0, -0.1]])), axes) is None
+    lifted = within_cones(model.sensor, replace(hangs, forces=np.array([[0.0, 0.0, 0.1]])), axes)
+    assert lifted is not None and abs(lifted[0, 2]) < 1e-3
 
 
 def test_an_error_that_body_and_ball_share_leaves_their_gap(tmp_path: Path):
