@@ -25,8 +25,8 @@ Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
 FITS = 4.0
 """Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
-SIMPLER = 1.15
-"""A shape with more parameters has to leave so much less to be taken."""
+SIMPLER = 2.0
+"""A shape with more parameters has to leave less by so many standard deviations of the variance of its points' noise."""
 LEAST_SCATTER = 0.1
 """Variance of the scatter of an object's points about its shape, relative to the noise that is stated, at least."""
 ROUGH_STD = 0.006
@@ -35,6 +35,8 @@ LARGEST = 0.1
 """A larger radius is a plate [m]."""
 FIT_STEPS = 25
 """Steps of a fit at most."""
+NEAREST, END = 0.1, 0.5
+"""A rod meets a body with its end where this share of its points, the nearest, lie within so many radii of that end."""
 MOST_POINTS = 400
 """More points than this are thinned out: the shape of an object is known well enough."""
 FEWEST = 12
@@ -205,6 +207,10 @@ def find_shapes(
             close = np.concatenate([close, *more])
             own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
             shape = _completed(fit, points[close], std[close], origins[close], own)
+        if _ends(shape, points[close], near[close]):
+            end = near[close] <= near[close].min() + 0.5 * local_m
+            cap = _completed(fit, points[close[end]], std[close[end]], origins[close[end]], own[end])
+            shape = replace(cap, points=shape.points) if cap.kind == "sphere" else _raw(points[close], std[close])
         seen_by = np.bincount(view[close], minlength=cameras) / len(close)
         result.append(replace(shape, seen_by=seen_by, edge_m=0.0 if edge is None else float(np.median(edge[close]))))
     return result
@@ -220,6 +226,17 @@ def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArra
         return _raw(points, std)
     shape = fit(points[own], std[own], origins[own])
     return shape if shape.kind != "points" else _raw(points, std)
+
+
+def _ends(shape: Shape, points: FloatArray, near: FloatArray) -> bool:
+    """Return whether the part of an object that is nearest to a body is its end, of another form than the rest: the tip of a finger or of a rod, the
+    ball on a stick. points, near: as for `find_shapes`."""
+    if shape.kind == "points":
+        return shape.surface is None and len(points) >= FEWEST
+    if shape.kind != "cylinder":
+        return False
+    nearest = points[near <= np.quantile(near, NEAREST)].mean(axis=0)
+    return bool(abs((nearest - shape.center) @ shape.axes[0]) > shape.half[0] - END * shape.radius)
 
 
 def same_object(first: Shape, second: Shape) -> bool:
@@ -251,7 +268,8 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
         return _raw(points, std)
     least = min(cost for cost, _ in good)
     order = ("plate", "sphere", "cylinder")
-    fitting = [(cost, shape) for cost, shape in good if cost <= SIMPLER * least + 0.02]
+    allowed = least * (1.0 + SIMPLER * np.sqrt(2.0 / len(points)))
+    fitting = [(cost, shape) for cost, shape in good if cost <= allowed]
     return _as_well_as_it_fits(*min(fitting, key=lambda fit: order.index(fit[1].kind)), share)
 
 

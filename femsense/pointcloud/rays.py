@@ -93,16 +93,19 @@ class Surface:
         """Return how far the rays through points (k, 3) pass the surface near them [m], 0 where they meet it, and how far behind each point they do so
         [m]; both of shape (k,).
 
-        The closest point of the surface is projected onto the ray, and again from there (alternating projections).
+        The closest point of the surface is projected onto a ray that misses, and again from there (alternating projections).
         """
         ray = points - origins
         ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
-        at = points
+        along = self._scene.cast_rays(_tensor(np.hstack([origins, ray])))["t_hit"].numpy().astype(np.float64)
+        beside, missed = np.zeros(len(points)), np.flatnonzero(~np.isfinite(along))
+        at, start, way = points[missed], origins[missed], ray[missed]
         for _ in range(ALTERNATIONS):
             closest = self._scene.compute_closest_points(_tensor(at))["points"].numpy().astype(np.float64)
-            at = origins + np.einsum("kc,kc->k", closest - origins, ray)[:, None] * ray
-        met = np.isfinite(self._scene.cast_rays(_tensor(np.hstack([origins, ray])))["t_hit"].numpy())
-        return np.where(met, 0.0, self.gap(at)), np.einsum("kc,kc->k", at - points, ray)
+            along[missed] = np.einsum("kc,kc->k", closest - start, way)
+            at = start + along[missed, None] * way
+        beside[missed] = self.gap(at)
+        return beside, along - np.einsum("kc,kc->k", points - origins, ray)
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
