@@ -37,8 +37,6 @@ WINDOWED = 2.0
 """A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
-IN_FRONT = 3.0
-"""A point is in front of the body where it lies nearer to the camera by more standard deviations."""
 ASKED = 100
 """Points of an object that tell whether it is an edge of the body's."""
 AGAIN = 2.0
@@ -78,7 +76,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
     std = sensor.knowledge.depth_std(np.linalg.norm(points - origins, axis=1), view)
-    edge, halo = _edge_of(sensor, scan, body, points, gap, std, origins, view)
+    edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
@@ -95,19 +93,12 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
 
 
 def _edge_of(
-    sensor: Sensor,
-    scan: Scan,
-    body: Surface,
-    points: FloatArray,
-    gap: FloatArray,
-    std: FloatArray,
-    origins: FloatArray,
-    view: IntArray,
+    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, gap: FloatArray, origins: FloatArray, view: IntArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return how far beside the body a camera may show points of its edge [m], shape (o,), and which points are a stereo camera's halo, shape (o,).
 
     A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely. What lies in front of
-    the body is none.
+    the body by as much is none.
     """
     cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
     pixel = np.array([pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
@@ -118,7 +109,7 @@ def _edge_of(
     beside, behind = body.beside_rays(points[asked], origins[asked])
     edge_asked = edge[asked]
     passes = (gap[asked] < edge_asked) | ((beside > 0.0) & (beside < edge_asked))
-    halo[asked] = passes & (behind < IN_FRONT * std[asked])
+    halo[asked] = passes & (behind < edge_asked)
     return edge, halo
 
 
