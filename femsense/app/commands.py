@@ -296,8 +296,6 @@ def plan_into(
     from femsense.loop.design.documents import proposal_document
     from femsense.loop.design.planner import plan_experiment
 
-    if control not in ("tension", "displacement"):
-        raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")
     if file is not None and Path(file).suffix != ".toml":
         raise InputError("not the name of a script", where="-o", found=str(file), expected="a file that ends in .toml")
     if file is not None:

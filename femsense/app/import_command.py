@@ -14,8 +14,8 @@ from femsense.core.text import plain_name
 from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.formats import FORMATS, format_of
-from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
+from femsense.io.importers.options import UNITS, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import header_of
 from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
@@ -27,45 +27,6 @@ MANY_FRAMES = 1000
 """Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
 ENOUGH_FRAMES = 300
 """… and where a robot moves slowly, so many say as much."""
-
-
-def columns_named(columns: Sequence[str]) -> dict[str, str]:
-    """Return the mappings NAME=TARGET of `--map` as name in the source → name in the recording. Raises InputError."""
-    pairs = [text.rpartition("=") if "@" not in text else text.partition("=") for text in columns]
-    for text, (old, mark, new) in zip(columns, pairs):
-        if not (old and mark and new):
-            raise InputError(
-                "not a mapping", where="--map", found=text, expected="NAME=TARGET, such as motor1=cable_north or 3=tip.x"
-            )
-    return {old: new for old, _, new in pairs}
-
-
-def shifts_named(shifts: Sequence[str]) -> dict[str, float]:
-    """Return the seconds CAMERA=S of `--shift` as camera → seconds. Raises InputError."""
-    found: dict[str, float] = {}
-    for text in shifts:
-        name, _, value = text.rpartition("=")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            name = ""
-        if not name:
-            raise InputError("not a shift of a camera's times", where="--shift", found=text, expected="CAMERA=SECONDS")
-    return found
-
-
-def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
-    """Return the spans FROM:TO of `--free` [s]. Raises InputError."""
-    spans = []
-    for text in ranges:
-        try:
-            first, last = (float(part) for part in text.split(":"))
-        except ValueError:
-            first, last = 1.0, 0.0
-        if first > last:
-            raise InputError("not a span of time", where="--free", found=text, expected="FROM:TO, seconds after the first frame")
-        spans.append((first, last))
-    return spans
 
 
 def import_into(
@@ -99,7 +60,7 @@ def import_into(
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
     options = _spelt(options)
-    _check_options(options, inputs, zero)
+    _check_options(options)
     check_target(folder, folder=True)
     final = followed(folder)
     _check_apart(paths, final)
@@ -189,18 +150,9 @@ def _spelt(options: Options) -> Options:
     return replace(options, columns=columns, topics=topics, unit=options.unit if unit is None else unit.name)
 
 
-def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:
-    for name, value, allowed in (
-        ("--unit", options.unit, tuple(UNITS)),
-        ("--up", options.up, ("x", "y", "z")),
-        ("--clock", options.clock, ("auto", "header", "record")),
-        ("--inputs", inputs, ("tension", "displacement")),
-        ("--zero", zero, ("absolute", "unknown")),
-    ):
-        if value is not None and value not in allowed:
-            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
-    if options.every < 1:
-        raise InputError("not a count of frames", where="--every", found=options.every, expected="1, 2, …")
+def _check_options(options: Options) -> None:
+    if options.unit is not None and options.unit not in UNITS:
+        raise InputError("not a value of --unit", where="--unit", found=options.unit, expected="|".join(UNITS))
     if options.depth_unit is not None and not 0 < options.depth_unit < 1:
         raise InputError("not a unit of depth", where="--depth-unit", found=options.depth_unit, expected="metres, such as 0.001")
     if options.rate is not None and options.rate <= 0:

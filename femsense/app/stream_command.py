@@ -12,6 +12,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from femsense.app.stream_log import Streamed, StreamLog, Watched, connection, readings_from
+from femsense.app.stream_options import StreamOptions
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
@@ -34,32 +35,6 @@ MEASURED_HZ = 100.0
 """How often markers are measured by sensors at most: twice as often as commands go out."""
 PATIENCE_S = 3.0
 """How long a connection may take before it is said that there is none."""
-
-
-@dataclass(frozen=True, slots=True)
-class StreamOptions:
-    """Where a stream goes and who may see it."""
-
-    host: str = "127.0.0.1"
-    port: int = 0
-    mqtt: str | None = None
-    """Address of a broker."""
-    broker_port: int | None = None
-    """Serve a broker of our own here; 0 takes a free port."""
-    json_mirror: bool = False
-    password_file: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    authority: Path | None = None
-    """Certificate that a broker's own is checked against."""
-    rate_hz: float = 60.0
-    names: tuple[str, ...] = ()
-    """Further names of this machine."""
-    commands: bool = False
-    """Whether commands may go out once `let_drag` allows them."""
-    insecure: bool = False
-    """Commands also over a broker that lets anybody in."""
-    page: Path = PAGE
 
 
 @dataclass(eq=False, slots=True)
@@ -317,16 +292,16 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
     """Start the server, and a broker or a client of one where it is asked for; `stop` ends the sources."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
-    access = Access(options.host, password, options.certificate, options.key, options.names)
+    access = Access(options.host, password, options.certificate, options.key, tuple(options.names))
     address = None if options.mqtt is None else broker_address(options.mqtt, password=password, authority=options.authority)
     if options.commands and not options.insecure:
-        _need_known_clients(address, embedded=options.broker_port is not None, password=password)
+        _need_known_clients(address, embedded=options.served_port is not None, password=password)
     hub = Hub()
     with contextlib.ExitStack() as undo:
-        files = live_page_files(options.page)
+        files = live_page_files(options.page or PAGE)
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
-        broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
+        broker = None if options.served_port is None else EmbeddedBroker(hub, port=options.served_port, access=access)
         live = LiveStream(hub, server, broker, options.commands, stop=stop or Event())
         if address is not None:
             sink = MqttSink(hub, address, first)

@@ -157,7 +157,7 @@ def test_version(run: Any) -> None:
         (["calibratte"], "No such command 'calibratte'. Did you mean 'calibrate'? See: femsense --help"),
         (["calibrate", "robot"], "Missing argument 'RECORDING'. See: femsense calibrate --help"),
         (["estimate", "a", "b"], "Missing option '-o' / '--output'. See: femsense estimate --help"),
-        (["improve", "robot"], "Missing argument 'RECORDING...'. See: femsense improve --help"),
+        (["improve", "robot"], "Missing argument 'RECORDING'. See: femsense improve --help"),
         (["improve", "robot", "a"], "Missing option '-o' / '--output'. See: femsense improve --help"),
         (["simulate", "robot", "a"], "Missing option '-o' / '--output'. See: femsense simulate --help"),
         (["inspect", "--nonsense", "x"], "No such option: --nonsense"),
@@ -175,7 +175,7 @@ def test_wrong_usage_is_one_clear_line(run: Any, arguments: list[str], message: 
 
 def test_a_plan_refuses_what_it_cannot_do(run: Any, robot: Path) -> None:
     assert "expected: a file that ends in .toml" in run("improve", robot, "--plan", "-o", "plan").err
-    assert "expected: tension | displacement" in run("improve", robot, "--plan", "--actuation", "force").err
+    assert "'force' is not one of 'tension', 'displacement'" in run("improve", robot, "--plan", "--actuation", "force").err
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar
-from femsense.app.command_line.parameters import Json, argument, filled, option
+from femsense.app.command_line.parameters import argument, filled, option
 
 
+@command()
 def learn(
     files: Annotated[
         list[Path],
@@ -31,7 +33,6 @@ def learn(
         Path | None, option("-c --calibration", "FILE", "Take a camera's markers into the robot's frame.")
     ] = None,
     robot_frame: Annotated[bool, option("--robot-frame", help="The markers are in the robot's frame already.")] = False,
-    json: Json = False,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
     from femsense.app.learn_command import LearnFiles, learn_into, pairs_of

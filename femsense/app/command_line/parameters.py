@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     OptionsType = TypeVar("OptionsType", bound=DataclassInstance)
-T = TypeVar("T")
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
 
@@ -44,11 +44,23 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
 
 
 RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-OneRobot = Annotated[str | None, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-"""A robot that a table of jobs may name instead."""
-Recordings = Annotated[
-    list[Path] | None, argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")
-]
+Recordings = Annotated[list[Path], argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")]
+
+
+class Actuation(StrEnum):
+    """What the inputs of cables are."""
+
+    tension = "tension"
+    displacement = "displacement"
+
+
+class Zero(StrEnum):
+    """Whether the zero of inputs is known."""
+
+    absolute = "absolute"
+    unknown = "unknown"
+
+
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
 Json = Annotated[bool, option("--json", help="One JSON object on standard output, nothing else there.")]
 
@@ -78,13 +90,14 @@ def repeat_options(words: list[str]) -> list[str]:
     return result
 
 
-def required(context: typer.Context, value: T | None, name: str, kind: str) -> T:
-    """Return what only --plan or --jobs can do without."""
-    if value is None:
-        error = TyperException(f"Missing {kind} {name}.")
-        error.ctx = context  # type: ignore[attr-defined]
-        raise error
-    return value
+def missing(context: typer.Context, name: str) -> TyperException:
+    """Return the error of a parameter that is missing: what --plan or --jobs can do without."""
+    parameter = next(p for p in context.command.params if p.name == name)
+    is_argument = parameter.param_type_name == "argument"
+    names = [str(parameter.metavar).rstrip("…")] if is_argument else parameter.opts
+    error = TyperException(f"Missing {parameter.param_type_name} {' / '.join(map(repr, names))}.")
+    error.ctx = context  # type: ignore[attr-defined]
+    return error
 
 
 def places(texts: Sequence[str]) -> list[list[float]] | None:
