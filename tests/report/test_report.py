@@ -20,12 +20,13 @@ from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import read_loop, saved_loop
 from femsense.report import words, write_report
+from femsense.report.bodies import VIEWS, Key, best_view, body_height, frame_body, new_panels, skin
 from femsense.report.compare import load_error
-from femsense.report.drawing import VIEWS, Key, best_view, body_height, frame_body, new_axes, new_panels, nice, skin
+from femsense.report.drawing import new_axes, nice
 from femsense.report.loop.chapter import recovered
 from femsense.report.loop.effects import is_beyond, smallest_words
-from femsense.report.loop.residual_at_rest import draw_mean_residual, mean_residual
-from femsense.report.loop.residual_in_frames import draw_frame_residuals, frame_residuals
+from femsense.report.loop.residual_at_rest import mean_residual
+from femsense.report.loop.residual_in_frames import frame_residuals
 from femsense.report.run.document import KnownLoad
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
@@ -1162,7 +1163,7 @@ def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path) ->
     cameras = loop.evidence.pictures.camera_axes
     mean, frames = mean_residual(loop, loop.residuals.known(), robot, rest), frame_residuals(loop.evidence.pictures, rest)
     assert mean is not None and frames is not None
-    bodies = [*(draw_mean_residual(mean, title, cameras) for title in mean.means), draw_frame_residuals(frames, cameras)]
+    bodies = [*mean.figures(cameras), frames.figure(cameras)]
     assert [len(figure.axes) for figure in bodies] == [1, 1, 6]
     for figure in bodies:
         check_apart(figure)

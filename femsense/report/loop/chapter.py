@@ -16,7 +16,8 @@ from femsense.loop.result.loop_result import UNEXPLAINED, SavedLoop
 from femsense.loop.result.records import ModelError, Residuals
 from femsense.model.robot import Robot
 from femsense.report import words
-from femsense.report.drawing import DrawnSurface, marker_bars, skin
+from femsense.report.bodies import DrawnSurface, skin
+from femsense.report.drawing import marker_bars
 from femsense.report.loop.confounding_map import confounding_map
 from femsense.report.loop.effects import OUTCOMES, lacks, outcome, ranked_values, smallest_sizes, value_rows
 from femsense.report.loop.force_field import force_field

@@ -12,22 +12,8 @@ from markupsafe import Markup
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.report import words
-from femsense.report.drawing import (
-    MANY,
-    SERIES,
-    DrawnSurface,
-    Key,
-    add_legend,
-    as_image,
-    best_view,
-    body_height,
-    draw_body,
-    frame_body,
-    name_axes,
-    new_axes,
-    nice,
-    skin,
-)
+from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure, skin
+from femsense.report.drawing import INK, MANY, SERIES, add_legend, as_image, name_axes, new_axes, nice
 from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
 from femsense.sensing.run_arrays import NOISE, undetermined_text
 from femsense.sensing.run_files import read_states
@@ -37,7 +23,8 @@ ROWS = 150
 SHOWN = len(SERIES)
 ARROW_SHARE = 0.3
 """The longest arrow, in sizes of the body."""
-ARROW: dict[str, Any] = {"arrowstyle": "-|>,head_length=0.55,head_width=0.28", "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0}
+SHAFT = 0.03
+"""Width of an arrow [inch]."""
 
 
 def force_text(size: float, std: float) -> str:
@@ -145,22 +132,15 @@ def _surface_at(file: Path, frames: FrameTable, number: int) -> DrawnSurface | N
 
 
 def _draw_forces(surface: DrawnSurface, contacts: ContactTable, rows: IntArray) -> Any:
-    view = best_view(surface.nodes, contacts.force_n[rows])
+    forces, tips = contacts.force_n[rows], contacts.place_m[rows]
     largest = float(contacts.size_n[rows].max())
     scale = ARROW_SHARE * float(np.linalg.norm(np.ptp(surface.nodes, axis=0))) / max(largest, 1e-12)
-    tips = contacts.place_m[rows]
-    tails = tips - scale * contacts.force_n[rows]
-    flat = 1e3 * view.flat(np.vstack([surface.nodes, tips, tails]))
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    figure, axes = new_axes(height=body_height(low, high))
-    draw_body(axes, surface, view)
-    for i, tail, tip in zip(rows, 1e3 * view.flat(tails), 1e3 * view.flat(tips)):
-        arrow = ARROW | {"color": SERIES[int(contacts.contact[i]) % len(SERIES)]}
-        axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops=arrow, zorder=6)
+    colors = [SERIES[int(contact) % len(SERIES)] for contact in contacts.contact[rows]]
+    arrows = tuple(Arrows((tip - scale * f)[None], scale * f[None], color) for tip, f, color in zip(tips, forces, colors))
     factor, unit = words.force_unit(largest)
-    bar = nice(largest)
-    frame_body(axes, view, low, high, key=Key(1e3 * scale * bar, f"{factor * bar:g} {unit}", SERIES[0], None))
-    return figure
+    length = nice(largest)
+    key = Key(1e3 * scale * length, f"{factor * length:g} {unit}", INK, SHAFT)
+    return body_figure([[Panel(surface, arrows, INK)]], best_view(surface.nodes, forces), key)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
