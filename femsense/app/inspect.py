@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from femsense.app.inspection.recordings import inspect_cloud, inspect_image, inspect_jpeg, inspect_recording
-from femsense.app.inspection.reports import Report, collected
+from femsense.app.inspection.reports import Problems, Report, collected
 from femsense.app.inspection.results import (
     inspect_cad,
     inspect_calibration,
@@ -78,7 +78,7 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
     target = _existing(path)
     check_no_pipe([target])
     report: Report = {"path": str(target), "kind": "unknown"}
-    problems: list[str] = []
+    problems: Problems = []
     notes: list[str] = []
     with collected(problems, notes):
         kind, inspect = _kind(target)
@@ -86,8 +86,8 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
         inspect(target, report, problems)
         if robot is not None:
             _compare(target, report, robot)
-    report["problems"] = problems
-    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in problems]
+    report["problems"] = [str(problem) for problem in problems]
+    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in report["problems"]]
     checked: Report = plain(report)
     return checked
 
@@ -210,7 +210,7 @@ def _existing(path: str | Path) -> Path:
     )
 
 
-Inspector = Callable[[Path, Report, list[str]], None]
+Inspector = Callable[[Path, Report, Problems], None]
 
 
 def _kind(path: Path) -> tuple[str, Inspector]:

@@ -50,7 +50,11 @@ def _draw_robot(axes: Any, before: Run, after: Run, truth: Sequence[TrueContact]
     number = _strongest_frame(after, truth)
     k = next((i for i, frame in enumerate(after.frames) if frame.frame == number), 0)
     surface = skin(np.asarray(after.states.nodes_m[k], dtype=np.float64), after.states.tets)
-    groups = [(truth, "true", INK), (before.contacts, "declared robot", BEFORE), (after.contacts, "improved robot", AFTER)]
+    groups: list[tuple[Sequence[Any], str, str]] = [
+        (truth, "true", INK),
+        (before.contacts, "declared robot", BEFORE),
+        (after.contacts, "improved robot", AFTER),
+    ]
     forces = [[(c.position_m, c.force_n_xyz) for c in contacts if c.frame == number] for contacts, *_ in groups]
     size = max((float(np.linalg.norm(force)) for group in forces for _, force in group), default=1.0)
     scale = ARROW_SHARE * float(np.ptp(surface.nodes, axis=0).max()) / max(size, 1e-12)

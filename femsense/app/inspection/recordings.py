@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.app.inspection.reports import Report, attempt
+from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
@@ -26,13 +26,13 @@ CLOUDS_READ = 8
 """So many clouds of a recording are read whole; of the others only the name and the size are checked."""
 
 
-def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_recording(path: Path, report: Report, problems: Problems) -> None:
     """Report frames, markers, clouds and inputs of a recording."""
     folder = path if path.is_dir() else path.parent
     toml = folder / "recording.toml"
     if toml.is_file():
         found = recording_problems(read_toml(toml), toml)
-        problems += [str(problem) for problem in found]
+        problems += found
         if found:
             return
     loaded = load_recording(folder)
@@ -46,7 +46,7 @@ def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
     _warn_of_unmatched(loaded, folder)
 
 
-def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_cloud(file: Path, report: Report, problems: Problems) -> None:
     """Report points and colours of a cloud."""
     from femsense.io.clouds.cloud_files import read_cloud, viewpoint_doubt
 
@@ -72,7 +72,7 @@ def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
         )
 
 
-def inspect_image(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_image(file: Path, report: Report, problems: Problems) -> None:
     """Report size and content of a PNG image."""
     image = read_png(file)
     depth = image.ndim == 2 and image.dtype == np.uint16
@@ -93,7 +93,7 @@ def inspect_image(file: Path, report: Report, problems: list[str]) -> None:
             problems.append(f"{file}: no pixel has a depth")
 
 
-def inspect_jpeg(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_jpeg(file: Path, report: Report, problems: Problems) -> None:
     """Report size of a JPEG image."""
     image = read_color(file)
     report.update({"width": image.shape[1], "height": image.shape[0], "channels": 3, "bits": 8, "content": "colour"})
@@ -173,7 +173,7 @@ def _load_report(r: Recording) -> Report | None:
     }
 
 
-def _check_clouds(r: Recording, report: Report, problems: list[str]) -> None:
+def _check_clouds(r: Recording, report: Report, problems: Problems) -> None:
     """Read some clouds whole; say which files are empty and what extent the read ones have."""
     frames = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
     if not frames:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.app.inspection.reports import Report, attempt, read_object
+from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import Cable, Chamber
@@ -18,6 +18,7 @@ from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, trian
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.mesh_files import closed_surface, ordered_tets, radius_ratio, read_tets, read_triangles
 from femsense.io.meshes.reading import read_content
+from femsense.io.result_folder import read_object
 from femsense.io.robot_body import read_declared_mesh
 from femsense.io.robot_tables import RobotTable, robot_problems
 from femsense.io.robot_toml import load_robot
@@ -30,13 +31,13 @@ POOR_QUALITY = 0.05
 """A radius ratio below this is worth a warning."""
 
 
-def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_robot(path: Path, report: Report, problems: Problems) -> None:
     """Report what robot.toml declares."""
     file = path / "robot.toml" if path.is_dir() else path
     document = read_toml(file)
     report["name"] = str(document.get("name", ""))
     found = robot_problems(document, file)
-    problems += [str(problem) for problem in found]
+    problems += found
     if found:
         return
     loaded = attempt(lambda: load_robot(path, effects=False), problems)
@@ -85,7 +86,7 @@ def guessed_tables(text: str) -> list[str]:
     return found
 
 
-def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_mesh(file: Path, report: Report, problems: Problems) -> None:
     """Report cells, size and quality of a mesh."""
     content = read_content(file, str(file))
     points, cells = content.points, content.cells
@@ -102,14 +103,14 @@ def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
     _warn_of_quality(report["radius_ratio_min"], file.name)
 
 
-def inspect_surface(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_surface(file: Path, report: Report, problems: Problems) -> None:
     """Report size and gaps of a surface."""
     points, triangles = read_triangles(file)
     _surface_report(points, triangles, report)
     attempt(lambda: closed_surface(points, triangles, str(file)), problems)
 
 
-def inspect_scene(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_scene(file: Path, report: Report, problems: Problems) -> None:
     """A .glb is what `femsense export` writes; its header is checked, its content is for viewers."""
     with file.open("rb") as stream:
         head = stream.read(12)
@@ -121,7 +122,7 @@ def inspect_scene(file: Path, report: Report, problems: list[str]) -> None:
     announced = int.from_bytes(head[8:12], "little")
     if head[:4] != b"glTF" or announced != report["bytes"]:
         found = f"{announced} bytes announced, {report['bytes']} there" if head[:4] == b"glTF" else repr(head[:4])
-        problems.append(str(InputError("not a whole .glb file", where=file, found=found, expected="glTF and its length")))
+        problems.append(InputError("not a whole .glb file", where=file, found=found, expected="glTF and its length"))
 
 
 def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:

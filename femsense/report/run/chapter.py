@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from femsense.io.result_folder import read_document
+from femsense.io.tables import validated
 from femsense.report import words
 from femsense.report.compare import load_error
-from femsense.report.documents import read_document
 from femsense.report.page import Chapter, render
 from femsense.report.run.document import RunFacts
 from femsense.report.run.forces import ROWS, ListedContacts, force_pictures, force_text, listed_contacts
@@ -35,7 +36,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
     Raises:
         InputError: one of them is broken.
     """
-    facts = read_document(file, RunFacts, RUN_FORMAT)
+    facts = validated(RunFacts, read_document(file, RUN_FORMAT), file)
     folder = file.parent
     contacts = read_contacts(folder / "contacts.csv") if (folder / "contacts.csv").is_file() else None
     frames = read_frames(folder / "frames.csv") if (folder / "frames.csv").is_file() else None

@@ -1,10 +1,27 @@
-"""What run.json and demo.json hold, as far as a report shows it."""
+"""What run.json and demo.json hold, as far as a report shows it.
+
+What is missing is left out; a wrong type is an InputError.
+"""
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from femsense.report.documents import Document, Input, Number
+from femsense.io.tables import Schema
+
+Number = float | None
+
+
+class Document(Schema):
+    """Other keys than those named are left alone; null and NaN stand for what is not known."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, frozen=True, allow_inf_nan=True)
+
+
+class Input(Document):
+    name: str | None = None
+    path: str | None = None
+    sha256: str | None = None
 
 
 class KnownLoad(Document):
