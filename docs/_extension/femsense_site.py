@@ -17,7 +17,7 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from femsense.app.cli import EXAMPLES, app
+from femsense.app.cli import COMMANDS, app
 
 FIELDS: dict[str, list[str]] = {}
 """Qualified name of a field → its text."""
@@ -73,7 +73,7 @@ def command_page(name: str, command: Any) -> Iterator[str]:
     yield "| argument, option | meaning |\n|---|---|"
     for parameter in command.params:
         yield f"| {_name(parameter)} | {_cell(parameter.help)}{_default(parameter)} |"
-    yield f"\nExample:\n\n```sh\n{EXAMPLES[name]}\n```"
+    yield f"\nExample:\n\n```sh\n{COMMANDS[name][1]}\n```"
     yield ""
 
 

@@ -197,6 +197,11 @@ def loop_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Pat
     page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
     if page.is_file() and page.stat().st_mtime_ns >= loop.stat().st_mtime_ns:
         return page
+    return written_page(folder, say=say, write=write)
+
+
+def written_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Path] | None = None) -> Path | None:
+    """Write report.html of a folder of results and return it; None where this installation cannot. Arguments as of `loop_page`."""
     try:
         from femsense.report import write_report
 

@@ -15,7 +15,7 @@ from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.formats import FORMATS, format_of
 from femsense.io.importers.guess import open_sources, split_name
-from femsense.io.importers.options import UNITS, Options
+from femsense.io.importers.options import UNITS, InputOptions, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import header_of
 from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
@@ -33,12 +33,9 @@ def import_into(
     folder: str | Path,
     paths: Sequence[str | Path],
     options: Options,
+    driven: InputOptions,
     *,
     say: Say,
-    inputs: str | None = None,
-    zero: str | None = None,
-    actuation: str | Path | None = None,
-    offset: float | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -48,11 +45,8 @@ def import_into(
         folder: of the recording.
         paths: the captures, one a camera; NAME=PATH names it.
         options: what a person says about it.
-        say: told in one line what happens beside.
-        inputs: what cables' values are, "tension" or "displacement", where the capture does not say.
-        zero: "absolute" or "unknown".
-        actuation: a CSV file with the inputs over time.
-        offset: the frames' time minus that file's [s]; None finds it from the motion.
+        driven: what a person says about the inputs.
+        say: called with one line about what is happening.
         again: import anew although the recording is there.
         progress: called with (frames done, frames in all).
 
@@ -64,21 +58,21 @@ def import_into(
     check_target(folder, folder=True)
     final = followed(folder)
     _check_apart(paths, final)
-    identity = _identity(paths, options, inputs, zero, actuation, offset)
+    identity = _identity(paths, options, driven)
     known = _standing(final, identity, again)
     if known is not None:
         say(f"{final} holds this import already (--again makes it anew)")
         return known
-    log = None if actuation is None else read_actuation_log(actuation, options)
-    source = open_sources(paths, options if actuation is None else _without_log(options, Path(actuation), paths))
+    log = None if driven.actuation is None else read_actuation_log(driven.actuation, options)
+    source = open_sources(paths, options if driven.actuation is None else _without_log(options, driven.actuation, paths))
     found = write_recording(
         source,
         final,
         identity=identity,
-        actuation=inputs,
-        zero=zero,
+        actuation=driven.inputs,
+        zero=driven.zero,
         log=log,
-        offset=offset,
+        offset=driven.offset,
         replace=again,
         progress=progress,
     )
@@ -174,23 +168,14 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
     return replace(options, columns=columns, log_names=tuple(of_log))
 
 
-def _identity(
-    paths: Sequence[str | Path],
-    options: Options,
-    inputs: str | None,
-    zero: str | None,
-    actuation: str | Path | None,
-    offset: float | None,
-) -> dict[str, Any]:
+def _identity(paths: Sequence[str | Path], options: Options, driven: InputOptions) -> dict[str, Any]:
     """Return what an import is made from: another file, another time of its change or another option is another import."""
     states = [_state(split_name(path)[1]) for path in paths]
     return {
         "source": states[0] if len(states) == 1 else [*states, list(map(str, paths))],
         "options": asdict(options),
-        "inputs": inputs,
-        "zero": zero,
-        "actuation": None if actuation is None else _state(Path(actuation)),
-        "offset": offset,
+        **asdict(driven),
+        "actuation": None if driven.actuation is None else _state(driven.actuation),
         "femsense": femsense.__version__,
     }
 

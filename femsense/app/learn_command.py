@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from femsense.app.command_line.parameters import three_numbers
+from femsense.app.learn_options import LearnFiles, Pair
 from femsense.core.errors import InputError
 from femsense.io.files import check_target
 from femsense.io.own_files import MODEL
@@ -16,41 +16,10 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.labelled import Labelled
     from femsense.xr.proprioception.model import ProprioceptiveModel
 
-Pair = tuple[Path, Path]
 HELD = 0.9
 """Share of the positions of another recording that lie within their 95 % intervals, from which on these hold."""
 POOR = 0.5
 """A held-out error above this share of how the markers move says that the sensors say little of them."""
-
-
-@dataclass(frozen=True, slots=True)
-class LearnFiles:
-    """What is learnt from."""
-
-    pairs: tuple[Pair, ...]
-    """SENSORS.csv and MARKERS.csv of each recording."""
-    test: Pair | None = None
-    """Two more files, of another recording: the error is stated on them, that of a corrected model too."""
-    adapt: Path | None = None
-    """A model to correct by the first two, instead of learning anew; it keeps its bones."""
-    calibration: Path | None = None
-    in_robot_frame: bool = False
-    """Both as in `read_labelled`."""
-
-    @property
-    def all(self) -> list[Path]:
-        """Every file that is read."""
-        more = [file for file in (self.adapt, self.calibration) if file is not None]
-        return [*(file for pair in self.pairs for file in pair), *(self.test or ()), *more]
-
-    def read(self) -> tuple[Labelled, Labelled | None]:
-        """Return the recordings as one, and that of the test. Raises InputError."""
-        from femsense.xr.proprioception.files import read_labelled
-        from femsense.xr.proprioception.labelled import joined
-
-        read = partial(read_labelled, calibration=self.calibration, in_robot_frame=self.in_robot_frame)
-        data = joined([read(*pair) for pair in self.pairs]) if len(self.pairs) > 1 else read(*self.pairs[0])
-        return data, None if self.test is None else read(*self.test)
 
 
 def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
@@ -255,10 +224,7 @@ def _correction_text(by: str) -> str:
 
 
 def _normal(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError("not a direction", where="--plane", found=text, expected="X,Y,Z") from None
-    return x, y, z
+    normal = None if text is None else three_numbers(text)
+    if text is not None and normal is None:
+        raise InputError("not a direction", where="--plane", found=text, expected="X,Y,Z")
+    return normal

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from femsense.app.command_line.parameters import Actuation, Zero
 from femsense.core.options import Flag
+from femsense.io.importers.options import Inputs, Zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +29,8 @@ class LiveOptions:
         bool, Flag("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
     ] = False
     delay_s: Annotated[float, Flag("--delay", "SECONDS", "From an input to its effect.", min=0.0)] = 0.0
-    inputs: Annotated[Actuation, Flag("--inputs", help="What the inputs of cables are; a recording says it itself.")] = (
-        Actuation.tension
+    inputs: Annotated[Inputs, Flag("--inputs", help="What the inputs of cables are; a recording says it itself.")] = (
+        Inputs.tension
     )
     zero: Annotated[Zero, Flag("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute
     contact_free: Annotated[int, Flag("--contact-free", "N", "Contact-free frames first, with -c and after a zero.", min=0)] = 8

@@ -27,6 +27,7 @@ from femsense.many.limits import available_cores, memory_share
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import AGAIN
 from femsense.many.summary import check_no_result, check_summary_folder, read_summary, write_summary
+from femsense.report.words import duration
 
 Say = Callable[[str], None]
 Run = Callable[..., Outcome]
@@ -274,13 +275,6 @@ def progress_text(now: Progress) -> str:
     parts += [f"{duration(now.seconds_left)} left"] if now.seconds_left is not None and now.finished < now.total else []
     parts += [f"slowest {now.slowest.name} {duration(now.slowest.seconds)}"] if now.slowest is not None else []
     return ", ".join(parts)
-
-
-def duration(seconds: float) -> str:
-    """Return a time in words."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 # What is said

@@ -141,7 +141,7 @@ def test_each_command_has_help_and_json(run: Any, name: str) -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_each_help_ends_with_an_example_of_options_that_exist(run: Any, name: str) -> None:
     said = run(name, "--help").out
-    example = cli.EXAMPLES[name]
+    example = cli.COMMANDS[name][1]
     assert said.splitlines()[-1].strip() == example
     assert example.startswith(f"femsense {name}")
     assert not [word for word in example.split() if word.startswith("-") and f"{word} " not in said and f"{word}," not in said]

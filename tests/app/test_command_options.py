@@ -74,7 +74,7 @@ def test_what_an_options_type_does_not_take_is_refused(words: list[str], said: s
 
 @pytest.mark.parametrize(("name", "type_"), [("estimate", SensingOptions), ("improve", ImproveOptions)])
 def test_a_default_of_a_command_is_that_of_the_library(name: str, type_: type[Any]) -> None:
-    of_command = {p.name: p.default for p in inspect.signature(COMMANDS[name]).parameters.values()}
+    of_command = {p.name: p.default for p in inspect.signature(COMMANDS[name][0]).parameters.values()}
     of_library = {f.name: f.default for f in fields(type_) if f.default is not MISSING and f.name in of_command}
     shown = {name: value.value if isinstance(value, Enum) else value for name, value in of_command.items() if name in of_library}
     assert shown == {name: None if value == () else value for name, value in of_library.items()} and len(shown) > 1

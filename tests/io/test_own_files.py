@@ -13,7 +13,8 @@ from helpers import changed, write_block_robot
 from small_run import write_run_with_a_cloud
 
 from femsense.app.commands import script_plan
-from femsense.app.learn_command import LearnFiles, learn_into
+from femsense.app.learn_command import learn_into
+from femsense.app.learn_options import LearnFiles
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_text, write_toml
 from femsense.io.own_files import GLB, MODEL, RUN, SCRIPT, VIEW, check_files, check_replaceable

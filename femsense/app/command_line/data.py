@@ -9,9 +9,9 @@ import typer
 
 from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Actuation, RobotPath, Zero, argument, missing, option
+from femsense.app.command_line.parameters import RobotPath, argument, missing, option
 from femsense.app.command_line.several import Several
-from femsense.io.importers.options import Options
+from femsense.io.importers.options import InputOptions, Options
 from femsense.io.meshing.options import MeshOptions
 
 
@@ -23,28 +23,14 @@ def import_(
     ],
     output: Annotated[Path, option("-o --output", "RECORDING", "The folder to write.")],
     options: Options,
-    inputs: Annotated[Actuation | None, option("--inputs", help="What the cables' values are.")] = None,
-    zero: Annotated[Zero | None, option("--zero", help="What they count from.")] = None,
-    actuation: Annotated[Path | None, option("--actuation", "FILE", "A CSV file with the inputs over time.")] = None,
-    offset: Annotated[float | None, option("--offset", "S", "The frames' time minus that file's; else from motion.")] = None,
+    driven: InputOptions,
     again: Annotated[bool, option("--again", help="Import even where RECORDING holds an import.")] = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
     from femsense.app.import_command import import_into, import_text
 
     with progress_bar("import") as progress:
-        document = import_into(
-            output,
-            source,
-            options,
-            say=say,
-            inputs=inputs,
-            zero=zero,
-            actuation=actuation,
-            offset=offset,
-            again=again,
-            progress=progress,
-        )
+        document = import_into(output, source, options, driven, say=say, again=again, progress=progress)
     text = f"{import_text(output, document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
     return Answer({"recording": str(output), **document}, text)
 

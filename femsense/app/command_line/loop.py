@@ -10,9 +10,10 @@ import typer
 
 from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Actuation, RobotPath, argument, filled, missing, option, split_names
+from femsense.app.command_line.parameters import RobotPath, argument, filled, missing, option, split_names
 from femsense.app.command_line.several import Dask, Memory, Several, spread_over
 from femsense.core.errors import InputError
+from femsense.io.importers.options import Inputs
 
 
 @command(Several.TOGETHER)
@@ -62,7 +63,7 @@ def improve(
     given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: what is recorded already.")] = None,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
     frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
-    actuation: Annotated[Actuation, option("--actuation", help="With --plan: what drives the cables.")] = Actuation.tension,
+    actuation: Annotated[Inputs, option("--actuation", help="With --plan: what drives the cables.")] = Inputs.tension,
     dask: Dask = None,
     memory: Memory = None,
 ) -> Answer:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     OptionsType = TypeVar("OptionsType", bound=DataclassInstance)
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
+FREE = ("", "*")
+"""A coordinate that is written so is left free."""
 
 
 def option(flags: str, metavar: str | None = None, help: str = "", **limits: Any) -> Any:
@@ -45,20 +47,6 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
 
 RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
 Recordings = Annotated[list[Path], argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")]
-
-
-class Actuation(StrEnum):
-    """What the inputs of cables are."""
-
-    tension = "tension"
-    displacement = "displacement"
-
-
-class Zero(StrEnum):
-    """Whether the zero of inputs is known."""
-
-    absolute = "absolute"
-    unknown = "unknown"
 
 
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
@@ -100,18 +88,29 @@ def missing(context: typer.Context, name: str) -> TyperException:
     return error
 
 
-def places(texts: Sequence[str]) -> list[list[float]] | None:
+def three_numbers(text: str, *, free: bool = False) -> tuple[float, float, float] | None:
+    """Return the numbers of X,Y,Z; None where the text is another one.
+
+    Arguments:
+        text: of the command line.
+        free: an empty number, or "*", is left free: NaN.
+    """
+    try:
+        x, y, z = (math.nan if free and part.strip() in FREE else float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return (x, y, z) if free or all(map(math.isfinite, (x, y, z))) else None
+
+
+def places(texts: Sequence[str]) -> list[tuple[float, float, float]] | None:
     """Return places given as x,y,z [m]; None where none is given. Raises typer.BadParameter."""
-    places = []
+    found = []
     for text in texts:
-        try:
-            place = [float(part) for part in text.split(",")]
-        except ValueError:
-            place = []
-        if len(place) != 3:
+        place = three_numbers(text)
+        if place is None:
             raise typer.BadParameter(f"{text!r} is not a place: three numbers in metres are, such as --at 0.1,0,0.015")
-        places.append(place)
-    return places or None
+        found.append(place)
+    return found or None
 
 
 def split_names(texts: Sequence[str] | None) -> list[str] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 from femsense.core.errors import InputError
@@ -28,6 +29,32 @@ class Clock(StrEnum):
     auto = "auto"
     header = "header"
     record = "record"
+
+
+class Inputs(StrEnum):
+    """What the cables' values are."""
+
+    tension = "tension"
+    displacement = "displacement"
+
+
+class Zero(StrEnum):
+    """Whether the zero of the inputs is known."""
+
+    absolute = "absolute"
+    unknown = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class InputOptions:
+    """What a person says about the inputs of a recording."""
+
+    inputs: Annotated[Inputs | None, Flag("--inputs", help="What the cables' values are.")] = None
+    """None: as the source says."""
+    zero: Annotated[Zero | None, Flag("--zero", help="What they count from.")] = None
+    actuation: Annotated[Path | None, Flag("--actuation", "FILE", "A CSV file with the inputs over time.")] = None
+    offset: Annotated[float | None, Flag("--offset", "S", "The frames' time minus that file's; else from motion.")] = None
+    """None: found from the motion."""
 
 
 def columns_named(columns: Sequence[str]) -> dict[str, str]:
