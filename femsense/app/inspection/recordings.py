@@ -22,6 +22,7 @@ from femsense.io.tables import read_toml
 from femsense.model.plausibility import doubts_of_cloud_places, doubts_of_recording, warn_of
 from femsense.model.recording import Recording
 
+JPEG = (".jpg", ".jpeg")
 CLOUDS_READ = 8
 """So many clouds of a recording are read whole; of the others only the name and the size are checked."""
 
@@ -73,30 +74,21 @@ def inspect_cloud(file: Path, report: Report, problems: Problems) -> None:
 
 
 def inspect_image(file: Path, report: Report, problems: Problems) -> None:
-    """Report size and content of a PNG image."""
-    image = read_png(file)
+    """Report size and content of a PNG or JPEG image."""
+    jpeg = file.suffix.lower() in JPEG
+    image = read_color(file) if jpeg else read_png(file)
     depth = image.ndim == 2 and image.dtype == np.uint16
     channels = 1 if image.ndim == 2 else image.shape[2]
-    report.update({"width": image.shape[1], "height": image.shape[0], "channels": channels, "bits": 8 * image.dtype.itemsize})
+    bits = 8 if jpeg else 8 * image.dtype.itemsize
+    report.update({"width": image.shape[1], "height": image.shape[0], "channels": channels, "bits": bits})
     report["content"] = "depth" if depth else "colour" if channels >= 3 else "grey"
     if depth:
         valid = image[image > 0]
-        report.update(
-            {
-                "valid_share": float((image > 0).mean()),
-                "depth_min": int(valid.min()) if valid.size else None,
-                "depth_median": float(np.median(valid)) if valid.size else None,
-                "depth_max": int(valid.max()) if valid.size else None,
-            }
-        )
+        depths = {"min": int(valid.min()), "median": float(np.median(valid)), "max": int(valid.max())} if valid.size else {}
+        report["valid_share"] = float((image > 0).mean())
+        report |= {f"depth_{name}": depths.get(name) for name in ("min", "median", "max")}
         if not valid.size:
             problems.append(f"{file}: no pixel has a depth")
-
-
-def inspect_jpeg(file: Path, report: Report, problems: Problems) -> None:
-    """Report size of a JPEG image."""
-    image = read_color(file)
-    report.update({"width": image.shape[1], "height": image.shape[0], "channels": 3, "bits": 8, "content": "colour"})
 
 
 def _recording_report(r: Recording) -> Report:

@@ -130,8 +130,35 @@ def inspect_capture(path: Path, report: Report, problems: Problems) -> None:
         report.update({**found, "next": "femsense import reads its frames and makes a recording of it"})
 
 
-def inspect_folder(folder: Path, report: Report, problems: Problems) -> None:
-    """Report a folder by what it holds."""
+def inspect_cad(file: Path, report: Report, problems: Problems) -> None:
+    """Report what the text of a CAD file says; its shapes are not read."""
+    data = file.read_bytes()
+    report["bytes"] = len(data)
+    if file.suffix.lower() not in (".step", ".stp"):
+        return
+    report["solids"] = data.count(b"MANIFOLD_SOLID_BREP(") + data.count(b"BREP_WITH_VOIDS(")
+    if b"ISO-10303-21" not in data[:1000]:
+        problems.append(InputError("no STEP file", where=file, found=f"begins {data[:12]!r}", expected="ISO-10303-21"))
+
+
+def inspect_unknown(path: Path, report: Report, problems: Problems) -> None:
+    """Report a file of no known kind, or a folder by what it holds."""
+    if path.is_dir():
+        _inspect_folder(path, report, problems)
+        return
+    report["bytes"] = path.stat().st_size
+    problems.append(
+        InputError(
+            "not a kind of file that femsense knows",
+            where=path,
+            found=path.suffix or "no ending",
+            expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
+            hint=export_hint(path),
+        )
+    )
+
+
+def _inspect_folder(folder: Path, report: Report, problems: Problems) -> None:
     from femsense.io.importers.guess import guess_format
 
     if guess_format(folder) is not None:
@@ -147,31 +174,6 @@ def inspect_folder(folder: Path, report: Report, problems: Problems) -> None:
             found=", ".join(f"{n} {e}" for e, n in endings.items()) or "no files",
             expected="robot.toml, recording.toml, run.json or loop.json",
             hint="femsense import makes a recording of folders of clouds or images",
-        )
-    )
-
-
-def inspect_cad(file: Path, report: Report, problems: Problems) -> None:
-    """Report what the text of a CAD file says; its shapes are not read."""
-    data = file.read_bytes()
-    report["bytes"] = len(data)
-    if file.suffix.lower() not in (".step", ".stp"):
-        return
-    report["solids"] = data.count(b"MANIFOLD_SOLID_BREP(") + data.count(b"BREP_WITH_VOIDS(")
-    if b"ISO-10303-21" not in data[:1000]:
-        problems.append(InputError("no STEP file", where=file, found=f"begins {data[:12]!r}", expected="ISO-10303-21"))
-
-
-def inspect_unknown(file: Path, report: Report, problems: Problems) -> None:
-    """Report a file of no known kind."""
-    report["bytes"] = file.stat().st_size
-    problems.append(
-        InputError(
-            "not a kind of file that femsense knows",
-            where=file,
-            found=file.suffix or "no ending",
-            expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
-            hint=export_hint(file),
         )
     )
 
