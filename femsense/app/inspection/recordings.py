@@ -12,6 +12,7 @@ import numpy as np
 
 from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
 from femsense.io.clouds.images import read_color, read_png
@@ -58,19 +59,12 @@ def inspect_cloud(file: Path, report: Report, problems: Problems) -> None:
     if not len(cloud):
         problems.append(f"{file}: the cloud has no points")
         return
-    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-    report.update(
-        {
-            "low_mm": 1e3 * low,
-            "high_mm": 1e3 * high,
-            "median_distance_mm": 1e3 * float(np.median(np.linalg.norm(cloud.points, axis=1))),
-        }
-    )
-    if np.abs(cloud.points).max() > TOO_FAR:
-        problems.append(
-            f"{file}: coordinates of this size look like millimetres\n  found:    up to "
-            f"{np.abs(cloud.points).max():.4g}\n  expected: metres"
-        )
+    report |= {"low_mm": 1e3 * cloud.points.min(axis=0), "high_mm": 1e3 * cloud.points.max(axis=0)}
+    report["median_distance_mm"] = 1e3 * float(np.median(np.linalg.norm(cloud.points, axis=1)))
+    largest = float(np.abs(cloud.points).max())
+    if largest > TOO_FAR:
+        text = "coordinates of this size look like millimetres"
+        problems.append(InputError(text, where=file, found=f"up to {largest:.4g}", expected="metres"))
 
 
 def inspect_image(file: Path, report: Report, problems: Problems) -> None:
@@ -192,14 +186,8 @@ def _warn_of_gaps(r: Recording, steps: FloatArray) -> None:
         return
     gaps = np.flatnonzero(steps > 5.0 * np.median(steps))
     if len(gaps):
-        k = int(gaps[0])
-        warnings.warn(
-            (
-                f"{len(gaps)} gaps in time of more than five frames, the first of {steps[k]:.3g} s before frame "
-                f"{r.frame_numbers[k + 1]}"
-            ),
-            stacklevel=2,
-        )
+        first = f"{steps[gaps[0]]:.3g} s before frame {r.frame_numbers[gaps[0] + 1]}"
+        warnings.warn(f"{len(gaps)} gaps in time of more than five frames, the first of {first}", stacklevel=2)
 
 
 def _warn_of_unmatched(r: Recording, folder: Path) -> None:
@@ -207,16 +195,11 @@ def _warn_of_unmatched(r: Recording, folder: Path) -> None:
     numbers = set(r.frame_numbers.tolist())
     for kind, endings in FOLDERS.items():
         for name in r.camera_names:
-            outliers = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
+            place = folder / kind / name
+            outliers = sorted(set(numbered_files(place, endings)) - numbers)
             if outliers:
-                warnings.warn(
-                    (
-                        f"{folder / kind / name}: {len(outliers)} files whose number is not in frames.csv, the first is "
-                        f"{outliers[0]}"
-                    ),
-                    stacklevel=2,
-                )
+                text = f"{len(outliers)} files whose number is not in frames.csv, the first is {outliers[0]}"
+                warnings.warn(f"{place}: {text}", stacklevel=2)
     if any((folder / "clouds").glob("*/*.p[lc][yd]")) and r.camera_names == ("",):
-        warnings.warn(
-            f"{folder / 'clouds'}: folders of clouds, but recording.toml has no [cameras.NAME]: they are not used", stacklevel=2
-        )
+        text = "folders of clouds, but recording.toml has no [cameras.NAME]: they are not used"
+        warnings.warn(f"{folder / 'clouds'}: {text}", stacklevel=2)

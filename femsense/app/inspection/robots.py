@@ -54,24 +54,22 @@ def inspect_robot(path: Path, report: Report, problems: Problems) -> None:
 
 def _warn_of_gaps(robot: Robot, file: Path) -> None:
     """Warn of what a robot needs before it can be calibrated, and of values that `femsense mesh` guessed and nobody has confirmed."""
+    texts = []
     guessed = guessed_tables(file.read_text(encoding="utf-8-sig"))
     if guessed:
-        warnings.warn(
-            f"{file.name}: still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word",
-            stacklevel=3,
-        )
+        texts.append(f"still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word")
     if not robot.body.cables and not robot.body.chambers:
-        warnings.warn(
-            f"{file.name}: neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it "
-            "at rest alone, and improve has no inputs to compare with",
-            stacklevel=3,
+        texts.append(
+            "neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it at rest alone, "
+            "and improve has no inputs to compare with"
         )
     if not robot.marker_names:
-        warnings.warn(
-            f"{file.name}: no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
-            "(femsense docs calibration), and there are no forces without clouds",
-            stacklevel=3,
+        texts.append(
+            "no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
+            "(femsense docs calibration), and there are no forces without clouds"
         )
+    for text in texts:
+        warnings.warn(f"{file.name}: {text}", stacklevel=3)
 
 
 def guessed_tables(text: str) -> list[str]:
@@ -198,32 +196,17 @@ def _mesh_report(mesh: TetMesh, to_mm: float) -> Report:
 
 def _warn_of_quality(worst: float, name: str) -> None:
     if worst < POOR_QUALITY:
-        warnings.warn(
-            (
-                f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): a sliver makes the model stiff "
-                f"and the solver slow"
-            ),
-            stacklevel=2,
-        )
+        text = "a sliver makes the model stiff and the solver slow"
+        warnings.warn(f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): {text}", stacklevel=2)
 
 
 def _without_unit(report: Report) -> Report:
     """Rename lengths of a file whose unit is not known."""
-    names = {"low_mm": "low", "high_mm": "high", "size_mm": "size"}
-    return {"lengths": "in the unit of the file"} | {
-        names.get(key, key): value for key, value in report.items() if key != "volume_cm3"
-    }
+    own = {key.removesuffix("_mm"): value for key, value in report.items() if key != "volume_cm3"}
+    return {"lengths": "in the unit of the file"} | own
 
 
 def _surface_report(points: FloatArray, triangles: Any, report: Report) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
-    report.update(
-        {
-            "lengths": "in the unit of the file",
-            "points": len(points),
-            "triangles": len(triangles),
-            "low": low,
-            "high": high,
-            "size": high - low,
-        }
-    )
+    report |= {"lengths": "in the unit of the file", "points": len(points), "triangles": len(triangles)}
+    report |= {"low": low, "high": high, "size": high - low}
