@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -53,13 +54,21 @@ FEW_KERNELS = 50
 """Functions: an installation brings 59, and the tiny solve alone leaves 31."""
 
 
+class Level(StrEnum):
+    """How serious a finding is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    """Something is slower, or missing and not always needed."""
+    ERROR = "error"
+
+
 @dataclass(frozen=True, slots=True)
 class Check:
     """One finding."""
 
     name: str
-    level: str
-    """"ok", "warning" (something is slower or missing that is not always needed) or "error"."""
+    level: Level
     found: str
     hint: str | None = None
     """What to do."""
@@ -72,7 +81,7 @@ def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
         packages: modules that have to be there, and what pip calls them.
 
     Returns:
-        `ok` (no check has level "error") and `checks`, each `{name, level, found, hint}`.
+        `ok` (no check has level Level.ERROR) and `checks`, each `{name, level, found, hint}`.
     """
     checks = [_python(), *(_package(module, package) for module, package in packages.items())]
     parts: tuple[Callable[[], Check], ...] = (
@@ -87,19 +96,19 @@ def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
         _machine,
     )
     checks += [_guarded(part) for part in parts]
-    return {"ok": all(check.level != "error" for check in checks), "checks": [asdict(check) for check in checks]}
+    return {"ok": all(check.level is not Level.ERROR for check in checks), "checks": [asdict(check) for check in checks]}
 
 
 def doctor_text(document: dict[str, Any]) -> str:
     """Return what `diagnose` found as a table."""
-    marks = {"ok": "ok", "warning": "note", "error": "BAD"}
+    marks = {Level.OK: "ok", Level.WARNING: "note", Level.ERROR: "BAD"}
     width = max(len(check["name"]) for check in document["checks"])
     lines = []
     for check in document["checks"]:
         lines.append(f"{marks[check['level']]:<4}  {check['name']:<{width}}  {check['found']}")
         if check["hint"]:
             lines.append(f"{'':<{width + 8}}→ {check['hint']}")
-    bad = sum(check["level"] == "error" for check in document["checks"])
+    bad = sum(check["level"] == Level.ERROR for check in document["checks"])
     lines += ["", "everything that is needed works" if not bad else f"{bad} checks failed: femsense will not work fully"]
     return "\n".join(lines)
 
@@ -111,7 +120,7 @@ def _guarded(part: Callable[[], Check]) -> Check:
     except Exception as error:  # a broken installation may fail in any way
         return Check(
             part.__name__.strip("_").replace("_", " "),
-            "error",
+            Level.ERROR,
             _short(error),
             "reinstall: pip install --force-reinstall femsense",
         )
@@ -120,15 +129,15 @@ def _guarded(part: Callable[[], Check]) -> Check:
 def _python() -> Check:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     good = (3, 11) <= sys.version_info[:2] <= (3, 12)
-    return Check("python", "ok" if good else "error", found, None if good else "femsense runs on Python 3.11 and 3.12")
+    return Check("python", Level.OK if good else Level.ERROR, found, None if good else "femsense runs on Python 3.11 and 3.12")
 
 
 def _package(module: str, package: str) -> Check:
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # OSError and ImportError, and what a broken binary raises
-        return Check(module, "error", _short(error), import_hint(str(error), package))
-    return Check(module, "ok", _version(package) or str(getattr(loaded, "__version__", "version not known")))
+        return Check(module, Level.ERROR, _short(error), import_hint(str(error), package))
+    return Check(module, Level.OK, _version(package) or str(getattr(loaded, "__version__", "version not known")))
 
 
 def import_hint(message: str, package: str) -> str:
@@ -143,42 +152,40 @@ def import_hint(message: str, package: str) -> str:
 def _tetrahedra() -> Check:
     """pytetwild runs in a process of its own and is not loaded here."""
     if importlib.util.find_spec("pytetwild") is None:
-        return Check("pytetwild", "warning", "not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
-    return Check("pytetwild", "ok", _version("pytetwild") or "version not known")
+        return Check("pytetwild", Level.WARNING, "not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
+    return Check("pytetwild", Level.OK, _version("pytetwild") or "version not known")
 
 
 def _libraries() -> Check:
+    name = "system libraries"
     if not sys.platform.startswith("linux"):
-        return Check("system libraries", "ok", "only checked on Linux")
-    missing = [name for name in LIBRARIES if not _loads(name)]
+        return Check(name, Level.OK, "only checked on Linux")
+    missing = {library: package for library, package in LIBRARIES.items() if not _loads(library)}
     if not missing:
-        return Check("system libraries", "ok", "all that Open3D wants")
-    return Check(
-        "system libraries",
-        "error",
-        "missing: " + ", ".join(missing),
-        "apt-get install " + " ".join(LIBRARIES[name] for name in missing),
-    )
+        return Check(name, Level.OK, "all that Open3D wants")
+    return Check(name, Level.ERROR, "missing: " + ", ".join(missing), "apt-get install " + " ".join(missing.values()))
 
 
 def _solver() -> Check:
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
     if chosen in ("", "cholesky", "direct"):
-        return Check("linear solver", "ok", "Cholesky of femsense, with the BLAS of SciPy")
+        return Check("linear solver", Level.OK, "Cholesky of femsense, with the BLAS of SciPy")
     if chosen == "iterative":
         return Check(
             "linear solver",
-            "warning",
+            Level.WARNING,
             "conjugate gradients",
             "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time",
         )
     if chosen not in ("pardiso", "superlu"):
-        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
+        return Check(
+            "linear solver", Level.ERROR, f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu"
+        )
     from femsense.fem.linalg.factorization import pardiso_library
 
     name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
     return Check(
-        "linear solver", "warning", name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along"
+        "linear solver", Level.WARNING, name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along"
     )
 
 
@@ -187,10 +194,10 @@ def _viewer() -> Check:
 
     if (PAGE / "index.html").is_file():
         size = sum(file.stat().st_size for file in PAGE.iterdir() if file.is_file())
-        return Check("viewer page", "ok", f"{size / 1e3:.0f} kB")
+        return Check("viewer page", Level.OK, f"{size / 1e3:.0f} kB")
     return Check(
         "viewer page",
-        "warning",
+        Level.WARNING,
         "not built into this installation: femsense view will not work",
         "pip install . (in a checkout: pip install -e .)",
     )
@@ -200,7 +207,9 @@ def _robots() -> Check:
     from femsense.io.robot_toml import robot_names
 
     names = ", ".join(robot_names())
-    return Check("robots that come along", "ok" if names else "warning", names or "none", None if names else "reinstall femsense")
+    return Check(
+        "robots that come along", Level.OK if names else Level.WARNING, names or "none", None if names else "reinstall femsense"
+    )
 
 
 def _numba_cache() -> Check:
@@ -212,11 +221,11 @@ def _numba_cache() -> Check:
     if usable is None:
         return Check(
             "cache of compiled kernels",
-            "warning",
+            Level.WARNING,
             "no folder can be written: each start compiles anew",
             "set NUMBA_CACHE_DIR to a folder of your own",
         )
-    return Check("cache of compiled kernels", "ok", "can be written")
+    return Check("cache of compiled kernels", Level.OK, "can be written")
 
 
 def _kernels() -> Check:
@@ -227,11 +236,11 @@ def _kernels() -> Check:
     found = [_kernel_version(file) for file in (Path(chosen) if chosen else package).rglob("*.nbi")]
     mine = found.count(_version("numba"))
     if mine >= FEW_KERNELS:
-        return Check("compiled kernels", "ok", f"{mine} functions are compiled")
+        return Check("compiled kernels", Level.OK, f"{mine} functions are compiled")
     other = f", and {len(found) - mine} by another version of numba" if mine < len(found) else ""
     return Check(
         "compiled kernels",
-        "warning",
+        Level.WARNING,
         f"{mine} functions are compiled{other}: the first calibrate and estimate compile for up to a minute each",
         "NUMBA_CACHE_DIR hides those that came along"
         if chosen
@@ -271,7 +280,10 @@ def _tiny_solve() -> Check:
     found = f"{state.status}, residual {state.residual_n:.1e} N, sag {sag:.3f} mm"
     good = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
     return Check(
-        "a tiny solve", "ok" if good else "error", found, None if good else "reinstall: pip install --force-reinstall femsense"
+        "a tiny solve",
+        Level.OK if good else Level.ERROR,
+        found,
+        None if good else "reinstall: pip install --force-reinstall femsense",
     )
 
 
@@ -280,8 +292,8 @@ def _machine() -> Check:
     free = _free_memory_gb()
     text = f"{cores} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
     if free is not None and free < LITTLE_MEMORY_GB:
-        return Check("machine", "warning", text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
-    return Check("machine", "ok", text)
+        return Check("machine", Level.WARNING, text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
+    return Check("machine", Level.OK, text)
 
 
 def _free_memory_gb() -> float | None:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from femsense.app.doctor import Check
+from femsense.app.doctor import Check, Level
 from femsense.live.sources import list_cameras
 from femsense.live.sources.source import FoundCamera
 
@@ -32,16 +32,16 @@ def camera_checks(listing: Callable[[], Listing] = list_cameras) -> list[dict[st
     if not cameras:
         looked = "none found" if len(missing) < 3 else "no package for cameras is installed"
         hint = "a recording can be replayed: femsense live ROBOT --camera RECORDING"
-        checks.append(Check("cameras", "warning", looked, hint))
+        checks.append(Check("cameras", Level.WARNING, looked, hint))
     for word, text in missing.items():
         checks.append(
-            Check(f"cameras: {word}", "warning", "its package is not installed", text.partition("try:")[2].strip() or text)
+            Check(f"cameras: {word}", Level.WARNING, "its package is not installed", text.partition("try:")[2].strip() or text)
         )
     needed = sum(camera.needed_mbit_s for camera in cameras)
     limit = USB2_MBIT_S if any(camera.is_slow_link for camera in cameras) else USB3_MBIT_S
     if len(cameras) > 1 and needed > limit:
         found = f"{needed:.0f} Mbit/s are needed, one bus carries about {limit:.0f}"
-        checks.append(Check("bandwidth of the bus", "warning", found, "spread the cameras over several USB controllers"))
+        checks.append(Check("bandwidth of the bus", Level.WARNING, found, "spread the cameras over several USB controllers"))
     checks.append(_disk())
     return [asdict(check) for check in checks]
 
@@ -50,8 +50,8 @@ def _camera(camera: FoundCamera) -> Check:
     name = f"camera {camera.source}"
     found = f"{camera.name}, {camera.link}, needs {camera.needed_mbit_s:.0f} Mbit/s"
     if camera.is_slow_link:
-        return Check(name, "warning", found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
-    return Check(name, "ok", found)
+        return Check(name, Level.WARNING, found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
+    return Check(name, Level.OK, found)
 
 
 def _disk() -> Check:
@@ -65,6 +65,6 @@ def _disk() -> Check:
             stream.flush()
             speed = WRITTEN_MB / (time.perf_counter() - began)
     except OSError as error:
-        return Check("disk for sessions", "warning", f"this folder cannot be written: {error.strerror}", "another -o SESSION")
+        return Check("disk for sessions", Level.WARNING, f"this folder cannot be written: {error.strerror}", "another -o SESSION")
     found = f"{speed:.0f} MB/s into this folder, a session at 30 Hz needs about {NEEDED_DISK_MB_S:.0f}"
-    return Check("disk for sessions", "ok" if speed > NEEDED_DISK_MB_S else "warning", found)
+    return Check("disk for sessions", Level.OK if speed > NEEDED_DISK_MB_S else Level.WARNING, found)

@@ -92,12 +92,8 @@ def learn_into(
         if other is not None and test is not None:
             text += f"\n\n{test_text(model, other, test[0])}"
     save_model(model, output)
-    return {
-        "path": str(output),
-        "frame": model.frame,
-        **document,
-        **model.report,
-    }, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
+    document = {"path": str(output), "frame": model.frame, **document, **model.report}
+    return document, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
 
 
 def report_text(report: dict[str, Any]) -> str:
