@@ -70,7 +70,7 @@ def model_error(c: Calibration) -> str:
 def run_document(run: Run) -> dict[str, Any]:
     """Return a run in numbers."""
     good = [frame for frame in run.frames if frame.status == "ok"]
-    strongest, felt = _strongest(run), sensed(run.contacts)
+    strongest, felt = strongest_contact(run.contacts, run.frames), sensed(run.contacts)
     feels = {contact.frame for contact in felt}
     touched = [frame for frame in good if frame.frame in feels] or good
     return {
@@ -109,7 +109,7 @@ def run_text(run: Run) -> str:
         of = "the frames with contact" if facts["contacts"] else "all frames"
         before, after = 1e3 * facts["rms_before_m"], 1e3 * facts["rms_after_m"]
         rows.append(["residual", f"{before:.3f} → {after:.3f} mm rms with the forces, median of {of}"])
-    rows += _strongest_rows(_strongest(run))
+    rows += _strongest_rows(strongest_contact(run.contacts, run.frames))
     if facts["unexplained"]:
         worst = max(facts["unexplained"], key=lambda frame: frame["rms_after_m"])
         count = f"{len(facts['unexplained'])} of {facts['frames_ok']} frames, most frame {worst['frame']}"
@@ -165,10 +165,10 @@ def known_part(contact: ContactForce) -> str:
     return f"{size:.3f} ± {own:.3f} N across {'xyz'[worst]}; along it {along}"
 
 
-def _strongest(run: Run) -> ContactForce | None:
-    """Return the sensed contact with the largest force of the frames that are ok; None where there is none."""
-    good = {frame.frame for frame in run.frames if frame.status == "ok"}
-    return max((c for c in sensed(run.contacts) if c.frame in good), key=lambda contact: contact.force_n, default=None)
+def strongest_contact(contacts: Sequence[ContactForce], frames: Sequence[FrameReport]) -> ContactForce | None:
+    """Return the sensed contact with the largest force, outside the frames that are not ok; None where there is none."""
+    bad = {frame.frame for frame in frames if frame.status != "ok"}
+    return max((c for c in sensed(contacts) if c.frame not in bad), key=lambda contact: contact.force_n, default=None)
 
 
 def _median(values: Sequence[float]) -> float | None:
