@@ -1,4 +1,4 @@
-"""What this installation has and lacks, with the line that mends it."""
+"""Checks of this installation, each with the line that mends it."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ LIBRARIES = {
     "libX11.so.6": "libx11-6",
     "libudev.so.1": "libudev1",
 }
-"""What Open3D is linked to on Linux → the Debian package that has it."""
+"""Library that Open3D is linked to on Linux → its Debian package."""
 OTHER_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libEGL.so.1": "libegl1", "libglib-2.0.so.0": "libglib2.0-0"}
-"""What other versions of it may want."""
+"""Libraries of other versions of it."""
 LITTLE_MEMORY_GB = 2.0
 SMALL_RESIDUAL_N = 1e-6
 FEW_KERNELS = 50
@@ -100,7 +100,7 @@ def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
 
 
 def doctor_text(document: dict[str, Any]) -> str:
-    """Return what `diagnose` found as a table."""
+    """Return the findings of `diagnose` as a table."""
     marks = {Level.OK: "ok", Level.WARNING: "note", Level.ERROR: "BAD"}
     width = max(len(check["name"]) for check in document["checks"])
     lines = []
@@ -141,7 +141,7 @@ def _package(module: str, package: str) -> Check:
 
 
 def import_hint(message: str, package: str) -> str:
-    """Return what to do where an import failed with this message: the system's package, or pip's."""
+    """Return the remedy for an import that failed with this message: a package of the system, or of pip."""
     library = re.search(r"(lib[\w.+-]+\.so(?:\.\d+)*)", message)
     debian = {**LIBRARIES, **OTHER_LIBRARIES}.get(library.group(1)) if library else None
     if debian is not None:

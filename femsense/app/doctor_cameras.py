@@ -1,4 +1,4 @@
-"""The cameras that are plugged in, their links, and what a session needs of them."""
+"""Checks of connected cameras, their links, and the disk that a session needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from femsense.live.sources import list_cameras
 from femsense.live.sources.source import FoundCamera
 
 USB2_MBIT_S, USB3_MBIT_S = 280.0, 3200.0
-"""What a bus carries in practice, of 480 and 5000 Mbit/s."""
+"""Practical capacity of a bus of 480 and of 5000 Mbit/s."""
 NEEDED_DISK_MB_S = 20.0
 """Depth and colour of 848 × 480 at 30 Hz as PNG."""
 WRITTEN_MB = 32
@@ -22,7 +22,7 @@ Listing = tuple[Sequence[FoundCamera], Mapping[str, str]]
 
 
 def camera_checks(listing: Callable[[], Listing] = list_cameras) -> list[dict[str, Any]]:
-    """Return what `femsense doctor` says of cameras: each one found, packages that are missing, buses that carry too little, the disk.
+    """Return the checks of cameras: each one found, missing packages, overloaded buses, the disk.
 
     Arguments:
         listing: returns the cameras, and for each kind whose package is missing how to install it.

@@ -1,4 +1,4 @@
-"""`femsense import`: from a capture of another program to a recording folder, and what is said of it."""
+"""`femsense import`: from a capture of another program to a recording folder, with notes on it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, wri
 Progress = Callable[..., None]
 Say = Callable[[str], None]
 MANY_FRAMES = 1000
-"""Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
+"""A note suggests to thin recordings of more frames than this, since each frame costs time later …"""
 ENOUGH_FRAMES = 300
-"""… and where a robot moves slowly, so many say as much."""
+"""… to this number, which is enough where a robot moves slowly."""
 
 
 def import_into(
@@ -39,7 +39,7 @@ def import_into(
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Import a capture into a recording folder, or return what stands there if it was made from the same.
+    """Import a capture into a recording folder, or return the report of the import in it if it was made from the same.
 
     Arguments:
         folder: of the recording.
@@ -47,7 +47,7 @@ def import_into(
         options: what a person says about it.
         driven: what a person says about the inputs.
         say: called with one line about what is happening.
-        again: import anew although the recording is there.
+        again: repeat the import although the recording is there.
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -99,7 +99,7 @@ def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
 
 
 def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
-    """Return what is said of a recording of very many frames."""
+    """Return the note on a recording of very many frames."""
     frames = int(found["frames"])
     if frames <= MANY_FRAMES:
         return ()
@@ -113,7 +113,7 @@ def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 
 
 def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
-    """Return what is said of a recording that does not tell when nothing touches the robot."""
+    """Return the note on a recording without contact-free frames."""
     if options.free:
         late = [f"{first:g}:{last:g}" for first, last in options.free if first > found["duration_s"] or last < 0]
         return tuple(f"--free {span}: no frame lies there; the frames last {found['duration_s']:.4g} s" for span in late)
@@ -124,7 +124,7 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 
 
 def _in_vain(name: str, options: Options) -> tuple[str, ...]:
-    """Return what is said of options that have no effect on a format."""
+    """Return notes on options that have no effect on a format."""
     said = {
         "--clock": options.clock != "auto",
         "--rate": options.rate is not None,
@@ -169,7 +169,7 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
 
 
 def _identity(paths: Sequence[str | Path], options: Options, driven: InputOptions) -> dict[str, Any]:
-    """Return what an import is made from: another file, another time of its change or another option is another import."""
+    """Return the identity of an import: another file, another time of its change or another option is another import."""
     states = [_state(split_name(path)[1]) for path in paths]
     return {
         "source": states[0] if len(states) == 1 else [*states, list(map(str, paths))],
@@ -200,7 +200,7 @@ def _state(path: Path) -> list[Any]:
 
 
 def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str, Any] | None:
-    """Return what an earlier import of the same says; None where there is none. Raises InputError where something else stands."""
+    """Return the report of an earlier import of the same; None where there is none. Raises InputError where other files are in its place."""
     if not final.exists():
         return None
     if final.is_dir() and not any(final.iterdir()):

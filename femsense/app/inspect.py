@@ -1,4 +1,4 @@
-"""What a file or a folder is, what is in it and what is wrong with it: a plain report for people and programs."""
+"""The kind, content and problems of a file or a folder: a plain report for people and programs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ MESH_ENDINGS = (
 
 
 def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:
-    """Return what a file or folder is and holds, and what is wrong with it.
+    """Return kind, content and problems of a file or folder.
 
     Arguments:
         path: a file, a folder, or the name of a robot.

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.model import ProprioceptiveModel
 
 HELD = 0.9
-"""Share of the positions of another recording that lie within their 95 % intervals, from which on these hold."""
+"""The 95 % intervals hold on another recording if at least this share of its positions lies within them."""
 POOR = 0.5
-"""A held-out error above this share of how the markers move says that the sensors say little of them."""
+"""If the held-out error exceeds this share of the rms motion of the markers, the sensors carry little information about them."""
 
 
 def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
-    """Return SENSORS MARKERS SENSORS MARKERS … two by two. Raises InputError where one is left over."""
+    """Return SENSORS MARKERS SENSORS MARKERS … in pairs. Raises InputError where a file has no partner."""
     if not files or len(files) % 2:
         raise InputError(
             "files of a recording come in pairs",
@@ -46,7 +46,7 @@ def learn_into(
     """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
 
     Arguments:
-        files: what is read.
+        files: of sensors and markers.
         output: the ONNX file.
         end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
 
@@ -126,7 +126,7 @@ def report_text(report: dict[str, Any]) -> str:
 
 
 def interval_text(report: dict[str, Any]) -> list[str]:
-    """Return what is said of the intervals of a model, as lines."""
+    """Return the intervals of a model and their coverage, as lines."""
     interval, sessions = report["interval"], report["sessions"]
     radii = ", ".join(f"{name} {radius:.2f} mm" for name, radius in interval["radius_mm"].items())
     lines = [
@@ -143,7 +143,7 @@ def interval_text(report: dict[str, Any]) -> list[str]:
 
 
 def test_text(model: ProprioceptiveModel, data: Labelled, name: Path) -> str:
-    """Return how far a model is off on another recording, whether its intervals hold there, and why it is far off where it is."""
+    """Return the error of a model on another recording, the coverage of its intervals there, and the likely cause of a large error."""
     from femsense.xr.proprioception.drift import drift
 
     found = model.report["test"]

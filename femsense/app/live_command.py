@@ -36,10 +36,10 @@ from femsense.xr.view import PAGE, live_page_files
 
 PASSWORD = "FEMSENSE_PASSWORD"
 TELL_S = 0.2
-"""How often the state of the session is sent."""
+"""Period at which the state of the session is sent."""
 KEEPER_S = 10.0
 LIVE_FILE = "live.json"
-"""In a session that runs: where its page is."""
+"""Holds the address of the page of a running session."""
 
 
 def sense_live(
@@ -56,7 +56,7 @@ def sense_live(
         robot: folder or name.
         camera: source of frames.
         options: everything else.
-        say: takes lines for people.
+        say: called with lines for people.
         on_url: called with the address of the page once it is there.
 
     Raises:
@@ -116,13 +116,13 @@ def sense_live(
 
 
 def _wait_for(keeper: subprocess.Popen[bytes]) -> None:
-    """Let the keeper tidy up; one that takes long goes on by itself."""
+    """Wait for the keeper to tidy up; one that takes long continues by itself."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         keeper.wait(KEEPER_S)
 
 
 def page_of_session(folder: Path) -> str:
-    """Return where the page of a session is that runs now. Raises InputError where none does."""
+    """Return the address of the page of a running session. Raises InputError where none runs."""
     import json
 
     file = folder / LIVE_FILE

@@ -1,4 +1,4 @@
-"""A command asked of many recordings: its jobs, the run over them, and what is said of it."""
+"""A command on many recordings: its jobs, the run over them, and its answer."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ UNITS = {
     "import": "source",
     "report": "dir",
 }
-"""Command → column of a table that says what a job is about; `recording` is understood by all."""
+"""Command → column of a table that holds the input of a job; all commands take `recording` too."""
 TRUE, FALSE = ("1", "true", "yes"), ("0", "false", "no")
 LINE_S = 30.0
-"""Where no terminal shows a bar, a line is said as often."""
+"""Period of the lines on progress where no terminal shows a bar."""
 LISTED = 5
 """Jobs without a result that are listed."""
 
 
 def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
-    """Run the jobs that a command asks for, and write their summary.
+    """Run the jobs of a command, and write their summary.
 
     Arguments:
         asked: of the command line.
         run_job: runs one in a worker, by its name there: called with a job, `memory_bytes` and `in_process`.
-        say: told what happens beside.
+        say: called with lines on progress.
 
     Raises:
         FemsenseError: bad input, no engine, a full disk, or another command that works on the same folder.
@@ -90,7 +90,7 @@ def _folder_of_all(asked: ManyJobs) -> Path:
 
 
 def _summarise(out: Path, command: str, outcomes: Sequence[Outcome], folders: Mapping[str, Path]) -> None:
-    """Write the summary; reports beside results of another command renew the links of that one's summary."""
+    """Write the summary; reports next to results of another command renew the links of its summary."""
     before = read_summary(out) if command == "report" else None
     if before is not None and before[0] != "report":
         write_summary(out, *before)
@@ -102,7 +102,7 @@ def _summarise(out: Path, command: str, outcomes: Sequence[Outcome], folders: Ma
 
 
 def _jobs(asked: ManyJobs, command: str, out: Path) -> list[Job]:
-    """Return the jobs that are asked for. Raises InputError."""
+    """Return the jobs of a command. Raises InputError."""
     options = {p.name: p for p in asked.command.params if p.param_type_name == "option"}
     common = {name: _words(options[name], value) for name, value in asked.given.items()}
     if asked.jobs is not None and not is_glob(asked.jobs) and Path(asked.jobs).suffix in TABLES:
@@ -128,7 +128,7 @@ def _jobs(asked: ManyJobs, command: str, out: Path) -> list[Job]:
 
 
 def _names(parts: Sequence[tuple[str, str | None, list[str], dict[str, list[str]]]], firsts: Sequence[Path]) -> list[str]:
-    """Return names of jobs by what they are about; where the same stands twice, by its number too."""
+    """Return names of jobs by their input; where the same input occurs twice, by its number too."""
     unnamed = [first for first, (own, *_) in zip(firsts, parts) if not own]
     if len(set(unnamed)) == len(unnamed):
         found = iter(names_of(unnamed))
@@ -277,7 +277,7 @@ def progress_text(now: Progress) -> str:
     return ", ".join(parts)
 
 
-# What is said
+# The answer
 
 
 def row_of(command: str, document: Mapping[str, Any]) -> dict[str, Scalar]:

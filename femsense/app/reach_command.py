@@ -18,7 +18,7 @@ from femsense.model.robot import Robot
 
 FORMAT = "femsense-motion-1"
 FAR = 10.0
-"""A target that is so many diagonals of the body away from it is in another unit."""
+"""A target that is farther from the body than this number of its diagonals is in another unit."""
 
 
 def reach_targets(

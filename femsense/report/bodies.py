@@ -1,4 +1,4 @@
-"""Pictures of bodies: seen along an axis, with arrows on them, a scale, and which way the camera looks."""
+"""Pictures of bodies: seen along an axis, with arrows on them, a scale, and the viewing direction of the camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHAFT = 0.018
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """A direction to look along, given by what points right and up."""
+    """A viewing direction, given by the vectors that point right and up."""
 
     right: FloatArray
     up: FloatArray
@@ -227,7 +227,7 @@ def _draw_body(axes: Any, surface: DrawnSurface, view: View) -> None:
 
 
 def body_height(low: FloatArray, high: FloatArray, *, width: float = WIDTH, most: float = 4.9) -> float:
-    """Return how high a picture of a rectangle with its title and keys is [inch], where it takes the whole width."""
+    """Return the height of a picture of a rectangle with its title and keys [inch], where it takes the whole width."""
     across, up = high - low + 0.08 * float((high - low).max())
     return min(most, float((width - 0.1) * up / across) + (2 * ROW + SIGN) / 72.0 + 0.6)
 
@@ -242,8 +242,8 @@ def frame_body(
     cameras: Sequence[FloatArray] = (),
     corner: bool = True,
 ) -> None:
-    """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key,
-    and which way the cameras look, or else (where `corner`) the axes of the robot frame."""
+    """Show a rectangle [mm] with equal scales, without axes. Below it come, each in a line of its own, a scale bar, the key,
+    and the viewing directions of the cameras, or else (where `corner`) the axes of the robot frame."""
     margin = 0.04 * float((high - low).max())
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     axes.axis("off")
@@ -256,15 +256,15 @@ def frame_body(
         _draw_cameras(axes, view, cameras, low[0], below)
     elif corner:
         _draw_cross(axes, view, low[0], below)
-    room = _below(axes, 0.0, below + SIGN)  # the same in all pictures, whatever stands there
+    room = _below(axes, 0.0, below + SIGN)  # equal in all pictures, whether a camera or the axes are drawn
     axes.plot([low[0]], [0.0], "o", color="none", markersize=1, transform=room, clip_on=False)
     axes.dataLim.set_points(axes.viewLim.get_points())
     axes.set_autoscale_on(True)  # limits may be widened
-    axes.set_aspect("equal", adjustable="datalim")  # widens what is shown: the layout knows nothing of a box that shrinks
+    axes.set_aspect("equal", adjustable="datalim")  # widens the limits: the layout does not account for a box that shrinks
 
 
 def _below(axes: Any, right: float, down: float) -> Any:
-    """Return the transform from x [mm] and a height to so many points right of and below the lower edge of the axes."""
+    """Return the transform from x [mm] and a height to a place below the lower edge of the axes, shifted by `right` and `down` [pt]."""
     from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
     edge = blended_transform_factory(axes.transData, axes.transAxes)
@@ -292,7 +292,7 @@ def _write(
 
 
 def _draw_cameras(axes: Any, view: View, directions: Sequence[FloatArray], x: float, down: float) -> None:
-    """Draw which way the cameras look, beside each other; across the page as a ring with a dot (to the eye) or a cross."""
+    """Draw the viewing directions of the cameras next to each other; one across the page as a ring with a dot (to the eye) or a cross."""
     middle = down + 0.5 * SIGN
     for i, direction in enumerate(directions[:2]):
         right = 12.0 + 72.0 * i
@@ -308,7 +308,7 @@ def _draw_cameras(axes: Any, view: View, directions: Sequence[FloatArray], x: fl
 
 
 def _draw_cross(axes: Any, view: View, x: float, down: float) -> None:
-    """Draw which way the axes of the robot frame point."""
+    """Draw the directions of the axes of the robot frame."""
     foot = (5.0, down + SIGN - 9.0)
     for name, (dx, dy) in zip(view.axes, ((1.0, 0.0), (0.0, 1.0))):
         _draw_way(axes, x, foot, (foot[0] + 14.0 * dx, foot[1] - 14.0 * dy), "->", SOFT, 0.9)
@@ -318,7 +318,7 @@ def _draw_cross(axes: Any, view: View, x: float, down: float) -> None:
 def _draw_way(
     axes: Any, x: float, start: tuple[float, float], end: tuple[float, float], style: str, color: str, width: float
 ) -> None:
-    """Draw an arrow between two places, each so many points right of x [mm] and below the axes."""
+    """Draw an arrow between two places, each given by its shift right of x [mm] and below the axes [pt]."""
     tail, tip = (_below(axes, *place) for place in (start, end))
     arrow = {"arrowstyle": style, "color": color, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", xy=(x, 0.0), xycoords=tip, xytext=(x, 0.0), textcoords=tail, arrowprops=arrow, annotation_clip=False)

@@ -1,4 +1,4 @@
-"""The report on what a better model changes: runs next to each other, and the demo's errors against the truth."""
+"""The report on the gain of a better model: runs next to each other, and the demo's errors against the truth."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 4.5, 3.0
 """Of a panel [inch]: readable at the width of a phone."""
 SIZE = 9.5
 MANY = 1500
-"""So many points are drawn as pixels."""
+"""From this number on, points are drawn as pixels."""
 
 
 def nice(value: float) -> float:
@@ -106,7 +106,7 @@ def _draw_bars(names: Sequence[str], values_mm: Sequence[float], axis: str) -> A
 
 
 def clipped(name: str, width: int = 22) -> str:
-    """Return a name that fits beside an axis, without what matplotlib takes for mathematics."""
+    """Return a name that fits next to an axis; dollar signs are escaped, which matplotlib reads as mathematics."""
     text = name if len(name) <= width else name[: width - 1] + "…"
     return text.replace("$", r"\$")
 

@@ -1,4 +1,4 @@
-"""Finding what a folder holds: loops, runs and calibrations, in it and in its subfolders."""
+"""The results in a folder and its subfolders: loops, runs and calibrations."""
 
 from __future__ import annotations
 

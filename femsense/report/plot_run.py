@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def plot_run(run: Run) -> Any:
     """Return a matplotlib figure: the size of each force over time with bands of one and two standard deviations, hollow
-    where the frame is not ok, or the residual where nothing touches."""
+    where the frame is not ok, or the residual of a run without contacts."""
     contacts = [c for c in run.contacts if np.isfinite(c.force_n)]
     if contacts:
         return forces_figure(contacts, run.frames)

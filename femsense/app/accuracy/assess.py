@@ -47,12 +47,12 @@ def expected_duration(options: AccuracyOptions | None = None) -> str:
 
 
 def assess_accuracy(robot: Robot, *, options: AccuracyOptions | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Return what the mesh of a robot costs in motion and in force, and what would be better, as plain tables.
+    """Return the discretisation error of a robot in motion and in force, and a recommended mesh, as plain tables.
 
     Arguments:
         robot: as it is declared.
-        options: how far finer spaces are looked at, and what is fine enough.
-        progress: called with what is being done.
+        options: limits on finer spaces, and the errors that are fine enough.
+        progress: called with the name of each step.
 
     Returns:
         `declared`, `reference` (what was taken as the truth), `loads` (a row each), `forces`, `spaces` (what each would cost) and

@@ -1,4 +1,4 @@
-"""What acts on every space alike: the weight, inputs of a size that the body bears, contact forces on patches of its surface."""
+"""Loads that are equal on every space: the weight, feasible inputs, contact forces on patches of the surface."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from femsense.model.remeshing import body_on_mesh, finer_mesh
 from femsense.model.robot import Robot
 
 MOST_INPUTS = 4
-"""So many cables and chambers are looked at, spread over their list."""
+"""Number of cables and chambers that are tried, spread over their list."""
 FORCE_POINTS = 6
-"""Contact forces are tried at so many features …"""
+"""Number of features at which contact forces are tried …"""
 FELT = 0.05
 """… at which a force moves the rest of the body by this share of the most at least: next to the clamp nothing is sensed."""
 PART_OF_LARGEST = 0.5
@@ -115,7 +115,7 @@ def _inputs(body: BodyModel) -> list[Load]:
 
 
 def spread_evenly(count: int, most: int) -> list[int]:
-    """Return at most so many indices of a list, spread evenly."""
+    """Return at most `most` indices of a list, spread evenly."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 

@@ -14,7 +14,7 @@ from femsense.app.accuracy.loads import Load, Patches
 
 @dataclass(frozen=True, slots=True)
 class AccuracyOptions:
-    """How far finer spaces are looked at, and what is fine enough."""
+    """Limits on the finer spaces that are solved, and the errors below which a space is fine enough."""
 
     most_unknowns: int = 400_000
     """A finer space with more unknowns is not solved …"""
@@ -101,7 +101,7 @@ def _force_table(error: Errors, patches: Patches, declared: Answer) -> dict[str,
 
 
 def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
-    """Return which space would serve, in words; the spaces of the report get a mark where they do."""
+    """Return the recommended space in words; the spaces of the report that are fine enough get a mark."""
     best = _best(report["spaces"], options)
     declared = next(space for space in report["spaces"] if space["declared"])
     plain = next((space for space in report["spaces"] if space["element"] == "tet10" and not space["refinements"]), None)
@@ -123,7 +123,7 @@ def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
 
 
 def _lack(space: Mapping[str, Any], options: AccuracyOptions) -> float:
-    """Return the error of a space over what is fine enough; 0 where it is not known."""
+    """Return the error of a space over the error that is fine enough; 0 where it is not known."""
     motion, force = space["motion_percent"] or 0.0, space["force_percent"] or 0.0
     return max(motion / (100 * options.good_motion), force / (100 * options.good_force))
 

@@ -1,4 +1,4 @@
-"""Parameters that several commands have, and how they are read."""
+"""Parameters that several commands share, and readers of their texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands of one recording share that take many: `--jobs`, `--workers`, `--dask`, `--memory`."""
+"""Options of commands that take many recordings: `--jobs`, `--workers`, `--dask`, `--memory`."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ MANY = {"jobs": Jobs, "workers": Workers, "dask": Dask, "memory": Memory}
 
 
 def several(context: typer.Context, of: Several) -> Answer | None:
-    """Return the answer that many jobs are to run; None where the command is asked of one recording only.
+    """Return an answer with many jobs; None where the command is about one recording only.
 
     Arguments:
-        context: of the command; its last argument holds what a job is about, and all results go below its `-o`, where it has one.
-        of: what several of them are.
+        context: of the command; its last argument holds the recordings, scripts or folders, and all results go below its `-o`, if any.
+        of: whether each of them is a job.
     """
     from femsense.many.jobs import is_glob, parts_of
 
@@ -86,7 +86,7 @@ def several(context: typer.Context, of: Several) -> Answer | None:
 
 @contextlib.contextmanager
 def spread_over(count: int, most: int, workers: int | None, dask: str | None, memory: float | None) -> Iterator[Spread | None]:
-    """Yield what spreads so many recordings of one joint job over workers; None where this process works alone.
+    """Yield a function that spreads the recordings of one joint job over workers; None where this process works alone.
 
     Arguments:
         count: of recordings; no more than `most` need no engine.

@@ -1,4 +1,4 @@
-"""Where one starts: `demo`, `inspect`, `docs`, `doctor`."""
+"""First commands: `demo`, `inspect`, `docs`, `doctor`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole chain on a recording that comes along, measured against the truth beside it."""
+"""The whole chain on a recording of this package, compared with its truth."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def run_demo(
 
     Arguments:
         folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.
-        say: told in one line what happens.
-        progress: called with what is done and how much there is.
+        say: called with a line on each step.
+        progress: called with (items done, items in all).
         steps: other ways to estimate and to improve.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The truth that the virtual rig leaves beside a recording, and how far a run is from it."""
+"""The truth that the virtual rig writes next to a recording, and the errors of a run against it."""
 
 from __future__ import annotations
 

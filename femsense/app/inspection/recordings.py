@@ -1,4 +1,4 @@
-"""Recordings, clouds and images, looked into."""
+"""Reports on recordings, clouds and images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from femsense.model.recording import Recording
 
 JPEG = (".jpg", ".jpeg")
 CLOUDS_READ = 8
-"""So many clouds of a recording are read whole; of the others only the name and the size are checked."""
+"""Number of clouds of a recording that are read whole; of the others only the name and the size are checked."""
 
 
 def inspect_recording(path: Path, report: Report, problems: Problems) -> None:
@@ -160,7 +160,7 @@ def _load_report(r: Recording) -> Report | None:
 
 
 def _check_clouds(r: Recording, report: Report, problems: Problems) -> None:
-    """Read some clouds whole; say which files are empty and what extent the read ones have."""
+    """Read some clouds whole; report empty files and the number of points."""
     frames = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
     if not frames:
         return

@@ -1,4 +1,4 @@
-"""Scripts, results of commands, captures of other programs, and what is none of these, looked into."""
+"""Reports on scripts, results of commands, captures of other programs, and files of no known kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robots, meshes, surfaces and scenes, looked into."""
+"""Reports on robots, meshes, surfaces and scenes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def inspect_robot(path: Path, report: Report, problems: Problems) -> None:
 
 
 def _warn_of_gaps(robot: Robot, file: Path) -> None:
-    """Warn of what a robot needs before it can be calibrated, and of values that `femsense mesh` guessed and nobody has confirmed."""
+    """Warn of missing tables without which a robot cannot be calibrated, and of guesses of `femsense mesh` that nobody has confirmed."""
     texts = []
     guessed = guessed_tables(file.read_text(encoding="utf-8-sig"))
     if guessed:

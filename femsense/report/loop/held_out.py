@@ -42,7 +42,7 @@ def held_out_errors(residuals: Residuals, table: FrameTable, noise_m: float) -> 
 
 
 def _distribution(before: FloatArray, after: FloatArray, noise_m: float) -> Any:
-    """Draw the shares of errors below a size, with what noise alone would give."""
+    """Draw the distribution function of the errors, next to that of noise alone."""
     figure, axes = new_axes()
     for values, color, name in ((before, BEFORE, "before"), (after, AFTER, "after")):
         sizes = 1e3 * np.sort(values)
@@ -69,7 +69,7 @@ def _distribution(before: FloatArray, after: FloatArray, noise_m: float) -> Any:
 
 
 def _noise_share(ratio: FloatArray) -> FloatArray:
-    """Return how often 3-D noise of root mean square 1 is below a size (Maxwell's distribution)."""
+    """Return the probability that 3-D Gaussian noise of root mean square 1 is below a size (Maxwell's distribution)."""
     from scipy.special import erf
 
     u = ratio * math.sqrt(1.5)

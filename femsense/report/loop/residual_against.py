@@ -1,4 +1,4 @@
-"""What the residual goes with: the leading pattern against its covariates, and the way of the tip."""
+"""The leading pattern of the residual against its covariates, and the path of the tip."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from femsense.report import words
 from femsense.report.drawing import AFTER, BEFORE, INK, PALE, SERIES, add_legend, as_image, clipped, name_axes, new_axes
 
 SWEEPS = len(SERIES)
-"""So many sweeps have a colour of their own."""
+"""Number of sweeps that have a colour of their own."""
 
 
 def residual_against(frames: FrameTable, score: Pattern, tip: Tip) -> list[Markup | None]:
-    """Return the leading pattern against its best covariate, coloured by direction and by sweep, and the way of the tip."""
+    """Return the leading pattern against its best covariate, coloured by direction and by sweep, and the path of the tip."""
     if not score.covariate or not len(score.covariate_values) == len(frames.score_before_m) > 0:
         return [_tip_loop(frames, tip)]
     x, y, z = (np.asarray(values, float) for values in (score.covariate_values, frames.score_before_m, frames.score_after_m))
@@ -85,7 +85,7 @@ def sweep_labels(frames: FrameTable) -> list[str]:
 
 
 def _tip_loop(frames: FrameTable, tip: Tip) -> Markup | None:
-    """Draw the way of the tip against actuation: measured, before and after."""
+    """Draw the path of the tip against actuation: measured, before and after."""
     place = {key: i for i, key in enumerate(zip(frames.recording, frames.frame))}
     rows = [(place[key], i) for i, key in enumerate(zip(tip.recording, tip.frame)) if key in place]
     if len(rows) < 3:

@@ -32,7 +32,7 @@ from femsense.report.page import render
 ARROW_SHARE = 0.2
 """The longest arrow, in sizes of the body."""
 SPOTS = 600
-"""So many single frames are drawn as dots."""
+"""Number of single frames that are drawn as dots."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,7 +45,7 @@ class MeanResidual:
     """Of each marker, before and after [m], shape (m, 3)."""
     view: View
     factor: float
-    """So many times longer arrows are drawn."""
+    """Exaggeration of the arrows."""
 
     def figures(self, cameras: Sequence[FloatArray]) -> list[Any]:
         """Return a figure before and one after; `cameras` are the axes along which cameras look."""

@@ -30,7 +30,7 @@ class FrameResiduals:
 
     titles: tuple[str, ...]
     shapes: tuple[DrawnSurface | None, ...]
-    """What the declared model looks like there."""
+    """Shape of the declared model."""
     measured: tuple[FloatArray, ...]
     """Of each marker [m], shape (m, 3)."""
     before: tuple[FloatArray, ...]
@@ -40,7 +40,7 @@ class FrameResiduals:
 
     @property
     def factor(self) -> float:
-        """So many times longer arrows are drawn: by the largest body, not by how far bodies lie apart."""
+        """Exaggeration of the arrows: relative to the largest body, not to the distance between bodies."""
         largest = max(self._bodies, key=lambda points: float(np.linalg.norm(np.ptp(points, axis=0))))
         return exaggeration(largest, [*self.before, *self.after], share=ARROW_SHARE)
 

@@ -1,4 +1,4 @@
-"""The report on a run: forces over time, contacts, what became of each frame."""
+"""The report on a run: forces over time, contacts, status of each frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
     """Return the report on a run.
 
     Arguments:
-        file: run.json; contacts.csv, frames.csv and states.npz beside it are shown if they are there.
+        file: run.json; contacts.csv, frames.csv and states.npz next to it are shown if they are there.
         title: of the chapter.
 
     Raises:

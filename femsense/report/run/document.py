@@ -1,6 +1,6 @@
-"""A run as its folder holds it, and what run.json and demo.json hold, as far as a report shows it.
+"""The parts of a run, of run.json and of demo.json that a report shows.
 
-What is missing is left out; a wrong type is an InputError.
+Missing parts are left out; a wrong type is an InputError.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Number = float | None
 
 
 class Document(Schema):
-    """Other keys than those named are left alone; null and NaN stand for what is not known."""
+    """Other keys than those named are ignored; null and NaN stand for unknown values."""
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True, allow_inf_nan=True)
 
@@ -62,7 +62,7 @@ class RunFacts(Document):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SavedRun:
-    """What a report shows of a run; any file but run.json may be missing."""
+    """A run as its folder holds it; any file but run.json may be missing."""
 
     facts: RunFacts
     contacts: tuple[ContactForce, ...] | None

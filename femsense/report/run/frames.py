@@ -1,4 +1,4 @@
-"""What became of each frame of a run: status, residual, time, tensions and pressures."""
+"""The frames of a run: status, residual, time, tensions and pressures."""
 
 from __future__ import annotations
 
