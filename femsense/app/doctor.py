@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import femsense
+from femsense.core.parallel import available_cores
 
 PACKAGES = {
     "numpy": "numpy",
@@ -288,9 +289,8 @@ def _tiny_solve() -> Check:
 
 
 def _machine() -> Check:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     free = _free_memory_gb()
-    text = f"{cores} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
+    text = f"{available_cores()} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
     if free is not None and free < LITTLE_MEMORY_GB:
         return Check("machine", Level.WARNING, text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
     return Check("machine", Level.OK, text)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from femsense.core.errors import DataError, InputError, MissingDependency
+from femsense.core.parallel import available_cores
 from femsense.many import limits
 
 P = ParamSpec("P")
@@ -246,7 +247,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         try:
             if where == "local":
                 cluster = distributed.LocalCluster(
-                    n_workers=workers or limits.available_cores(),
+                    n_workers=workers or available_cores(),
                     threads_per_worker=1,
                     processes=True,
                     memory_limit=memory or "auto",
@@ -317,5 +318,5 @@ def open_engine(workers: int | None, where: str | None, memory: int | None) -> c
     if workers == 0:
         chosen = ENGINES["in process"]()
         return chosen
-    chosen = ENGINES["processes"](workers or limits.available_cores(), memory)
+    chosen = ENGINES["processes"](workers or available_cores(), memory)
     return chosen

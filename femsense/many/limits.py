@@ -44,11 +44,6 @@ def environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def available_memory() -> int | None:
     """Return the memory of this machine, or of the container if that is less [bytes]; None where it is unknown."""
     found = list[int]()

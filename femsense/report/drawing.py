@@ -94,9 +94,7 @@ def marker_bars(rms_m: Mapping[str, float | None], title: str, *, most: int, axi
 def _draw_bars(names: Sequence[str], values_mm: Sequence[float], axis: str) -> Any:
     figure, axes = new_axes(height=max(1.5, 0.55 + 0.26 * len(names)))
     places = np.arange(len(names))
-    axes.barh(places, values_mm, height=0.62, color=AFTER)
-    for place, value in zip(places, values_mm):
-        axes.text(value, place, f" {value:.2f}", va="center", fontsize=SIZE - 1, color=INK)
+    axes.bar_label(axes.barh(places, values_mm, height=0.62, color=AFTER), fmt=" %.2f", fontsize=SIZE - 1, color=INK)
     axes.set_yticks(places, [clipped(name) for name in names])
     axes.invert_yaxis()
     axes.margins(x=0.14)

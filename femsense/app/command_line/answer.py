@@ -61,9 +61,9 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Column
 
-    label = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # a long label is cut, the other columns are not
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # a long label is cut, the other columns are not
     columns = (
-        TextColumn("{task.description}", table_column=label),
+        TextColumn("{task.description}", table_column=cut),
         BarColumn(),
         TextColumn("{task.fields[count]}"),
         TimeElapsedColumn(),
@@ -71,10 +71,10 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True, expand=True) as bar:
         task = bar.add_task(title, total=None, count="")
 
-        def advance(done: int | str, total: int | None = None) -> None:
+        def advance(done: int | str, total: int | None = None, label: str = title) -> None:
             nonlocal task
             if isinstance(done, int):
-                bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
+                bar.update(task, completed=done, total=total, description=label, count=f"{done}/{total}")
                 return
             words, clock = label_and_clock(done)
             if bar.tasks[-1].total is None:

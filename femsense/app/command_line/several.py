@@ -95,8 +95,9 @@ def spread_over(count: int, most: int, workers: int | None, dask: str | None, me
     Raises:
         BadParameter: a cluster for recordings that this process fits together.
     """
+    from femsense.core.parallel import available_cores
     from femsense.many.engines import open_engine, spread
-    from femsense.many.limits import available_cores, memory_share
+    from femsense.many.limits import memory_share
 
     if count <= most and (dask is not None or memory is not None):
         raise typer.BadParameter(f"--dask and --memory are of many jobs, or of more than {most} recordings")

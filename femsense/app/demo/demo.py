@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from femsense.app.commands import estimate_into, improve_into, written_page
-from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
+from femsense.app.demo.truth import force_errors, true_effects
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_json
 from femsense.io.own_files import DEMO, check_files
@@ -17,6 +17,7 @@ from femsense.io.robot_toml import robot_names
 from femsense.loop.files import saved_loop
 from femsense.report.loop.text import effect_text
 from femsense.report.text import columns, run_document
+from femsense.sensing.comparison import TrueContact, read_truth
 
 if TYPE_CHECKING:
     from femsense.sensing.types import Run

@@ -14,7 +14,7 @@ from femsense.report.bodies import Arrows, Key, Panel, best_view, corners_of, dr
 from femsense.report.drawing import AFTER, BEFORE, INK, add_legend, dress, name_axes, nice, whole_numbers
 
 if TYPE_CHECKING:
-    from femsense.app.demo.truth import TrueContact
+    from femsense.sensing.comparison import TrueContact
     from femsense.sensing.types import Run
 
 ARROW_SHARE = 0.35

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.sensing.comparison import TrueContact, compare, read_truth
+from femsense.sensing.comparison import TrueContact, compare
 
 if TYPE_CHECKING:
     from femsense.sensing.types import Run
-
-__all__ = ["TrueContact", "force_errors", "read_truth", "true_effects"]
 
 
 def true_effects(recording: Path) -> list[dict[str, Any]]:
