@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from femsense.app.doctor import Check, Level
+from femsense.app.doctor import Finding, Level, good, note
 from femsense.live.sources import list_cameras
 from femsense.live.sources.source import FoundCamera
 
@@ -28,33 +28,29 @@ def camera_checks(listing: Callable[[], Listing] = list_cameras) -> list[dict[st
         listing: returns the cameras, and for each kind whose package is missing how to install it.
     """
     cameras, missing = listing()
-    checks = [_camera(camera) for camera in cameras]
+    checks = {f"camera {camera.source}": _camera(camera) for camera in cameras}
     if not cameras:
         looked = "none found" if len(missing) < 3 else "no package for cameras is installed"
-        hint = "a recording can be replayed: femsense live ROBOT --camera RECORDING"
-        checks.append(Check("cameras", Level.WARNING, looked, hint))
+        checks["cameras"] = note(looked, "a recording can be replayed: femsense live ROBOT --camera RECORDING")
     for word, text in missing.items():
-        checks.append(
-            Check(f"cameras: {word}", Level.WARNING, "its package is not installed", text.partition("try:")[2].strip() or text)
-        )
+        checks[f"cameras: {word}"] = note("its package is not installed", text.partition("try:")[2].strip() or text)
     needed = sum(camera.needed_mbit_s for camera in cameras)
     limit = USB2_MBIT_S if any(camera.is_slow_link for camera in cameras) else USB3_MBIT_S
     if len(cameras) > 1 and needed > limit:
         found = f"{needed:.0f} Mbit/s are needed, one bus carries about {limit:.0f}"
-        checks.append(Check("bandwidth of the bus", Level.WARNING, found, "spread the cameras over several USB controllers"))
-    checks.append(_disk())
-    return [asdict(check) for check in checks]
+        checks["bandwidth of the bus"] = note(found, "spread the cameras over several USB controllers")
+    checks["disk for sessions"] = _disk()
+    return [{"name": name, **asdict(finding)} for name, finding in checks.items()]
 
 
-def _camera(camera: FoundCamera) -> Check:
-    name = f"camera {camera.source}"
+def _camera(camera: FoundCamera) -> Finding:
     found = f"{camera.name}, {camera.link}, needs {camera.needed_mbit_s:.0f} Mbit/s"
     if camera.is_slow_link:
-        return Check(name, Level.WARNING, found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
-    return Check(name, Level.OK, found)
+        return note(found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
+    return good(found)
 
 
-def _disk() -> Check:
+def _disk() -> Finding:
     """Write for a moment into the present folder, where sessions go."""
     data = bytes(1 << 20)
     try:
@@ -65,6 +61,6 @@ def _disk() -> Check:
             stream.flush()
             speed = WRITTEN_MB / (time.perf_counter() - began)
     except OSError as error:
-        return Check("disk for sessions", Level.WARNING, f"this folder cannot be written: {error.strerror}", "another -o SESSION")
+        return note(f"this folder cannot be written: {error.strerror}", "another -o SESSION")
     found = f"{speed:.0f} MB/s into this folder, a session at 30 Hz needs about {NEEDED_DISK_MB_S:.0f}"
-    return Check("disk for sessions", Level.OK if speed > NEEDED_DISK_MB_S else Level.WARNING, found)
+    return good(found) if speed > NEEDED_DISK_MB_S else Finding(Level.WARNING, found)

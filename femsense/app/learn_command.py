@@ -61,9 +61,8 @@ def learn_into(
 
     adapt, test = files.adapt, files.test
     if adapt is not None and (end_to_end or plane is not None):
-        raise InputError(
-            "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
-        )
+        text = "a corrected model keeps its bones"
+        raise InputError(text, where="--adapt", found="--end-to-end or --plane", expected="neither")
     check_target(output, folder=False, kind=MODEL, inputs=files.all)
     data, other = files.read()
     if adapt is not None:
@@ -129,17 +128,15 @@ def interval_text(report: dict[str, Any]) -> list[str]:
     """Return the intervals of a model and their coverage, as lines."""
     interval, sessions = report["interval"], report["sessions"]
     radii = ", ".join(f"{name} {radius:.2f} mm" for name, radius in interval["radius_mm"].items())
-    lines = [
-        f"  95 % interval: {radii} (median radius); {100 * interval['coverage']:.0f} % of the held-out positions lie within it"
-    ]
+    coverage = f"{100 * interval['coverage']:.0f} % of the held-out positions lie within it"
     if sessions > 1:
-        lines.append(f"  it holds what differs between the {sessions} recordings: each was predicted from the others")
+        validity = f"it holds what differs between the {sessions} recordings: each was predicted from the others"
     else:
-        lines.append(
-            "  drifts: interval holds within a session only. Predicted from what came before, the end of this one is off by "
+        validity = (
+            "drifts: interval holds within a session only. Predicted from what came before, the end of this one is off by "
             f"{interval['growth']:.2f} times as much as its middle; further recordings, or --test, measure other sessions"
         )
-    return lines
+    return [f"  95 % interval: {radii} (median radius); {coverage}", f"  {validity}"]
 
 
 def test_text(model: ProprioceptiveModel, data: Labelled, name: Path) -> str:
@@ -148,18 +145,17 @@ def test_text(model: ProprioceptiveModel, data: Labelled, name: Path) -> str:
 
     found = model.report["test"]
     low, high = found["error_ci_mm"]
+    within = f"{100 * found['coverage']:.0f} % of the positions lie within it"
     lines = [
         f"on {name}: {found['error_mm']:.2f} mm on {found['rows']} rows (95 % interval {low:.2f} … {high:.2f}), "
         f"{found['growth']:.1f} times the held-out error",
         f"  of the markers: {_each_text(found['marker_error_mm'])}",
     ]
     if found["coverage"] >= HELD:
-        lines.append(f"  the interval holds there: {100 * found['coverage']:.0f} % of the positions lie within it")
+        lines.append(f"  the interval holds there: {within}")
     else:
-        lines.append(
-            f"  drifts: interval holds within a session only. Here {100 * found['coverage']:.0f} % of the positions lie within it, "
-            f"and the error has grown {found['growth']:.1f} times"
-        )
+        grown = f"the error has grown {found['growth']:.1f} times"
+        lines.append(f"  drifts: interval holds within a session only. Here {within}, and {grown}")
     why = drift(model, data)
     if why.verdict != "holds":
         lines += [f"  {line}" for line in why.text.splitlines()]

@@ -16,6 +16,7 @@ import numpy as np
 from femsense.app.accuracy.errors import Answer, space_name
 from femsense.app.accuracy.loads import (
     Load,
+    LoadKind,
     Patches,
     SolvedSpace,
     body_on,
@@ -125,7 +126,7 @@ def _answer(
         return None, None
     ties = embed_points(body.mesh, places)
     rest = ties.positions(states[0].positions)
-    motions = [rest - places] if loads and loads[0].kind == "gravity" else []
+    motions = [rest - places] if loads and loads[0].kind is LoadKind.GRAVITY else []
     motions += [ties.positions(state.positions) - rest for state in states[1:]]
     times = []
     for _ in range(2):  # the first one may have to analyse the mesh
