@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from femsense.app.command_line.parameters import three_numbers
-from femsense.app.learn_options import LearnFiles, Pair
+from femsense.app.learn_options import LearnTask, Pair
 from femsense.core.errors import InputError
 from femsense.io.files import check_target
 from femsense.io.own_files import MODEL
@@ -35,64 +35,73 @@ def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
 
 
 def learn_into(
-    files: LearnFiles,
-    output: Path,
-    *,
-    end_to_end: bool = False,
-    bones: int = 8,
-    plane: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    task: LearnTask, output: Path, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[dict[str, Any], str]:
     """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
 
     Arguments:
-        files: of sensors and markers.
+        task: files and bones.
         output: the ONNX file.
-        end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
+        progress: called with (items done, items in all).
 
     Raises:
         InputError, DataError: files that do not fit, too few rows.
     """
-    from femsense.xr.armature import ArmatureOptions
-    from femsense.xr.proprioception.drift import adapt as adapted
-    from femsense.xr.proprioception.drift import drift
-    from femsense.xr.proprioception.learn import LearnOptions, learn
-    from femsense.xr.proprioception.model_file import load_model, save_model
+    from femsense.xr.proprioception.model_file import save_model
 
-    adapt, test = files.adapt, files.test
-    if adapt is not None and (end_to_end or plane is not None):
+    if task.adapt is not None and (task.end_to_end or task.plane is not None):
         text = "a corrected model keeps its bones"
         raise InputError(text, where="--adapt", found="--end-to-end or --plane", expected="neither")
-    check_target(output, folder=False, kind=MODEL, inputs=files.all)
-    data, other = files.read()
-    if adapt is not None:
-        before = load_model(adapt)
-        found = drift(before, data)
-        model = adapted(before, data)
-        text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
-        if before.bones is not None:
-            text += "\nthe end-to-end network is left out, as frames of markers do not correct it: bones come from the corrected markers"
-        document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
-        document["shifts"] = found.shifts
-        if other is not None:
-            tested = _tested(model, other)
-            document["test"] = tested
-            text += f"\non {test[0] if test else ''}: {_each_text(tested)}"
-        if model.spread is not None:
-            text += f"\n95 % interval: {_radius_text(model, data)} (median)"
-    else:
-        options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
-        model = learn(data, test=other, options=options, progress=progress)
-        text, document = report_text(model.report), {}
-        if model.chain is not None:
-            text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
-            if len(model.marker_names) == 2:
-                text += "\n  two markers say nothing of how the body bends between them: its bones lie on a straight line for lack of data"
-        if other is not None and test is not None:
-            text += f"\n\n{test_text(model, other, test[0])}"
+    check_target(output, folder=False, kind=MODEL, inputs=task.all)
+    data, other = task.read()
+    made = _learnt(task, data, other, progress) if task.adapt is None else _corrected(task, task.adapt, data, other)
+    model, document, text = made
     save_model(model, output)
     document = {"path": str(output), "frame": model.frame, **document, **model.report}
     return document, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
+
+
+Made = tuple["ProprioceptiveModel", dict[str, Any], str]
+"""A model, its figures, and its text."""
+
+
+def _learnt(task: LearnTask, data: Labelled, other: Labelled | None, progress: Callable[[int, int], None] | None) -> Made:
+    """Learn a model; `other` are the recordings of the test."""
+    from femsense.xr.armature import ArmatureOptions
+    from femsense.xr.proprioception.learn import LearnOptions, learn
+
+    bones = ArmatureOptions(bones=task.bones, plane_normal=_normal(task.plane))
+    model = learn(data, test=other, options=LearnOptions(end_to_end=task.end_to_end, bones=bones), progress=progress)
+    text = report_text(model.report)
+    if model.chain is not None:
+        text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
+        if len(model.marker_names) == 2:
+            text += "\n  two markers say nothing of how the body bends between them: its bones lie on a straight line for lack of data"
+    if other is not None and task.test is not None:
+        text += f"\n\n{test_text(model, other, task.test[0])}"
+    return model, {}, text
+
+
+def _corrected(task: LearnTask, file: Path, data: Labelled, other: Labelled | None) -> Made:
+    """Correct the model of a file by data of another day; `other` are the recordings of the test."""
+    from femsense.xr.proprioception.drift import adapt, drift
+    from femsense.xr.proprioception.model_file import load_model
+
+    before = load_model(file)
+    found, model = drift(before, data), adapt(before, data)
+    text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
+    if before.bones is not None:
+        text += (
+            "\nthe end-to-end network is left out, as frames of markers do not correct it: bones come from the corrected markers"
+        )
+    document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+    document["shifts"] = found.shifts
+    if other is not None and task.test is not None:
+        document["test"] = _tested(model, other)
+        text += f"\non {task.test[0]}: {_each_text(document['test'])}"
+    if model.spread is not None:
+        text += f"\n95 % interval: {_radius_text(model, data)} (median)"
+    return model, document, text
 
 
 def report_text(report: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Options of `femsense learn`: what a model is learnt from."""
+"""Options of `femsense learn`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Pair = tuple[Path, Path]
 
 
 @dataclass(frozen=True, slots=True)
-class LearnFiles:
-    """What is learnt from."""
+class LearnTask:
+    """The files that a model is learnt from, and its bones."""
 
     pairs: tuple[Pair, ...] = ()
     """SENSORS.csv and MARKERS.csv of each recording."""
@@ -25,6 +25,9 @@ class LearnFiles:
     """The error of a corrected model is stated on it, too."""
     adapt: Annotated[Path | None, Flag("--adapt", "MODEL", "Correct this model by a few labelled frames of another day.")] = None
     """It keeps its bones."""
+    end_to_end: Annotated[bool, Flag("--end-to-end", help="A second network from readings to bones.")] = False
+    bones: Annotated[int, Flag("--bones", help="How many bones.")] = 8
+    plane: Annotated[str | None, Flag("--plane", "X,Y,Z", "Normal of the plane in which the body bends.")] = None
     calibration: Annotated[Path | None, Flag("-c --calibration", "FILE", "Take a camera's markers into the robot's frame.")] = (
         None
     )

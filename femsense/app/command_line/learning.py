@@ -9,7 +9,7 @@ from typing import Annotated
 from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar
 from femsense.app.command_line.parameters import argument, option
-from femsense.app.learn_options import LearnFiles
+from femsense.app.learn_options import LearnTask
 
 
 @command()
@@ -22,21 +22,11 @@ def learn(
         ),
     ],
     output: Annotated[Path, option("-o --output", "MODEL", "The ONNX file.")],
-    options: LearnFiles,
-    end_to_end: Annotated[bool, option("--end-to-end", help="A second network from readings to bones.")] = False,
-    bones: Annotated[int, option("--bones", help="How many bones.")] = 8,
-    plane: Annotated[str | None, option("--plane", "X,Y,Z", "Normal of the plane in which the body bends.")] = None,
+    task: LearnTask,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
     from femsense.app.learn_command import learn_into, pairs_of
 
     with progress_bar("learn") as progress:
-        document, text = learn_into(
-            replace(options, pairs=pairs_of(files)),
-            output,
-            end_to_end=end_to_end,
-            bones=bones,
-            plane=plane,
-            progress=progress,
-        )
+        document, text = learn_into(replace(task, pairs=pairs_of(files)), output, progress=progress)
     return Answer(document, text)
