@@ -24,12 +24,15 @@ LISTED = 6
 """Number of frames that are listed one by one."""
 
 
-def columns(rows: Iterable[Sequence[str]], *, indent: int = 2) -> str:
-    """Return rows of text as aligned columns; a row may end early."""
+def columns(rows: Iterable[Sequence[str]], *, indent: int = 2, right: bool = False) -> str:
+    """Return rows of text as aligned columns; a row may end early. `right`: all columns but the first are aligned on the right."""
     table = [list(row) for row in rows]
     count = max((len(row) for row in table), default=0)
-    widths = [max((len(row[j]) for row in table if j < len(row) - 1), default=0) for j in range(count)]
-    return "\n".join((" " * indent + "  ".join(cell.ljust(width) for cell, width in zip(row, widths))).rstrip() for row in table)
+    ragged = 0 if right else 1  # the last cell of a row takes its own width
+    widths = [max((len(row[j]) for row in table if j < len(row) - ragged), default=0) for j in range(count)]
+    sides = [str.rjust if right and j else str.ljust for j in range(count)]
+    lines = ["  ".join(side(cell, width) for side, cell, width in zip(sides, row, widths)) for row in table]
+    return "\n".join((" " * indent + line).rstrip() for line in lines)
 
 
 def calibration_text(calibration: Calibration) -> str:

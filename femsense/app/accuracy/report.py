@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from femsense.app.accuracy.errors import Answer, Errors, errors_of, reference_of, space_name
 from femsense.app.accuracy.loads import Load, Patches
+from femsense.report.text import columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,27 +142,19 @@ def accuracy_text(report: Mapping[str, Any]) -> str:
         f"the declared mesh: {d['element']}, {d['tetrahedra']} tetrahedra, {d['unknowns']} unknowns",
         f"compared with: {report['reference']['text']}",
         "",
-        _table(("load", "motion", "error", "of the motion", "doubt"), map(_load_cells, report["loads"])),
+        columns([("load", "motion", "error", "of the motion", "doubt"), *map(_load_cells, report["loads"])], right=True),
     ]
     if not report["loads"]:
         lines.append("  none: the robot has neither weight nor cables nor chambers; forces alone are looked at")
     if len(report["forces"]["places_mm"]):
-        lines += ["", _table(("force at [mm]", "moves it", "sensed force"), _force_cells(report["forces"]))]
+        lines += ["", columns([("force at [mm]", "moves it", "sensed force"), *_force_cells(report["forces"])], right=True)]
         lines.append("  (+: sensed too large, the mesh is too stiff)")
     head = ("space", "tetrahedra", "unknowns", "ms a step", "motion", "force")
-    lines += ["", _table(head, map(_space_cells, report["spaces"]))]
+    lines += ["", columns([head, *map(_space_cells, report["spaces"])], right=True)]
     enough = f"{good['motion_percent']:.0f} % of motion, {good['force_percent']:.0f} % of force"
     lines.append(f"  * declared; errors are the worst of all loads and places; fine enough: {enough}")
     lines += [f"  left out: {'; '.join(left_out)}"] if left_out else []
     return "\n".join([*lines, "", report["advice"]])
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return rows of text as columns, the first on the left, numbers on the right."""
-    table = [head, *rows]
-    widths = [max(len(row[j]) for row in table) for j in range(len(head))]
-    cells = [[row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:]))] for row in table]
-    return "\n".join("  " + "   ".join(row) for row in cells)
 
 
 def _load_cells(row: Mapping[str, Any]) -> list[str]:
