@@ -15,7 +15,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from femsense.app.command_line.answer import Answer
-from femsense.app.command_line.parameters import Json, filled, missing, option
+from femsense.app.command_line.parameters import Json, missing, option
 from femsense.app.command_line.several import MANY, Several, several
 from femsense.core.options import Flag
 
@@ -81,9 +81,9 @@ def _of_options(type_: Any) -> Iterator[Parameter]:
 
 
 def _filled(type_: Any, given: dict[str, Any]) -> Any:
-    """Return an options type made of what stands on the command line. Raises InputError where a text cannot be read."""
-    read = {name: flag.read(given[name] or []) for name, flag in _flags(type_).items() if flag.read is not None}
-    return filled(type_, given, **read)
+    """Return an options type made of the values on the command line. Raises InputError where a text cannot be read."""
+    flags = _flags(type_)
+    return type_(**{n: given[n] if flag.read is None else flag.read(given[n] or []) for n, flag in flags.items()})
 
 
 def _flags(type_: Any) -> dict[str, Flag]:
