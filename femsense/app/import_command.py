@@ -33,9 +33,9 @@ def import_into(
     folder: str | Path,
     paths: Sequence[str | Path],
     options: Options,
-    driven: InputOptions,
     *,
     say: Say,
+    driven: InputOptions | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -45,15 +45,15 @@ def import_into(
         folder: of the recording.
         paths: the captures, one a camera; NAME=PATH names it.
         options: what a person says about it.
-        driven: what a person says about the inputs.
         say: called with one line about what is happening.
+        driven: what a person says about the inputs.
         again: repeat the import although the recording is there.
         progress: called with (frames done, frames in all).
 
     Raises:
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
-    options = _spelt(options)
+    options, driven = _spelt(options), driven or InputOptions()
     _check_options(options)
     check_target(folder, folder=True)
     final = followed(folder)

@@ -80,7 +80,7 @@ def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]
     except ValueError as error:
         raise InputError("not valid JSON", where=file, found=error, expected=expected) from None
     if not isinstance(document, dict):
-        raise InputError("not a JSON object", where=file, found=type(document).__name__, expected=expected)
+        raise InputError("another kind of file", where=file, found=type(document).__name__, expected=expected)
     return document
 
 

@@ -30,7 +30,7 @@ def import_(
     from femsense.app.import_command import import_into, import_text
 
     with progress_bar("import") as progress:
-        document = import_into(output, source, options, driven, say=say, again=again, progress=progress)
+        document = import_into(output, source, options, driven=driven, say=say, again=again, progress=progress)
     text = f"{import_text(output, document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
     return Answer({"recording": str(output), **document}, text)
 
