@@ -278,8 +278,8 @@ def import_alone(path: Path, output: Path, options: dict[str, str]) -> dict[str,
 
 
 def run_import(path: str, output: str, options: str) -> None:
-    from femsense.io.importers.frames import Options
     from femsense.io.importers.guess import open_source
+    from femsense.io.importers.options import Options
     from femsense.io.importers.writer import write_recording
 
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -17,7 +17,8 @@ import numpy as np
 import trimesh
 
 from femsense import InputError
-from femsense.io.meshing.filling import MeshOptions, fill
+from femsense.io.meshing.filling import fill
+from femsense.io.meshing.options import MeshOptions
 from femsense.io.meshing.quality import quality_report
 
 

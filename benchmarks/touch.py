@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from femsense import Recording, Robot, SensingOptions, apply_effects, calibrate, estimate, load_recording, load_robot, simulate
-from femsense.app.demo.truth import read_truth, true_effects
+from femsense.app.demo.truth import true_effects
+from femsense.sensing.comparison import read_truth
 
 PLACES = {
     "leg, from above": [0.0, -0.042964, 0.09057],

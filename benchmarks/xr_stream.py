@@ -165,7 +165,7 @@ def flood(seconds: float, rate_hz: float = 500.0) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
         probe.close()
-        with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=PAGE)) as live:
+        with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(port=0, page=PAGE)) as live:
             client = spawn.Process(target=latencies, args=("ws", live.server.port, seconds + 5.0, out))
             client.start()
             time.sleep(2.0)

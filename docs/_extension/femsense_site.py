@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from femsense.app.cli import EXAMPLES, app
+from femsense.app.cli import COMMANDS, app
 
 FIELDS: dict[str, list[str]] = {}
 """Qualified name of a field → its text."""
@@ -73,17 +74,19 @@ def command_page(name: str, command: Any) -> Iterator[str]:
     yield "| argument, option | meaning |\n|---|---|"
     for parameter in command.params:
         yield f"| {_name(parameter)} | {_cell(parameter.help)}{_default(parameter)} |"
-    yield f"\nExample:\n\n```sh\n{EXAMPLES[name]}\n```"
+    yield f"\nExample:\n\n```sh\n{COMMANDS[name][1]}\n```"
     yield ""
 
 
 def _name(parameter: Any) -> str:
     """Return how a table names a parameter: an argument by its word, an option by its flags and what it takes."""
-    metavar = _cell(parameter.metavar or parameter.name.upper())
     if parameter.param_type_name == "argument":
-        return f"`{metavar}`"
+        return f"`{_cell(parameter.metavar or parameter.name.upper())}`"
     flags = ", ".join(f"`{flag}`" for flag in [*parameter.opts, *parameter.secondary_opts])
-    return f"{flags} `{metavar}`" if parameter.metavar else flags
+    type_ = parameter.type_descriptor.annotation
+    choices = "|".join(choice.value for choice in type_) if isinstance(type_, type) and issubclass(type_, Enum) else None
+    takes = parameter.metavar or choices
+    return f"{flags} `{_cell(takes)}`" if takes else flags
 
 
 def _cell(text: str | None) -> str:

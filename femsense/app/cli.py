@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -20,6 +20,7 @@ from typer.exceptions import TyperException
 
 import femsense
 from femsense.app.command_line import data, learning, loop, results, sensing, start
+from femsense.app.command_line.adapter import Command
 from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import repeat_options
 from femsense.app.compiling import announced_compiling
@@ -61,48 +62,28 @@ def _common(
 ) -> None: ...
 
 
-COMMANDS: dict[str, Callable[..., Answer]] = {
-    "demo": start.demo,
-    "inspect": start.inspect,
-    "import": data.import_,
-    "mesh": data.mesh,
-    "simulate": data.simulate,
-    "calibrate": sensing.calibrate,
-    "estimate": sensing.estimate,
-    "live": sensing.live,
-    "improve": loop.improve,
-    "export": results.export,
-    "reach": sensing.reach,
-    "learn": learning.learn,
-    "view": results.view,
-    "stream": results.stream,
-    "report": results.report,
-    "docs": start.docs,
-    "doctor": start.doctor,
+COMMANDS: dict[str, tuple[Command, str]] = {
+    "demo": (start.demo, "femsense demo -o femsense-demo"),
+    "inspect": (start.inspect, "femsense inspect my-recording --robot my-robot"),
+    "import": (data.import_, "femsense import take.db3 -o my-recording --free 0:20"),
+    "mesh": (data.mesh, "femsense mesh finger.stl --unit mm -o my-robot"),
+    "simulate": (data.simulate, "femsense simulate my-robot script.toml -o my-recording"),
+    "calibrate": (sensing.calibrate, "femsense calibrate my-robot my-recording -o calibration.json"),
+    "estimate": (sensing.estimate, "femsense estimate my-robot my-recording -c calibration.json -o run"),
+    "live": (sensing.live, "femsense live my-robot --camera realsense --actuation fixed:top=2"),
+    "improve": (loop.improve, "femsense improve my-robot monday --validation tuesday -o improved"),
+    "export": (results.export, "femsense export run -o robot.glb --arrows"),
+    "reach": (sensing.reach, "femsense reach four-leg --target tip=0.01,0,0.12 -o motion.json"),
+    "learn": (learning.learn, "femsense learn sensors.csv markers.csv -o finger.onnx"),
+    "view": (results.view, "femsense view run"),
+    "stream": (results.stream, "femsense stream --sensors sensors.csv --model finger.onnx --browser"),
+    "report": (results.report, "femsense report run"),
+    "docs": (start.docs, "femsense docs is-this-force-real"),
+    "doctor": (start.doctor, "femsense doctor"),
 }
-"""In the order of the help."""
-EXAMPLES: dict[str, str] = {
-    "demo": "femsense demo -o femsense-demo",
-    "inspect": "femsense inspect my-recording --robot my-robot",
-    "import": "femsense import take.db3 -o my-recording --free 0:20",
-    "mesh": "femsense mesh finger.stl --unit mm -o my-robot",
-    "simulate": "femsense simulate my-robot script.toml -o my-recording",
-    "calibrate": "femsense calibrate my-robot my-recording -o calibration.json",
-    "estimate": "femsense estimate my-robot my-recording -c calibration.json -o run",
-    "live": "femsense live my-robot --camera realsense --actuation fixed:top=2",
-    "improve": "femsense improve my-robot monday --validation tuesday -o improved",
-    "export": "femsense export run -o robot.glb --arrows",
-    "reach": "femsense reach four-leg --target tip=0.01,0,0.12 -o motion.json",
-    "learn": "femsense learn sensors.csv markers.csv -o finger.onnx",
-    "view": "femsense view run",
-    "stream": "femsense stream --sensors sensors.csv --model finger.onnx --browser",
-    "report": "femsense report run",
-    "docs": "femsense docs is-this-force-real",
-    "doctor": "femsense doctor",
-}
-"""The last line of each command's help."""
-for _name, _command in COMMANDS.items():
-    app.command(_name, epilog=f"\b\nExample:\n  {EXAMPLES[_name]}")(_command)
+"""Name → command, and the last line of its help. In the order of the help."""
+for _name, (_command, _example) in COMMANDS.items():
+    app.command(_name, epilog=f"\b\nExample:\n  {_example}")(_command)
 
 
 # Running them

@@ -1,4 +1,4 @@
-"""From files to files: what the commands do between reading their arguments and saying the result, with resuming."""
+"""From files to files: the work of the commands between their arguments and their answers, with resuming."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def estimate_into(
     again: bool = False,
     progress: Progress | None = None,
 ) -> Run:
-    """Estimate a recording into a folder, or return what stands there if it was made from the same input.
+    """Estimate a recording into a folder, or return the run in it if it was made from the same input.
 
     Arguments:
         folder: of the run.
         robot, recording: folders (or the name of a robot).
-        say: told in one line what happens beside the estimate.
+        say: called with a line on each step besides the estimate.
         calibration: calibration.json; None calibrates first.
         at: places of contact at rest [m], shape (k, 3).
         options: of `estimate`.
@@ -102,15 +102,15 @@ def improve_into(
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Close the loop into a folder, or return what stands there if it was made from the same input.
+    """Close the loop into a folder, or return the loop in it if it was made from the same input.
 
     Arguments:
         folder: gets loop.json, robot.toml and the mesh.
         robot: a folder, or the name of a robot.
-        recordings: what effects are found on; validation: what they are tested on.
-        say: told in one line what happens beside the loop.
+        recordings: on which effects are found; validation: on which they are tested.
+        say: called with a line on each step besides the loop.
         effects, without: names of effects to try, or not to try.
-        options: of `improve`; what it keeps is set here.
+        options: of `improve`; its checkpoint is set here.
         again: compute even where the result is there.
         progress: as of `improve`.
 
@@ -174,12 +174,12 @@ def _require_different(recordings: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
-    """Return where a killed command has left how far it came, and what that is made from."""
+    """Return the file in which a killed command left its progress, and the input of that."""
     return Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}
 
 
 def load_pages(load: Callable[[str], object] = importlib.import_module) -> None:
-    """Load what draws pages, which takes a second; an installation without it has no pages.
+    """Load the packages that draw pages, which takes a second; an installation without them has no pages.
     `load` imports a module by its name."""
     with contextlib.suppress(ImportError):
         for name in ("femsense.report", "matplotlib.figure", "matplotlib.backends.backend_svg"):
@@ -197,6 +197,11 @@ def loop_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Pat
     page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
     if page.is_file() and page.stat().st_mtime_ns >= loop.stat().st_mtime_ns:
         return page
+    return written_page(folder, say=say, write=write)
+
+
+def written_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Path] | None = None) -> Path | None:
+    """Write report.html of a folder of results and return it; None where this installation cannot. Arguments as of `loop_page`."""
     try:
         from femsense.report import write_report
 
@@ -233,7 +238,7 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, 
 def script_plan(
     robot: str | Path, script: str | Path, *, noise: float, folder: str | Path | None = None
 ) -> tuple[dict[str, Any], str]:
-    """Return what the experiment of a script could show, as plain tables and as text: effects, and forces where it has clouds.
+    """Return the effects that the experiment of a script could identify, and the forces where it has clouds, as tables and as text.
 
     Arguments:
         robot, script: folder or name, and file.
@@ -279,7 +284,7 @@ def plan_into(
     """Propose an experiment; write it as a script where a file is named. Return it as plain tables and as text.
 
     Arguments:
-        file: script to write; one with `-far` in its name is written beside it for a second distance of the camera.
+        file: script to write; one with `-far` in its name is written next to it for a second distance of the camera.
         robot: a folder, or the name of a robot.
         given: a recording that exists; None starts from nothing.
         noise: of a marker's coordinate [m].
@@ -296,8 +301,6 @@ def plan_into(
     from femsense.loop.design.documents import proposal_document
     from femsense.loop.design.planner import plan_experiment
 
-    if control not in ("tension", "displacement"):
-        raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")
     if file is not None and Path(file).suffix != ".toml":
         raise InputError("not the name of a script", where="-o", found=str(file), expected="a file that ends in .toml")
     if file is not None:

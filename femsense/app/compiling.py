@@ -1,4 +1,4 @@
-"""What a command says while it waits for kernels to be compiled."""
+"""The message of a command that waits for kernels to be compiled."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ COMPILING_TEXT = "compiling kernels, once after an installation: up to a minute"
 
 @contextlib.contextmanager
 def announced_compiling(words: Sequence[str], say: Callable[[str], None]) -> Iterator[None]:
-    """Say once that kernels are compiled, when the first one is.
+    """Report once that kernels are compiled, when the first one is.
 
     Arguments:
-        words: the command and its arguments; others than those that use kernels are left alone, so that they need not load numba.
+        words: the command and its arguments; commands without kernels do not load numba.
         say: takes the line.
     """
     uses = words[0] in COMPILING or (words[0] == "stream" and bool(DRAGGING & set(words)))

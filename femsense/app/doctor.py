@@ -1,4 +1,4 @@
-"""What this installation has and lacks, with the line that mends it."""
+"""Checks of this installation, each with the line that mends it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
 import femsense
+from femsense.core.parallel import available_cores
 
 PACKAGES = {
     "numpy": "numpy",
@@ -44,95 +46,102 @@ LIBRARIES = {
     "libX11.so.6": "libx11-6",
     "libudev.so.1": "libudev1",
 }
-"""What Open3D is linked to on Linux → the Debian package that has it."""
+"""Library that Open3D is linked to on Linux → its Debian package."""
 OTHER_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libEGL.so.1": "libegl1", "libglib-2.0.so.0": "libglib2.0-0"}
-"""What other versions of it may want."""
+"""Libraries of other versions of it."""
 LITTLE_MEMORY_GB = 2.0
 SMALL_RESIDUAL_N = 1e-6
 FEW_KERNELS = 50
 """Functions: an installation brings 59, and the tiny solve alone leaves 31."""
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One finding."""
+class Level(StrEnum):
+    """How serious a finding is."""
 
-    name: str
-    level: str
-    """"ok", "warning" (something is slower or missing that is not always needed) or "error"."""
+    OK = "ok"
+    WARNING = "warning"
+    """Something is slower, or missing and not always needed."""
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of a check."""
+
+    level: Level
     found: str
     hint: str | None = None
-    """What to do."""
+    """The remedy."""
+
+
+def good(found: str) -> Finding:
+    """Return the finding of a check that passes."""
+    return Finding(Level.OK, found)
+
+
+def note(found: str, hint: str) -> Finding:
+    """Return a finding that is slower or lacks something, with its remedy."""
+    return Finding(Level.WARNING, found, hint)
+
+
+def bad(found: str, hint: str) -> Finding:
+    """Return a finding that keeps femsense from working, with its remedy."""
+    return Finding(Level.ERROR, found, hint)
 
 
 def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
     """Check this installation.
 
     Arguments:
-        packages: modules that have to be there, and what pip calls them.
+        packages: required modules, and their names on PyPI.
 
     Returns:
-        `ok` (no check has level "error") and `checks`, each `{name, level, found, hint}`.
+        `ok` (no check has the level "error") and `checks`, each `{name, level, found, hint}`.
     """
-    checks = [_python(), *(_package(module, package) for module, package in packages.items())]
-    parts: tuple[Callable[[], Check], ...] = (
-        _tetrahedra,
-        _libraries,
-        _solver,
-        _viewer,
-        _robots,
-        _numba_cache,
-        _kernels,
-        _tiny_solve,
-        _machine,
-    )
-    checks += [_guarded(part) for part in parts]
-    return {"ok": all(check.level != "error" for check in checks), "checks": [asdict(check) for check in checks]}
+    findings = {"python": _python(), **{module: _package(module, package) for module, package in packages.items()}}
+    findings |= {name: _guarded(part) for name, part in PARTS.items()}
+    checks = [{"name": name, **asdict(finding)} for name, finding in findings.items()]
+    return {"ok": all(finding.level is not Level.ERROR for finding in findings.values()), "checks": checks}
 
 
 def doctor_text(document: dict[str, Any]) -> str:
-    """Return what `diagnose` found as a table."""
-    marks = {"ok": "ok", "warning": "note", "error": "BAD"}
+    """Return the findings of `diagnose` as a table."""
+    marks = {Level.OK: "ok", Level.WARNING: "note", Level.ERROR: "BAD"}
     width = max(len(check["name"]) for check in document["checks"])
     lines = []
     for check in document["checks"]:
         lines.append(f"{marks[check['level']]:<4}  {check['name']:<{width}}  {check['found']}")
         if check["hint"]:
             lines.append(f"{'':<{width + 8}}→ {check['hint']}")
-    bad = sum(check["level"] == "error" for check in document["checks"])
+    bad = sum(check["level"] == Level.ERROR for check in document["checks"])
     lines += ["", "everything that is needed works" if not bad else f"{bad} checks failed: femsense will not work fully"]
     return "\n".join(lines)
 
 
-def _guarded(part: Callable[[], Check]) -> Check:
-    """Return a check; one that fails in itself is an error, not a crash."""
+def _guarded(part: Callable[[], Finding]) -> Finding:
+    """Return the finding of a check; one that fails in itself is an error, not a crash."""
     try:
         return part()
     except Exception as error:  # a broken installation may fail in any way
-        return Check(
-            part.__name__.strip("_").replace("_", " "),
-            "error",
-            _short(error),
-            "reinstall: pip install --force-reinstall femsense",
-        )
+        return bad(_short(error), "reinstall: pip install --force-reinstall femsense")
 
 
-def _python() -> Check:
+def _python() -> Finding:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    good = (3, 11) <= sys.version_info[:2] <= (3, 12)
-    return Check("python", "ok" if good else "error", found, None if good else "femsense runs on Python 3.11 and 3.12")
+    known = (3, 11) <= sys.version_info[:2] <= (3, 12)
+    return good(found) if known else bad(found, "femsense runs on Python 3.11 and 3.12")
 
 
-def _package(module: str, package: str) -> Check:
+def _package(module: str, package: str) -> Finding:
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # OSError and ImportError, and what a broken binary raises
-        return Check(module, "error", _short(error), import_hint(str(error), package))
-    return Check(module, "ok", _version(package) or str(getattr(loaded, "__version__", "version not known")))
+        return bad(_short(error), import_hint(str(error), package))
+    return good(_version(package) or str(getattr(loaded, "__version__", "version not known")))
 
 
 def import_hint(message: str, package: str) -> str:
-    """Return what to do where an import failed with this message: the system's package, or pip's."""
+    """Return the remedy for an import that failed with this message: a package of the system, or of pip."""
     library = re.search(r"(lib[\w.+-]+\.so(?:\.\d+)*)", message)
     debian = {**LIBRARIES, **OTHER_LIBRARIES}.get(library.group(1)) if library else None
     if debian is not None:
@@ -140,103 +149,75 @@ def import_hint(message: str, package: str) -> str:
     return f"pip install {package}"
 
 
-def _tetrahedra() -> Check:
+def _tetrahedra() -> Finding:
     """pytetwild runs in a process of its own and is not loaded here."""
     if importlib.util.find_spec("pytetwild") is None:
-        return Check("pytetwild", "warning", "not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
-    return Check("pytetwild", "ok", _version("pytetwild") or "version not known")
+        return note("not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
+    return good(_version("pytetwild") or "version not known")
 
 
-def _libraries() -> Check:
+def _libraries() -> Finding:
     if not sys.platform.startswith("linux"):
-        return Check("system libraries", "ok", "only checked on Linux")
-    missing = [name for name in LIBRARIES if not _loads(name)]
+        return good("only checked on Linux")
+    missing = {library: package for library, package in LIBRARIES.items() if not _loads(library)}
     if not missing:
-        return Check("system libraries", "ok", "all that Open3D wants")
-    return Check(
-        "system libraries",
-        "error",
-        "missing: " + ", ".join(missing),
-        "apt-get install " + " ".join(LIBRARIES[name] for name in missing),
-    )
+        return good("all that Open3D wants")
+    return bad("missing: " + ", ".join(missing), "apt-get install " + " ".join(missing.values()))
 
 
-def _solver() -> Check:
+def _solver() -> Finding:
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
     if chosen in ("", "cholesky", "direct"):
-        return Check("linear solver", "ok", "Cholesky of femsense, with the BLAS of SciPy")
+        return good("Cholesky of femsense, with the BLAS of SciPy")
     if chosen == "iterative":
-        return Check(
-            "linear solver",
-            "warning",
-            "conjugate gradients",
-            "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time",
-        )
+        return note("conjugate gradients", "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time")
     if chosen not in ("pardiso", "superlu"):
-        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
+        return bad(f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
     from femsense.fem.linalg.factorization import pardiso_library
 
     name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
-    return Check(
-        "linear solver", "warning", name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along"
-    )
+    return note(name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along")
 
 
-def _viewer() -> Check:
+def _viewer() -> Finding:
     from femsense.xr.view import PAGE
 
-    if (PAGE / "index.html").is_file():
-        size = sum(file.stat().st_size for file in PAGE.iterdir() if file.is_file())
-        return Check("viewer page", "ok", f"{size / 1e3:.0f} kB")
-    return Check(
-        "viewer page",
-        "warning",
-        "not built into this installation: femsense view will not work",
-        "pip install . (in a checkout: pip install -e .)",
-    )
+    if not (PAGE / "index.html").is_file():
+        hint = "pip install . (in a checkout: pip install -e .)"
+        return note("not built into this installation: femsense view will not work", hint)
+    size = sum(file.stat().st_size for file in PAGE.iterdir() if file.is_file())
+    return good(f"{size / 1e3:.0f} kB")
 
 
-def _robots() -> Check:
+def _robots() -> Finding:
     from femsense.io.robot_toml import robot_names
 
     names = ", ".join(robot_names())
-    return Check("robots that come along", "ok" if names else "warning", names or "none", None if names else "reinstall femsense")
+    return good(names) if names else note("none", "reinstall femsense")
 
 
-def _numba_cache() -> Check:
+def _numba_cache() -> Finding:
     """Compiled kernels are kept in __pycache__, in NUMBA_CACHE_DIR, or in the user's cache folder."""
     package = Path(femsense.__file__).parent / "fem"
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(chosen)] if chosen else [package / "__pycache__", package, Path.home() / ".cache"]
-    usable = next((place for place in places if place.is_dir() and _writable(place)), None)
-    if usable is None:
-        return Check(
-            "cache of compiled kernels",
-            "warning",
-            "no folder can be written: each start compiles anew",
-            "set NUMBA_CACHE_DIR to a folder of your own",
-        )
-    return Check("cache of compiled kernels", "ok", "can be written")
+    if any(place.is_dir() and _writable(place) for place in places):
+        return good("can be written")
+    return note("no folder can be written: each start compiles anew", "set NUMBA_CACHE_DIR to a folder of your own")
 
 
-def _kernels() -> Check:
+def _kernels() -> Finding:
     """Kernels of calibrate and estimate come along compiled, if the build could run them;
     each is a file where numba looks for it."""
-    package = Path(femsense.__file__).parent
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    found = [_kernel_version(file) for file in (Path(chosen) if chosen else package).rglob("*.nbi")]
+    found = [_kernel_version(file) for file in Path(chosen or Path(femsense.__file__).parent).rglob("*.nbi")]
     mine = found.count(_version("numba"))
     if mine >= FEW_KERNELS:
-        return Check("compiled kernels", "ok", f"{mine} functions are compiled")
+        return good(f"{mine} functions are compiled")
     other = f", and {len(found) - mine} by another version of numba" if mine < len(found) else ""
-    return Check(
-        "compiled kernels",
-        "warning",
-        f"{mine} functions are compiled{other}: the first calibrate and estimate compile for up to a minute each",
-        "NUMBA_CACHE_DIR hides those that came along"
-        if chosen
-        else "pip install --force-reinstall --no-deps -v femsense says why",
-    )
+    text = f"{mine} functions are compiled{other}: the first calibrate and estimate compile for up to a minute each"
+    reinstall = "pip install --force-reinstall --no-deps -v femsense says why"
+    return note(text, "NUMBA_CACHE_DIR hides those that came along" if chosen else reinstall)
 
 
 def _kernel_version(index: Path) -> object:
@@ -245,7 +226,7 @@ def _kernel_version(index: Path) -> object:
         return pickle.load(file)
 
 
-def _tiny_solve() -> Check:
+def _tiny_solve() -> Finding:
     """Let a soft cube hang by one face: the equilibrium certifies itself by its residual, and the weight must be carried."""
     import numpy as np
 
@@ -269,19 +250,30 @@ def _tiny_solve() -> Check:
     state = solve_equilibrium(body)
     sag = 1e3 * float((corners - state.positions)[:, 2].max())
     found = f"{state.status}, residual {state.residual_n:.1e} N, sag {sag:.3f} mm"
-    good = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
-    return Check(
-        "a tiny solve", "ok" if good else "error", found, None if good else "reinstall: pip install --force-reinstall femsense"
-    )
+    solved = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
+    return good(found) if solved else bad(found, "reinstall: pip install --force-reinstall femsense")
 
 
-def _machine() -> Check:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _machine() -> Finding:
     free = _free_memory_gb()
-    text = f"{cores} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
+    text = f"{available_cores()} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
     if free is not None and free < LITTLE_MEMORY_GB:
-        return Check("machine", "warning", text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
-    return Check("machine", "ok", text)
+        return note(text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
+    return good(text)
+
+
+PARTS: dict[str, Callable[[], Finding]] = {
+    "pytetwild": _tetrahedra,
+    "system libraries": _libraries,
+    "linear solver": _solver,
+    "viewer page": _viewer,
+    "robots that come along": _robots,
+    "cache of compiled kernels": _numba_cache,
+    "compiled kernels": _kernels,
+    "a tiny solve": _tiny_solve,
+    "machine": _machine,
+}
+"""Name of a check → the check."""
 
 
 def _free_memory_gb() -> float | None:

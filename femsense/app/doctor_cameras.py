@@ -1,4 +1,4 @@
-"""The cameras that are plugged in, their links, and what a session needs of them."""
+"""Checks of connected cameras, their links, and the disk that a session needs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from femsense.app.doctor import Check
+from femsense.app.doctor import Finding, Level, good, note
 from femsense.live.sources import list_cameras
 from femsense.live.sources.source import FoundCamera
 
 USB2_MBIT_S, USB3_MBIT_S = 280.0, 3200.0
-"""What a bus carries in practice, of 480 and 5000 Mbit/s."""
+"""Practical capacity of a bus of 480 and of 5000 Mbit/s."""
 NEEDED_DISK_MB_S = 20.0
 """Depth and colour of 848 × 480 at 30 Hz as PNG."""
 WRITTEN_MB = 32
@@ -22,39 +22,35 @@ Listing = tuple[Sequence[FoundCamera], Mapping[str, str]]
 
 
 def camera_checks(listing: Callable[[], Listing] = list_cameras) -> list[dict[str, Any]]:
-    """Return what `femsense doctor` says of cameras: each one found, packages that are missing, buses that carry too little, the disk.
+    """Return the checks of cameras: each one found, missing packages, overloaded buses, the disk.
 
     Arguments:
         listing: returns the cameras, and for each kind whose package is missing how to install it.
     """
     cameras, missing = listing()
-    checks = [_camera(camera) for camera in cameras]
+    checks = {f"camera {camera.source}": _camera(camera) for camera in cameras}
     if not cameras:
         looked = "none found" if len(missing) < 3 else "no package for cameras is installed"
-        hint = "a recording can be replayed: femsense live ROBOT --camera RECORDING"
-        checks.append(Check("cameras", "warning", looked, hint))
+        checks["cameras"] = note(looked, "a recording can be replayed: femsense live ROBOT --camera RECORDING")
     for word, text in missing.items():
-        checks.append(
-            Check(f"cameras: {word}", "warning", "its package is not installed", text.partition("try:")[2].strip() or text)
-        )
+        checks[f"cameras: {word}"] = note("its package is not installed", text.partition("try:")[2].strip() or text)
     needed = sum(camera.needed_mbit_s for camera in cameras)
     limit = USB2_MBIT_S if any(camera.is_slow_link for camera in cameras) else USB3_MBIT_S
     if len(cameras) > 1 and needed > limit:
         found = f"{needed:.0f} Mbit/s are needed, one bus carries about {limit:.0f}"
-        checks.append(Check("bandwidth of the bus", "warning", found, "spread the cameras over several USB controllers"))
-    checks.append(_disk())
-    return [asdict(check) for check in checks]
+        checks["bandwidth of the bus"] = note(found, "spread the cameras over several USB controllers")
+    checks["disk for sessions"] = _disk()
+    return [{"name": name, **asdict(finding)} for name, finding in checks.items()]
 
 
-def _camera(camera: FoundCamera) -> Check:
-    name = f"camera {camera.source}"
+def _camera(camera: FoundCamera) -> Finding:
     found = f"{camera.name}, {camera.link}, needs {camera.needed_mbit_s:.0f} Mbit/s"
     if camera.is_slow_link:
-        return Check(name, "warning", found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
-    return Check(name, "ok", found)
+        return note(found, f"a USB 2 bus carries about {USB2_MBIT_S:.0f}: use a USB 3 port and cable")
+    return good(found)
 
 
-def _disk() -> Check:
+def _disk() -> Finding:
     """Write for a moment into the present folder, where sessions go."""
     data = bytes(1 << 20)
     try:
@@ -65,6 +61,6 @@ def _disk() -> Check:
             stream.flush()
             speed = WRITTEN_MB / (time.perf_counter() - began)
     except OSError as error:
-        return Check("disk for sessions", "warning", f"this folder cannot be written: {error.strerror}", "another -o SESSION")
+        return note(f"this folder cannot be written: {error.strerror}", "another -o SESSION")
     found = f"{speed:.0f} MB/s into this folder, a session at 30 Hz needs about {NEEDED_DISK_MB_S:.0f}"
-    return Check("disk for sessions", "ok" if speed > NEEDED_DISK_MB_S else "warning", found)
+    return good(found) if speed > NEEDED_DISK_MB_S else Finding(Level.WARNING, found)

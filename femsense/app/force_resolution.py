@@ -1,4 +1,4 @@
-"""The forces that a recording's camera resolves on a robot, said by `inspect`, `calibrate` and `estimate`."""
+"""The forces that a recording's camera resolves on a robot, reported by `inspect`, `calibrate` and `estimate`."""
 
 from __future__ import annotations
 

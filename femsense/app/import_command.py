@@ -1,4 +1,4 @@
-"""`femsense import`: from a capture of another program to a recording folder, and what is said of it."""
+"""`femsense import`: from a capture of another program to a recording folder, with notes on it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from femsense.core.text import plain_name
 from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.formats import FORMATS, format_of
-from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
+from femsense.io.importers.options import UNITS, InputOptions, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import header_of
 from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
@@ -24,48 +24,9 @@ from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, wri
 Progress = Callable[..., None]
 Say = Callable[[str], None]
 MANY_FRAMES = 1000
-"""Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
+"""A note suggests to thin recordings of more frames than this, since each frame costs time later …"""
 ENOUGH_FRAMES = 300
-"""… and where a robot moves slowly, so many say as much."""
-
-
-def columns_named(columns: Sequence[str]) -> dict[str, str]:
-    """Return the mappings NAME=TARGET of `--map` as name in the source → name in the recording. Raises InputError."""
-    pairs = [text.rpartition("=") if "@" not in text else text.partition("=") for text in columns]
-    for text, (old, mark, new) in zip(columns, pairs):
-        if not (old and mark and new):
-            raise InputError(
-                "not a mapping", where="--map", found=text, expected="NAME=TARGET, such as motor1=cable_north or 3=tip.x"
-            )
-    return {old: new for old, _, new in pairs}
-
-
-def shifts_named(shifts: Sequence[str]) -> dict[str, float]:
-    """Return the seconds CAMERA=S of `--shift` as camera → seconds. Raises InputError."""
-    found: dict[str, float] = {}
-    for text in shifts:
-        name, _, value = text.rpartition("=")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            name = ""
-        if not name:
-            raise InputError("not a shift of a camera's times", where="--shift", found=text, expected="CAMERA=SECONDS")
-    return found
-
-
-def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
-    """Return the spans FROM:TO of `--free` [s]. Raises InputError."""
-    spans = []
-    for text in ranges:
-        try:
-            first, last = (float(part) for part in text.split(":"))
-        except ValueError:
-            first, last = 1.0, 0.0
-        if first > last:
-            raise InputError("not a span of time", where="--free", found=text, expected="FROM:TO, seconds after the first frame")
-        spans.append((first, last))
-    return spans
+"""… to this number, which is enough where a robot moves slowly."""
 
 
 def import_into(
@@ -74,50 +35,44 @@ def import_into(
     options: Options,
     *,
     say: Say,
-    inputs: str | None = None,
-    zero: str | None = None,
-    actuation: str | Path | None = None,
-    offset: float | None = None,
+    driven: InputOptions | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Import a capture into a recording folder, or return what stands there if it was made from the same.
+    """Import a capture into a recording folder, or return the report of the import in it if it was made from the same.
 
     Arguments:
         folder: of the recording.
         paths: the captures, one a camera; NAME=PATH names it.
         options: what a person says about it.
-        say: told in one line what happens beside.
-        inputs: what cables' values are, "tension" or "displacement", where the capture does not say.
-        zero: "absolute" or "unknown".
-        actuation: a CSV file with the inputs over time.
-        offset: the frames' time minus that file's [s]; None finds it from the motion.
-        again: import anew although the recording is there.
+        say: called with one line about what is happening.
+        driven: what a person says about the inputs.
+        again: repeat the import although the recording is there.
         progress: called with (frames done, frames in all).
 
     Raises:
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
-    options = _spelt(options)
-    _check_options(options, inputs, zero)
+    options, driven = _spelt(options), driven or InputOptions()
+    _check_options(options)
     check_target(folder, folder=True)
     final = followed(folder)
     _check_apart(paths, final)
-    identity = _identity(paths, options, inputs, zero, actuation, offset)
+    identity = _identity(paths, options, driven)
     known = _standing(final, identity, again)
     if known is not None:
         say(f"{final} holds this import already (--again makes it anew)")
         return known
-    log = None if actuation is None else read_actuation_log(actuation, options)
-    source = open_sources(paths, options if actuation is None else _without_log(options, Path(actuation), paths))
+    log = None if driven.actuation is None else read_actuation_log(driven.actuation, options)
+    source = open_sources(paths, options if driven.actuation is None else _without_log(options, driven.actuation, paths))
     found = write_recording(
         source,
         final,
         identity=identity,
-        actuation=inputs,
-        zero=zero,
+        actuation=driven.inputs,
+        zero=driven.zero,
         log=log,
-        offset=offset,
+        offset=driven.offset,
         replace=again,
         progress=progress,
     )
@@ -144,7 +99,7 @@ def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
 
 
 def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
-    """Return what is said of a recording of very many frames."""
+    """Return the note on a recording of very many frames."""
     frames = int(found["frames"])
     if frames <= MANY_FRAMES:
         return ()
@@ -158,7 +113,7 @@ def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 
 
 def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
-    """Return what is said of a recording that does not tell when nothing touches the robot."""
+    """Return the note on a recording without contact-free frames."""
     if options.free:
         late = [f"{first:g}:{last:g}" for first, last in options.free if first > found["duration_s"] or last < 0]
         return tuple(f"--free {span}: no frame lies there; the frames last {found['duration_s']:.4g} s" for span in late)
@@ -169,7 +124,7 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 
 
 def _in_vain(name: str, options: Options) -> tuple[str, ...]:
-    """Return what is said of options that have no effect on a format."""
+    """Return notes on options that have no effect on a format."""
     said = {
         "--clock": options.clock != "auto",
         "--rate": options.rate is not None,
@@ -189,18 +144,9 @@ def _spelt(options: Options) -> Options:
     return replace(options, columns=columns, topics=topics, unit=options.unit if unit is None else unit.name)
 
 
-def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:
-    for name, value, allowed in (
-        ("--unit", options.unit, tuple(UNITS)),
-        ("--up", options.up, ("x", "y", "z")),
-        ("--clock", options.clock, ("auto", "header", "record")),
-        ("--inputs", inputs, ("tension", "displacement")),
-        ("--zero", zero, ("absolute", "unknown")),
-    ):
-        if value is not None and value not in allowed:
-            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
-    if options.every < 1:
-        raise InputError("not a count of frames", where="--every", found=options.every, expected="1, 2, …")
+def _check_options(options: Options) -> None:
+    if options.unit is not None and options.unit not in UNITS:
+        raise InputError("not a value of --unit", where="--unit", found=options.unit, expected="|".join(UNITS))
     if options.depth_unit is not None and not 0 < options.depth_unit < 1:
         raise InputError("not a unit of depth", where="--depth-unit", found=options.depth_unit, expected="metres, such as 0.001")
     if options.rate is not None and options.rate <= 0:
@@ -222,23 +168,14 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
     return replace(options, columns=columns, log_names=tuple(of_log))
 
 
-def _identity(
-    paths: Sequence[str | Path],
-    options: Options,
-    inputs: str | None,
-    zero: str | None,
-    actuation: str | Path | None,
-    offset: float | None,
-) -> dict[str, Any]:
-    """Return what an import is made from: another file, another time of its change or another option is another import."""
+def _identity(paths: Sequence[str | Path], options: Options, driven: InputOptions) -> dict[str, Any]:
+    """Return the identity of an import: another file, another time of its change or another option is another import."""
     states = [_state(split_name(path)[1]) for path in paths]
     return {
         "source": states[0] if len(states) == 1 else [*states, list(map(str, paths))],
         "options": asdict(options),
-        "inputs": inputs,
-        "zero": zero,
-        "actuation": None if actuation is None else _state(Path(actuation)),
-        "offset": offset,
+        **asdict(driven),
+        "actuation": None if driven.actuation is None else _state(driven.actuation),
         "femsense": femsense.__version__,
     }
 
@@ -263,7 +200,7 @@ def _state(path: Path) -> list[Any]:
 
 
 def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str, Any] | None:
-    """Return what an earlier import of the same says; None where there is none. Raises InputError where something else stands."""
+    """Return the report of an earlier import of the same; None where there is none. Raises InputError where other files are in its place."""
     if not final.exists():
         return None
     if final.is_dir() and not any(final.iterdir()):

@@ -16,7 +16,7 @@ from femsense.model.robot import Robot
 
 
 def warn_of_pictures(robot: Robot, recording: Recording) -> None:
-    """Warn of clouds that cannot be the robot's as they are, of colours that are missing, and of tags of another dictionary."""
+    """Warn of clouds that cannot show the robot, of missing colours, and of tags of another dictionary."""
     warn_of_tags(robot, recording)
     for text in [*cloud_problems(recording, robot=robot), *cloud_doubts(recording), *doubts_of_cloud_poses(robot, recording)]:
         warnings.warn(text, stacklevel=3)
@@ -28,7 +28,7 @@ def warn_of_pictures(robot: Robot, recording: Recording) -> None:
 
 
 def warn_of_tags(robot: Robot, recording: Recording) -> None:
-    """Warn where none of the robot's tags is in the colour images that are looked at, with the dictionary that has them there."""
+    """Warn where some colour images hold none of the robot's tags, with the dictionary whose tags they hold."""
     numbers = {look.aruco_id for look in robot.marker_looks} - {None}
     images = _some_colors(recording) if numbers else []
     if not images or any(numbers & _tags(image, robot.aruco_dictionary) for image in images):
@@ -53,7 +53,7 @@ def _tags(image: FloatArray, dictionary: str) -> set[int | None]:
 
 
 def warn_of_markers(robot: Robot, recording: Recording) -> None:
-    """Warn of markers of the robot that are seen in no frame."""
+    """Warn of markers of the robot that are visible in no frame."""
     seen = {recording.marker_names[i] for i in recording.marker_index if i >= 0} - {""}
     unseen = [name for name in robot.marker_names if name not in seen]
     if seen and unseen:

@@ -1,4 +1,4 @@
-"""What a file or a folder is, what is in it and what is wrong with it: a plain report for people and programs."""
+"""The kind, content and problems of a file or a folder: a plain report for people and programs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from femsense.app.inspection.recordings import inspect_cloud, inspect_image, inspect_jpeg, inspect_recording
-from femsense.app.inspection.reports import Report, collected
+from femsense.app.inspection.recordings import JPEG, inspect_cloud, inspect_image, inspect_recording
+from femsense.app.inspection.reports import Problems, Report, collected
 from femsense.app.inspection.results import (
     inspect_cad,
     inspect_calibration,
     inspect_capture,
-    inspect_folder,
     inspect_line,
     inspect_loop,
     inspect_many,
@@ -61,7 +60,7 @@ MESH_ENDINGS = (
 
 
 def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:
-    """Return what a file or folder is and holds, and what is wrong with it.
+    """Return kind, content and problems of a file or folder.
 
     Arguments:
         path: a file, a folder, or the name of a robot.
@@ -78,16 +77,16 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
     target = _existing(path)
     check_no_pipe([target])
     report: Report = {"path": str(target), "kind": "unknown"}
-    problems: list[str] = []
+    problems: Problems = []
     notes: list[str] = []
     with collected(problems, notes):
-        kind, inspect = _kind(target)
+        kind = _kind(target)
         report["kind"] = kind
-        inspect(target, report, problems)
+        KINDS[kind][1](target, report, problems)
         if robot is not None:
             _compare(target, report, robot)
-    report["problems"] = problems
-    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in problems]
+    report["problems"] = [str(problem) for problem in problems]
+    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in report["problems"]]
     checked: Report = plain(report)
     return checked
 
@@ -135,7 +134,7 @@ def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None =
         raise InputError(
             "--accuracy is about robots",
             where=path,
-            found=TITLES.get(report["kind"], report["kind"]),
+            found=KINDS[report["kind"]][0],
             expected="a folder with robot.toml, or the name of a robot",
         )
     if not report["problems"]:
@@ -145,7 +144,7 @@ def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None =
 
 def describe(report: Mapping[str, Any]) -> str:
     """Return a report of `inspect_path` as aligned plain text."""
-    lines = [f"{report['path']}: {TITLES.get(report['kind'], report['kind'])}", ""]
+    lines = [f"{report['path']}: {KINDS[report['kind']][0]}", ""]
     if "accuracy" in report:
         from femsense.app.accuracy.report import accuracy_text
 
@@ -169,26 +168,28 @@ def describe(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-TITLES = {
-    "line": "a body along a line (femsense docs bodies)",
-    "robot": "a robot",
-    "recording": "a recording",
-    "mesh": "a mesh of tetrahedra",
-    "surface": "a surface",
-    "cad": "a CAD file",
-    "cloud": "a point cloud",
-    "scene": "a glTF scene",
-    "image": "an image",
-    "calibration": "a calibration",
-    "run": "the results of an estimate",
-    "loop": "the result of a closed loop",
-    "many": "the results of many recordings",
-    "script": "a script of the virtual rig",
-    "unfinished": "results that are not finished",
-    "capture": "a capture of another program",
-    "table": "a table",
-    "unknown": "not a kind of file that femsense knows",
+Inspector = Callable[[Path, Report, Problems], None]
+KINDS: dict[str, tuple[str, Inspector]] = {
+    "line": ("a body along a line (femsense docs bodies)", inspect_line),
+    "robot": ("a robot", inspect_robot),
+    "recording": ("a recording", inspect_recording),
+    "mesh": ("a mesh of tetrahedra", inspect_mesh),
+    "surface": ("a surface", inspect_surface),
+    "cad": ("a CAD file", inspect_cad),
+    "cloud": ("a point cloud", inspect_cloud),
+    "scene": ("a glTF scene", inspect_scene),
+    "image": ("an image", inspect_image),
+    "calibration": ("a calibration", inspect_calibration),
+    "run": ("the results of an estimate", inspect_run),
+    "loop": ("the result of a closed loop", inspect_loop),
+    "many": ("the results of many recordings", inspect_many),
+    "script": ("a script of the virtual rig", inspect_script),
+    "unfinished": ("results that are not finished", inspect_unfinished),
+    "capture": ("a capture of another program", inspect_capture),
+    "table": ("a table", inspect_table),
+    "unknown": ("not a kind of file that femsense knows", inspect_unknown),
 }
+"""Kind → its title, and the function that reports what such a file or folder holds. A report may refine its kind."""
 
 
 # What it is
@@ -210,72 +211,62 @@ def _existing(path: str | Path) -> Path:
     )
 
 
-Inspector = Callable[[Path, Report, list[str]], None]
-
-
-def _kind(path: Path) -> tuple[str, Inspector]:
+def _kind(path: Path) -> str:
     return _kind_of_folder(path) if path.is_dir() else _kind_of_file(path)
 
 
-def _kind_of_folder(folder: Path) -> tuple[str, Inspector]:
-    signs: tuple[tuple[str, str, Inspector], ...] = (
-        ("loop.json", "loop", inspect_loop),
-        ("robot.toml", "robot", inspect_robot),
-        ("recording.toml", "recording", inspect_recording),
-        ("run.json", "run", inspect_run),
-        ("contacts.csv", "run", inspect_run),
-        ("frames.csv", "recording", inspect_recording),
-        (UNFINISHED, "unfinished", inspect_unfinished),
-        ("many.json", "many", inspect_many),
+def _kind_of_folder(folder: Path) -> str:
+    signs = (
+        ("loop.json", "loop"),
+        ("robot.toml", "robot"),
+        ("recording.toml", "recording"),
+        ("run.json", "run"),
+        ("contacts.csv", "run"),
+        ("frames.csv", "recording"),
+        (UNFINISHED, "unfinished"),
+        ("many.json", "many"),
     )
-    return next(((kind, inspect) for name, kind, inspect in signs if (folder / name).is_file()), ("unknown", inspect_folder))
+    return next((kind for name, kind in signs if (folder / name).is_file()), "unknown")
 
 
-def _kind_of_file(file: Path) -> tuple[str, Inspector]:
+def _kind_of_file(file: Path) -> str:
     ending = file.suffix.lower()
     if ending == ".toml":
         return _kind_of_toml(file)
     if ending == ".json":
         return _kind_of_json(file)
     if ending in (".pcd", ".xyz") or (ending == ".ply" and not _has_faces(file)):
-        return "cloud", inspect_cloud
+        return "cloud"
     if ending in SURFACE_ENDINGS:
-        return "surface", inspect_surface
+        return "surface"
     if ending in (".glb", ".gltf") or _starts_with(file, b"glTF"):
-        return "scene", inspect_scene
+        return "scene"
     if ending in MESH_ENDINGS or file_format(file):
-        return "mesh", inspect_mesh
+        return "mesh"
     if ending in CAD_READ:
-        return "cad", inspect_cad
+        return "cad"
     if ending in CAPTURE_ENDINGS or content_ending(file):
-        return "capture", inspect_capture
-    others: dict[str, tuple[str, Inspector]] = {
-        ".jpg": ("image", inspect_jpeg),
-        ".jpeg": ("image", inspect_jpeg),
-        ".png": ("image", inspect_image),
-        ".csv": ("table", inspect_table),
-        ".tsv": ("table", inspect_table),
-        ".txt": ("table", inspect_table),
-    }
-    return others.get(ending, ("unknown", inspect_unknown))
+        return "capture"
+    images, tables = dict.fromkeys((*JPEG, ".png"), "image"), dict.fromkeys((".csv", ".tsv", ".txt"), "table")
+    return (images | tables).get(ending, "unknown")
 
 
-def _kind_of_toml(file: Path) -> tuple[str, Inspector]:
+def _kind_of_toml(file: Path) -> str:
     own = _format(file)
     if file.name == "recording.toml" or own.startswith("femsense-recording"):
-        return "recording", inspect_recording
+        return "recording"
     if own.startswith("femsense-line"):
-        return "line", inspect_line
-    return ("script", inspect_script) if own.startswith("femsense-script") else ("robot", inspect_robot)
+        return "line"
+    return "script" if own.startswith("femsense-script") else "robot"
 
 
-def _kind_of_json(file: Path) -> tuple[str, Inspector]:
+def _kind_of_json(file: Path) -> str:
     text = file.read_text(encoding="utf-8-sig", errors="replace")[:100_000]
     if file.name == "loop.json" or "femsense-loop" in text:
-        return "loop", inspect_loop
+        return "loop"
     if file.name == "calibration.json" or "femsense-calibration" in text:
-        return "calibration", inspect_calibration
-    return ("run", inspect_run) if file.name == "run.json" else ("unknown", inspect_unknown)
+        return "calibration"
+    return "run" if file.name == "run.json" else "unknown"
 
 
 def _format(file: Path) -> str:

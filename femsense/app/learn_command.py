@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from femsense.app.command_line.parameters import three_numbers
+from femsense.app.learn_options import LearnTask, Pair
 from femsense.core.errors import InputError
 from femsense.io.files import check_target
 from femsense.io.own_files import MODEL
@@ -16,45 +16,14 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.labelled import Labelled
     from femsense.xr.proprioception.model import ProprioceptiveModel
 
-Pair = tuple[Path, Path]
 HELD = 0.9
-"""Share of the positions of another recording that lie within their 95 % intervals, from which on these hold."""
+"""The 95 % intervals hold on another recording if at least this share of its positions lies within them."""
 POOR = 0.5
-"""A held-out error above this share of how the markers move says that the sensors say little of them."""
-
-
-@dataclass(frozen=True, slots=True)
-class LearnFiles:
-    """What is learnt from."""
-
-    pairs: tuple[Pair, ...]
-    """SENSORS.csv and MARKERS.csv of each recording."""
-    test: Pair | None = None
-    """Two more files, of another recording: the error is stated on them, that of a corrected model too."""
-    adapt: Path | None = None
-    """A model to correct by the first two, instead of learning anew; it keeps its bones."""
-    calibration: Path | None = None
-    in_robot_frame: bool = False
-    """Both as in `read_labelled`."""
-
-    @property
-    def all(self) -> list[Path]:
-        """Every file that is read."""
-        more = [file for file in (self.adapt, self.calibration) if file is not None]
-        return [*(file for pair in self.pairs for file in pair), *(self.test or ()), *more]
-
-    def read(self) -> tuple[Labelled, Labelled | None]:
-        """Return the recordings as one, and that of the test. Raises InputError."""
-        from femsense.xr.proprioception.files import read_labelled
-        from femsense.xr.proprioception.labelled import joined
-
-        read = partial(read_labelled, calibration=self.calibration, in_robot_frame=self.in_robot_frame)
-        data = joined([read(*pair) for pair in self.pairs]) if len(self.pairs) > 1 else read(*self.pairs[0])
-        return data, None if self.test is None else read(*self.test)
+"""If the held-out error exceeds this share of the rms motion of the markers, the sensors carry little information about them."""
 
 
 def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
-    """Return SENSORS MARKERS SENSORS MARKERS … two by two. Raises InputError where one is left over."""
+    """Return SENSORS MARKERS SENSORS MARKERS … in pairs. Raises InputError where a file has no partner."""
     if not files or len(files) % 2:
         raise InputError(
             "files of a recording come in pairs",
@@ -66,69 +35,73 @@ def pairs_of(files: Sequence[Path]) -> tuple[Pair, ...]:
 
 
 def learn_into(
-    files: LearnFiles,
-    output: Path,
-    *,
-    end_to_end: bool = False,
-    bones: int = 8,
-    plane: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    task: LearnTask, output: Path, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[dict[str, Any], str]:
     """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
 
     Arguments:
-        files: what is read.
+        task: files and bones.
         output: the ONNX file.
-        end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
+        progress: called with (items done, items in all).
 
     Raises:
         InputError, DataError: files that do not fit, too few rows.
     """
-    from femsense.xr.armature import ArmatureOptions
-    from femsense.xr.proprioception.drift import adapt as adapted
-    from femsense.xr.proprioception.drift import drift
-    from femsense.xr.proprioception.learn import LearnOptions, learn
-    from femsense.xr.proprioception.model_file import load_model, save_model
+    from femsense.xr.proprioception.model_file import save_model
 
-    adapt, test = files.adapt, files.test
-    if adapt is not None and (end_to_end or plane is not None):
-        raise InputError(
-            "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
-        )
-    check_target(output, folder=False, kind=MODEL, inputs=files.all)
-    data, other = files.read()
-    if adapt is not None:
-        before = load_model(adapt)
-        found = drift(before, data)
-        model = adapted(before, data)
-        text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
-        if before.bones is not None:
-            text += "\nthe end-to-end network is left out, as frames of markers do not correct it: bones come from the corrected markers"
-        document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
-        document["shifts"] = found.shifts
-        if other is not None:
-            tested = _tested(model, other)
-            document["test"] = tested
-            text += f"\non {test[0] if test else ''}: {_each_text(tested)}"
-        if model.spread is not None:
-            text += f"\n95 % interval: {_radius_text(model, data)} (median)"
-    else:
-        options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
-        model = learn(data, test=other, options=options, progress=progress)
-        text, document = report_text(model.report), {}
-        if model.chain is not None:
-            text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
-            if len(model.marker_names) == 2:
-                text += "\n  two markers say nothing of how the body bends between them: its bones lie on a straight line for lack of data"
-        if other is not None and test is not None:
-            text += f"\n\n{test_text(model, other, test[0])}"
+    if task.adapt is not None and (task.end_to_end or task.plane is not None):
+        text = "a corrected model keeps its bones"
+        raise InputError(text, where="--adapt", found="--end-to-end or --plane", expected="neither")
+    check_target(output, folder=False, kind=MODEL, inputs=task.all)
+    data, other = task.read()
+    made = _learnt(task, data, other, progress) if task.adapt is None else _corrected(task, task.adapt, data, other)
+    model, document, text = made
     save_model(model, output)
-    return {
-        "path": str(output),
-        "frame": model.frame,
-        **document,
-        **model.report,
-    }, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
+    document = {"path": str(output), "frame": model.frame, **document, **model.report}
+    return document, f"{text}\n\n{frame_text(model.frame)}\n\nwritten: {output}"
+
+
+Made = tuple["ProprioceptiveModel", dict[str, Any], str]
+"""A model, its figures, and its text."""
+
+
+def _learnt(task: LearnTask, data: Labelled, other: Labelled | None, progress: Callable[[int, int], None] | None) -> Made:
+    """Learn a model; `other` are the recordings of the test."""
+    from femsense.xr.armature import ArmatureOptions
+    from femsense.xr.proprioception.learn import LearnOptions, learn
+
+    bones = ArmatureOptions(bones=task.bones, plane_normal=_normal(task.plane))
+    model = learn(data, test=other, options=LearnOptions(end_to_end=task.end_to_end, bones=bones), progress=progress)
+    text = report_text(model.report)
+    if model.chain is not None:
+        text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
+        if len(model.marker_names) == 2:
+            text += "\n  two markers say nothing of how the body bends between them: its bones lie on a straight line for lack of data"
+    if other is not None and task.test is not None:
+        text += f"\n\n{test_text(model, other, task.test[0])}"
+    return model, {}, text
+
+
+def _corrected(task: LearnTask, file: Path, data: Labelled, other: Labelled | None) -> Made:
+    """Correct the model of a file by data of another day; `other` are the recordings of the test."""
+    from femsense.xr.proprioception.drift import adapt, drift
+    from femsense.xr.proprioception.model_file import load_model
+
+    before = load_model(file)
+    found, model = drift(before, data), adapt(before, data)
+    text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
+    if before.bones is not None:
+        text += (
+            "\nthe end-to-end network is left out, as frames of markers do not correct it: bones come from the corrected markers"
+        )
+    document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+    document["shifts"] = found.shifts
+    if other is not None and task.test is not None:
+        document["test"] = _tested(model, other)
+        text += f"\non {task.test[0]}: {_each_text(document['test'])}"
+    if model.spread is not None:
+        text += f"\n95 % interval: {_radius_text(model, data)} (median)"
+    return model, document, text
 
 
 def report_text(report: dict[str, Any]) -> str:
@@ -161,40 +134,37 @@ def report_text(report: dict[str, Any]) -> str:
 
 
 def interval_text(report: dict[str, Any]) -> list[str]:
-    """Return what is said of the intervals of a model, as lines."""
+    """Return the intervals of a model and their coverage, as lines."""
     interval, sessions = report["interval"], report["sessions"]
     radii = ", ".join(f"{name} {radius:.2f} mm" for name, radius in interval["radius_mm"].items())
-    lines = [
-        f"  95 % interval: {radii} (median radius); {100 * interval['coverage']:.0f} % of the held-out positions lie within it"
-    ]
+    coverage = f"{100 * interval['coverage']:.0f} % of the held-out positions lie within it"
     if sessions > 1:
-        lines.append(f"  it holds what differs between the {sessions} recordings: each was predicted from the others")
+        validity = f"it holds what differs between the {sessions} recordings: each was predicted from the others"
     else:
-        lines.append(
-            "  drifts: interval holds within a session only. Predicted from what came before, the end of this one is off by "
+        validity = (
+            "drifts: interval holds within a session only. Predicted from what came before, the end of this one is off by "
             f"{interval['growth']:.2f} times as much as its middle; further recordings, or --test, measure other sessions"
         )
-    return lines
+    return [f"  95 % interval: {radii} (median radius); {coverage}", f"  {validity}"]
 
 
 def test_text(model: ProprioceptiveModel, data: Labelled, name: Path) -> str:
-    """Return how far a model is off on another recording, whether its intervals hold there, and why it is far off where it is."""
+    """Return the error of a model on another recording, the coverage of its intervals there, and the likely cause of a large error."""
     from femsense.xr.proprioception.drift import drift
 
     found = model.report["test"]
     low, high = found["error_ci_mm"]
+    within = f"{100 * found['coverage']:.0f} % of the positions lie within it"
     lines = [
         f"on {name}: {found['error_mm']:.2f} mm on {found['rows']} rows (95 % interval {low:.2f} … {high:.2f}), "
         f"{found['growth']:.1f} times the held-out error",
         f"  of the markers: {_each_text(found['marker_error_mm'])}",
     ]
     if found["coverage"] >= HELD:
-        lines.append(f"  the interval holds there: {100 * found['coverage']:.0f} % of the positions lie within it")
+        lines.append(f"  the interval holds there: {within}")
     else:
-        lines.append(
-            f"  drifts: interval holds within a session only. Here {100 * found['coverage']:.0f} % of the positions lie within it, "
-            f"and the error has grown {found['growth']:.1f} times"
-        )
+        grown = f"the error has grown {found['growth']:.1f} times"
+        lines.append(f"  drifts: interval holds within a session only. Here {within}, and {grown}")
     why = drift(model, data)
     if why.verdict != "holds":
         lines += [f"  {line}" for line in why.text.splitlines()]
@@ -255,10 +225,7 @@ def _correction_text(by: str) -> str:
 
 
 def _normal(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError("not a direction", where="--plane", found=text, expected="X,Y,Z") from None
-    return x, y, z
+    normal = None if text is None else three_numbers(text)
+    if text is not None and normal is None:
+        raise InputError("not a direction", where="--plane", found=text, expected="X,Y,Z")
+    return normal

@@ -8,11 +8,11 @@ import subprocess
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
+from femsense.app.live_options import LiveOptions
 from femsense.core.errors import InputError
 from femsense.io.files import write_json
 from femsense.io.robot_toml import load_robot
@@ -36,41 +36,10 @@ from femsense.xr.view import PAGE, live_page_files
 
 PASSWORD = "FEMSENSE_PASSWORD"
 TELL_S = 0.2
-"""How often the state of the session is sent."""
+"""Period at which the state of the session is sent."""
 KEEPER_S = 10.0
 LIVE_FILE = "live.json"
-"""In a session that runs: where its page is."""
-
-
-@dataclass(frozen=True, slots=True)
-class OutletOptions:
-    """Where a session is shown and sent to."""
-
-    is_served: bool = True
-    """Whether there is a page."""
-    host: str = "127.0.0.1"
-    port: int = 0
-    mqtt: str | None = None
-    """Address of a broker."""
-    broker_port: int | None = None
-    """Serve a broker of our own here; 0 takes a free port."""
-    password_file: Path | None = None
-    mcap: Path | None = None
-    page: Path = PAGE
-
-
-@dataclass(frozen=True, slots=True)
-class LiveOptions:
-    """How `sense_live` runs."""
-
-    actuation: str | None = None
-    """Source of the inputs; None: those that come with the frames."""
-    limits: ActuationLimits = field(default_factory=ActuationLimits)
-    feed: FeedOptions = field(default_factory=FeedOptions)
-    session: SessionOptions = field(default_factory=SessionOptions)
-    outlet: OutletOptions = field(default_factory=OutletOptions)
-    seconds: float | None = None
-    """The session ends by itself after this time [s]."""
+"""Holds the address of the page of a running session."""
 
 
 def sense_live(
@@ -87,19 +56,21 @@ def sense_live(
         robot: folder or name.
         camera: source of frames.
         options: everything else.
-        say: takes lines for people.
+        say: called with lines for people.
         on_url: called with the address of the page once it is there.
 
     Raises:
         FemsenseError: bad input, a source that cannot be used, no calibration that suffices.
     """
-    folder = options.session.folder
+    folder = options.output
     if folder is not None:
         check_session(folder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of single frames; what matters is a notice
         body = load_robot(robot)
-    actuation = None if options.actuation is None else make_actuation(options.actuation, body, options.limits)
+    actuation = (
+        None if options.actuation is None else make_actuation(options.actuation, body, ActuationLimits(delay_s=options.delay_s))
+    )
     scratch = make_scratch()
     keeper = start_keeper(scratch, None if folder is None else folder.absolute())
     with contextlib.ExitStack() as undo:
@@ -114,15 +85,16 @@ def sense_live(
 
         hub = Hub()
         undo.callback(hub.close)
-        url, brokers = _serve(hub, body.name, options.outlet)
-        outlet = Outlet(hub, body) if url or brokers or options.outlet.mcap else None
-        feed = undo.enter_context(CameraFeed(camera, replace(options.feed, ring=scratch.name), on_skipped=skipped))
+        url, brokers = _serve(hub, body.name, options)
+        outlet = Outlet(hub, body) if url or brokers or options.mcap else None
+        reading = FeedOptions(as_fast_as_possible=options.as_fast_as_possible, ring=scratch.name)
+        feed = undo.enter_context(CameraFeed(camera, reading, on_skipped=skipped))
         session = Session(
             body,
             feed,
             scratch,
             actuation=actuation,
-            options=options.session,
+            options=SessionOptions(options.calibration, folder, options.inputs, options.zero, options.contact_free),
             on_answer=outlet.show if outlet is not None else lambda _answer, _taken: None,
         )
         holder.append(session)
@@ -144,13 +116,13 @@ def sense_live(
 
 
 def _wait_for(keeper: subprocess.Popen[bytes]) -> None:
-    """Let the keeper tidy up; one that takes long goes on by itself."""
+    """Wait for the keeper to tidy up; one that takes long continues by itself."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         keeper.wait(KEEPER_S)
 
 
 def page_of_session(folder: Path) -> str:
-    """Return where the page of a session is that runs now. Raises InputError where none does."""
+    """Return the address of the page of a running session. Raises InputError where none runs."""
     import json
 
     file = folder / LIVE_FILE
@@ -184,12 +156,12 @@ def summary_text(document: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _serve(hub: Hub, name: str, options: OutletOptions) -> tuple[str, list[MqttSink]]:
+def _serve(hub: Hub, name: str, options: LiveOptions) -> tuple[str, list[MqttSink]]:
     """Attach page, brokers and file to a hub; return the address of the page, or "", and clients of brokers elsewhere."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
     access, url, brokers = Access(options.host, password), "", []
-    if options.is_served:
-        url = WebSocketServer(hub, live_page_files(options.page), access=access, options=ServerOptions(port=options.port)).url
+    if options.page:
+        url = WebSocketServer(hub, live_page_files(PAGE), access=access, options=ServerOptions(port=options.port)).url
     if options.broker_port is not None:
         EmbeddedBroker(hub, port=options.broker_port, access=access)
     if options.mqtt is not None:

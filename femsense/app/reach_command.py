@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from femsense.app.command_line.parameters import three_numbers
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_json
@@ -15,10 +17,8 @@ from femsense.io.own_files import MOTION
 from femsense.model.robot import Robot
 
 FORMAT = "femsense-motion-1"
-FREE = ("", "*")
-"""A coordinate that is written so is left free."""
 FAR = 10.0
-"""A target that is so many diagonals of the body away from it is in another unit."""
+"""A target that is farther from the body than this number of its diagonals is in another unit."""
 
 
 def reach_targets(
@@ -61,11 +61,7 @@ def reach_targets(
         "reached_m": motion.reached_m,
         "limits": list(motion.limits),
         "tension_n": motion.equilibrium.tension,
-        "certificate": {
-            "equilibrium_n": motion.certificate.equilibrium_n,
-            "gradient": motion.certificate.gradient,
-            "violation": motion.certificate.violation,
-        },
+        "certificate": asdict(motion.certificate),
         "equilibria": motion.iterations,
     }
     if motion.correction_std_m is not None:
@@ -122,11 +118,7 @@ def _force(text: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _numbers(text: str, where: str, *, free: bool = False) -> np.ndarray:
-    parts = [part.strip() for part in text.split(",")]
-    try:
-        values = [float("nan") if free and part in FREE else float(part) for part in parts]
-    except ValueError:
-        values = []
-    if len(values) != 3 or not (free or np.isfinite(values).all()):
+    values = three_numbers(text, free=free)
+    if values is None:
         raise InputError("not three numbers", where=where, found=text, expected="X,Y,Z in metres (an empty one is left free)")
     return np.array(values)

@@ -1,4 +1,4 @@
-"""The site that comes with femsense: where it is, and the page that a word names."""
+"""The site of this version: its folder, and its pages by name."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from femsense.app.stream_log import Streamed, StreamLog, Watched, connection, readings_from
+from femsense.app.stream_options import StreamOptions
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
@@ -29,37 +30,11 @@ if TYPE_CHECKING:
 
 PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
-"""How often it is asked whether a source has stopped."""
+"""Period at which a source is checked for a stop."""
 MEASURED_HZ = 100.0
-"""How often markers are measured by sensors at most: twice as often as commands go out."""
+"""Highest rate at which sensors measure markers: twice the rate of commands."""
 PATIENCE_S = 3.0
-"""How long a connection may take before it is said that there is none."""
-
-
-@dataclass(frozen=True, slots=True)
-class StreamOptions:
-    """Where a stream goes and who may see it."""
-
-    host: str = "127.0.0.1"
-    port: int = 0
-    mqtt: str | None = None
-    """Address of a broker."""
-    broker_port: int | None = None
-    """Serve a broker of our own here; 0 takes a free port."""
-    json_mirror: bool = False
-    password_file: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    authority: Path | None = None
-    """Certificate that a broker's own is checked against."""
-    rate_hz: float = 60.0
-    names: tuple[str, ...] = ()
-    """Further names of this machine."""
-    commands: bool = False
-    """Whether commands may go out once `let_drag` allows them."""
-    insecure: bool = False
-    """Commands also over a broker that lets anybody in."""
-    page: Path = PAGE
+"""A connection that takes longer than this is reported as missing."""
 
 
 @dataclass(eq=False, slots=True)
@@ -89,12 +64,12 @@ class LiveStream:
 
     @property
     def trouble(self) -> str:
-        """Which connections and readings there are none of, and why; empty where all is well."""
+        """The missing connections and readings, with reasons; empty where there are none."""
         return "; ".join(one.trouble for one in self.watched if one.trouble)
 
     @property
     def streamed(self) -> Streamed:
-        """What was streamed so far, and who got it."""
+        """The poses streamed so far, and their receivers."""
         poses = {publisher.twin.name: publisher.sent for publisher in self.publishers}
         clients = None if self.broker is None else self.broker.clients
         brokers = {where: sink.was_connected for where, sink in self.brokers.items()}
@@ -103,7 +78,7 @@ class LiveStream:
         return Streamed(poses, time.monotonic() - self.begun, self.server.visits, clients, brokers, passed, dropped)
 
     def wait(self, say: Callable[[str], None] | None = None) -> None:
-        """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
+        """Return when all sources have ended; meanwhile report lost and restored connections by say(text)."""
         log, patient = StreamLog(self.watched), time.monotonic() + PATIENCE_S
         while any(thread.is_alive() for thread in self.threads) or not (self.threads or self.stop.is_set()):
             living = [thread for thread in self.threads if thread.is_alive()]
@@ -112,7 +87,7 @@ class LiveStream:
                 (say or quiet)(text)
 
     def close(self) -> None:
-        """End the sources, say so, and free the ports."""
+        """End the sources, publish that, and free the ports."""
         self.stop.set()
         for thread in self.threads:
             thread.join(2.0)
@@ -136,7 +111,7 @@ def quiet(_text: str) -> None:
 def stream_runs(
     runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, clouds: bool = True, say: Callable[[str], None] = quiet
 ) -> LiveStream:
-    """Play runs at their own times to whoever watches; return at once. `say` is told what takes long.
+    """Play runs at their own times to whoever watches; return at once. `say` is called before a long step.
 
     Raises:
         InputError: a folder without states, or an address that cannot be used.
@@ -166,7 +141,7 @@ def stream_sensors(
     skin: UserSkin | None = None,
     say: Callable[[str], None] = quiet,
 ) -> LiveStream:
-    """Send what a learnt model makes of sensors while they are read; return at once. `say` is told that a file is waited for.
+    """Send the poses that a learnt model predicts from sensors while they are read; return at once. `say` is called where a file is waited for.
 
     `skin`: the robot's own surface, in the frame of reference of the model; a tube without it.
 
@@ -181,7 +156,7 @@ def stream_sensors(
     model = load_model(model_file)
     twin = sensor_twin(model, name or model_file.stem, skin)
     stop = Event()
-    readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
+    readings = readings_of(source, model.channels, stop)  # opened before anything is served, so that errors are reported at once
     live = _serve(options, twin.name, stop)
     shown = without_password(source)
     say_of_file(readings, source, say)
@@ -211,7 +186,7 @@ def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
 
 
 def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Callable[[str], None] = quiet) -> None:
-    """Say on `measured` where sensors put the markers of the first robot that `live` plays, while they are read.
+    """Publish on `measured` the positions that sensors predict for the markers of the first robot that `live` plays.
 
     This closes the loop of a drag (see `let_drag`, which comes before).
 
@@ -276,7 +251,7 @@ def show_stream(
 
 
 def stream_document(live: LiveStream) -> dict[str, Any]:
-    """Return what runs where, for `--json`."""
+    """Return addresses, robots and topics, for `--json`."""
     return {
         "url": live.url,
         "robots": [publisher.twin.name for publisher in live.publishers],
@@ -297,13 +272,13 @@ def stream_text(live: LiveStream) -> str:
 
 
 def say_of_file(readings: Readings, source: str, say: Callable[[str], None]) -> None:
-    """Say at once that a file is waited for; connections are given some time first."""
+    """Report at once that a file is waited for; connections are given some time first."""
     if "://" not in source and readings.away:
         say(f"waiting for {source}: {readings.away}")
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Number names that come again."""
+    """Number repeated names."""
     found: list[str] = []
     for name in names:
         number, chosen = 1, name
@@ -315,18 +290,18 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 
 def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
-    """Start the server, and a broker or a client of one where it is asked for; `stop` ends the sources."""
+    """Start the server, and a broker or a client of one where the options name it; `stop` ends the sources."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
-    access = Access(options.host, password, options.certificate, options.key, options.names)
+    access = Access(options.host, password, options.certificate, options.key, tuple(options.names))
     address = None if options.mqtt is None else broker_address(options.mqtt, password=password, authority=options.authority)
     if options.commands and not options.insecure:
-        _need_known_clients(address, embedded=options.broker_port is not None, password=password)
+        _need_known_clients(address, embedded=options.served_port is not None, password=password)
     hub = Hub()
     with contextlib.ExitStack() as undo:
-        files = live_page_files(options.page)
+        files = live_page_files(options.page or PAGE)
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
-        broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
+        broker = None if options.served_port is None else EmbeddedBroker(hub, port=options.served_port, access=access)
         live = LiveStream(hub, server, broker, options.commands, stop=stop or Event())
         if address is not None:
             sink = MqttSink(hub, address, first)
@@ -360,7 +335,7 @@ def _need_known_clients(address: BrokerAddress | None, *, embedded: bool, passwo
 
 
 def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:
-    """Have it said where readings are missing, and what was passed over among them."""
+    """Report missing readings, and lines that are no readings."""
     live.sources.append(readings)
     live.watched.append(readings_from(shown, why, lambda: readings.refused))
 

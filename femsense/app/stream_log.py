@@ -1,4 +1,4 @@
-"""What a stream says while it runs and when it ends."""
+"""The messages of a stream while it runs and when it ends."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Watched:
     why: Callable[[], str]
     """Why it is missing; empty where it is there."""
     beside: Callable[[], str] = lambda: ""
-    """What is to be said once although it is there; empty: nothing."""
+    """A note that is reported once while the source is there; empty: none."""
 
     @property
     def trouble(self) -> str:
-        """That it is missing and why; empty where it is there."""
+        """The report that it is missing, with the reason; empty where it is there."""
         why = self.why()
         return f"{self.missing} ({why}), {self.until}" if why else ""
 
@@ -40,10 +40,10 @@ def readings_from(source: str, why: Callable[[], str], refused: Callable[[], str
 
 
 class StreamLog:
-    """Says of each connection and source for itself when it goes and when it comes back."""
+    """Reports of each connection and source when it is lost and when it is back."""
 
     def __init__(self, watched: Sequence[Watched]) -> None:
-        """Watch; as long as nothing was missing, nothing is said."""
+        """Watch connections and sources; nothing is reported before one was missing."""
         self._watched = watched
         self._known: dict[Watched, str] = {}
         self._said: set[Watched] = set()

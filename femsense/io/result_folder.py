@@ -57,6 +57,15 @@ def check_folder(root: Path, not_beside: Sequence[str], kinds: Mapping[str, File
 
 def read_document(file: Path, expected: str) -> dict[str, Any]:
     """Return a JSON object of a format. Raises InputError."""
+    document = read_object(file, f"a file of format {expected}")
+    if document.get("format") != expected:
+        found = repr(document.get("format"))
+        raise InputError("another kind of file", where=f"{file}: format", found=found, expected=repr(expected))
+    return document
+
+
+def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]:
+    """Return a JSON object; `expected` says what the file should be. Raises InputError."""
     try:
         document = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -65,16 +74,14 @@ def read_document(file: Path, expected: str) -> dict[str, Any]:
             "cannot be read",
             where=file,
             found=error.strerror,
-            expected=f"a file of format {expected}",
+            expected=expected,
             hint="if a command was to make it, the summary.csv of that says why it has not" if missing else None,
         ) from None
     except ValueError as error:
-        raise InputError("not valid JSON", where=file, found=error, expected=f"a file of format {expected}") from None
-    found = document.get("format") if isinstance(document, dict) else type(document).__name__
-    if found != expected:
-        raise InputError("another kind of file", where=f"{file}: format", found=repr(found), expected=repr(expected))
-    checked: dict[str, Any] = document
-    return checked
+        raise InputError("not valid JSON", where=file, found=error, expected=expected) from None
+    if not isinstance(document, dict):
+        raise InputError("another kind of file", where=file, found=type(document).__name__, expected=expected)
+    return document
 
 
 def value_of(document: Mapping[str, Any], key: str, file: Path) -> Any:

@@ -1,4 +1,4 @@
-"""Running many jobs: what is missing is handed to an engine, deaths of workers are counted, and outcomes are gathered."""
+"""Running many jobs: those without a result are given to an engine, deaths of workers are counted, and outcomes are collected."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from femsense.many.outcome import Outcome, Status
 from femsense.many.records import Record, Stats, is_valid, log_of, read_record, running_mark, shortened, stamp_of, write_record
 
 MOST_DEATHS = 2
-"""A job that has killed so many workers is set aside."""
+"""A job that has killed this number of workers is not run again."""
 LOOK_S = 1.0
 """Progress is reported at least as often."""
 MOST_IDLE_DEATHS = 3
-"""So often in a row each job at hand may lose its worker before it begins: then workers cannot start at all."""
+"""Number of deaths in a row, for each job at hand, of workers that had not begun: beyond it, workers cannot start at all."""
 LOG_LINES = 3
 """Last lines of the log of a job that stand in the reason of a crash."""
 OOM_SIGNAL = -9
@@ -106,7 +106,7 @@ def run_jobs(
         jobs: with names that differ.
         work: runs one, in a worker; it is sent there, so that it has to be importable.
         engine: open.
-        again: run also what is recorded.
+        again: also run jobs that have a recorded result.
         progress: called after each outcome and about once a second.
 
     Raises:
@@ -159,7 +159,7 @@ def _check_disk(outcome: Outcome, gathered: _Gathered) -> None:
 
 
 def _outcome(job: Job, future: Future[Outcome], engine: Engine) -> Outcome | None:
-    """Return the outcome of a job that has ended; None where it is to be run once more. Raises DataError without workers."""
+    """Return the outcome of a job that has ended; None where it is run once more. Raises DataError without workers."""
     if future.cancelled():
         raise DataError(GONE)
     error = future.exception()
@@ -187,7 +187,7 @@ def _running(job: Job) -> Mapping[str, object] | None:
 
 
 def _after_death(job: Job, death: Death, mark: Mapping[str, object]) -> Outcome | None:
-    """Record that a job has killed a worker. Return its outcome where that was once too often, else None."""
+    """Record that a job has killed a worker. Return its outcome from MOST_DEATHS on, else None."""
     before, stamp = read_record(job.record), stamp_of(job)
     deaths = death.count + (before.outcome.deaths if before is not None and before.stamp == stamp else 0)
     host = str(mark.get("host", ""))

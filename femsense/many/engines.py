@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from femsense.core.errors import DataError, InputError, MissingDependency
+from femsense.core.parallel import available_cores
 from femsense.many import limits
 
 P = ParamSpec("P")
@@ -26,16 +27,16 @@ T = TypeVar("T")
 LIFE = 200
 """Jobs after which a process is replaced by a fresh one: memory that libraries keep does not grow without bound."""
 AHEAD = 2
-"""Jobs for each worker that are handed to processes at a time."""
+"""Jobs for each worker that are given to processes at a time."""
 AHEAD_DASK = 4
 """The same of a cluster, where a worker should find its next job without asking the driver …"""
 FEWEST_DASK = 200
 """… and no fewer jobs than this: a cluster that starts small sees how much there is to do."""
 CONNECT = "10s"
-"""A scheduler that does not answer for so long is not there."""
+"""A scheduler that does not answer within this time is taken as absent."""
 GONE = "the scheduler is gone, and its workers with it; results so far are kept, and the same command goes on"
 TTL = "1 hour"
-"""For so long a dask worker may be silent: compiled code can hold Python's lock for minutes."""
+"""Longest silence of a dask worker: compiled code can hold Python's lock for minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +65,11 @@ class Engine(Protocol):
 
     @property
     def ahead(self) -> int:
-        """How many jobs to hand over at a time."""
+        """Number of jobs to submit at a time."""
 
     @property
     def workers(self) -> int:
-        """How many work at the moment."""
+        """Number of workers at the moment."""
 
     def submit(self, function: Callable[P, T], /, *arguments: P.args, **named: P.kwargs) -> Future[T]:
         """Begin function(*arguments, **named); as of `concurrent.futures.Executor`."""
@@ -78,7 +79,7 @@ class Engine(Protocol):
 
 
 def spread(engine: Engine, function: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Iterator[T]:
-    """Yield function(*task) of each task, in order, as an engine has them; few are handed over ahead.
+    """Yield function(*task) of each task, in order; an engine gets a few tasks ahead.
 
     A task that loses its worker is run once more. Raises DataError where it loses that one, too, or where the scheduler is gone, and what the
     function raises.
@@ -154,7 +155,7 @@ class Processes:
 
 @contextmanager
 def processes(workers: int, memory: int | None = None) -> Iterator[Processes]:
-    """Open a pool; each process may take so much memory [bytes].
+    """Open a pool; each process may take `memory` [bytes].
 
     Processes are spawned, since a fork would copy threads and locks of libraries in whatever state they are.
 
@@ -233,7 +234,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         raise MissingDependency('--dask needs dask.distributed: pip install "femsense[dask]"') from None
     known = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed.", "tornado."))]
     for name in ["distributed", "tornado", *known]:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what goes wrong is said in one line instead
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # the driver reports an error in one line
     settings = {
         "distributed.scheduler.worker-ttl": TTL,
         "distributed.scheduler.allowed-failures": 0,  # the driver counts, and knows which job was running
@@ -246,7 +247,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
         try:
             if where == "local":
                 cluster = distributed.LocalCluster(
-                    n_workers=workers or limits.available_cores(),
+                    n_workers=workers or available_cores(),
                     threads_per_worker=1,
                     processes=True,
                     memory_limit=memory or "auto",
@@ -310,12 +311,12 @@ ENGINES: dict[str, Callable[..., Any]] = {"in process": InProcess, "processes": 
 
 
 def open_engine(workers: int | None, where: str | None, memory: int | None) -> contextlib.AbstractContextManager[Engine]:
-    """Return the engine that is asked for: dask if `where` is given, in process for 0 workers, else processes, one a core."""
+    """Return an engine: dask if `where` is given, in process for 0 workers, else processes, one a core."""
     if where is not None:
         chosen: contextlib.AbstractContextManager[Engine] = ENGINES["dask"](where, workers, memory)
         return chosen
     if workers == 0:
         chosen = ENGINES["in process"]()
         return chosen
-    chosen = ENGINES["processes"](workers or limits.available_cores(), memory)
+    chosen = ENGINES["processes"](workers or available_cores(), memory)
     return chosen

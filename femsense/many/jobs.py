@@ -16,9 +16,9 @@ from femsense.io.tables import read_csv
 RECORDS = ".many"
 """Folder below the folder of all results that holds one record and one log for each job."""
 MANY = "many.json"
-"""File that says what a folder of all results holds."""
+"""File that lists the results of a folder of many."""
 SUMMARY = (MANY, "summary.csv", "summary.parquet", "summary.html", "poison.csv")
-"""Files beside the results: `recordings/*` names them too, and they are no recordings."""
+"""Files next to the results: `recordings/*` matches them too, and they are no recordings."""
 GLOB = "*?["
 
 
@@ -35,7 +35,7 @@ class Job:
     writes: Path
     """The file or folder that it makes."""
     record: Path
-    """File that says what became of it."""
+    """File that holds its outcome."""
 
 
 @dataclass(frozen=True, slots=True)

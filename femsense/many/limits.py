@@ -1,4 +1,4 @@
-"""What one worker may take: one thread in every library, so much memory; and whether the kernel killed for memory."""
+"""The limits of one worker: one thread in every library, a share of the memory; and whether the kernel killed for memory."""
 
 from __future__ import annotations
 
@@ -44,11 +44,6 @@ def environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def available_memory() -> int | None:
     """Return the memory of this machine, or of the container if that is less [bytes]; None where it is unknown."""
     found = list[int]()
@@ -90,7 +85,7 @@ def limit_memory(limit: int | None) -> None:
 
 
 def reset_peak() -> None:
-    """Start to measure the largest resident memory anew, where the system can."""
+    """Restart the measurement of the largest resident memory, where the system can."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
@@ -104,7 +99,7 @@ def peak_memory() -> int:
 
 
 def oom_kills() -> int:
-    """Return how many processes the kernel of this machine has killed for memory, as far as its counters say."""
+    """Return the number of processes that the kernel of this machine has killed for memory, from its counters."""
     count = 0
     for file in _OOM_COUNTERS:
         with contextlib.suppress(OSError):

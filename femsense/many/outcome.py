@@ -1,4 +1,4 @@
-"""What became of a job."""
+"""The outcome of a job."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Scalar = str | int | float | bool | None
 
 
 class Status(StrEnum):
-    """What became of a job."""
+    """How a job has ended."""
 
     DONE = "done"
     KEPT = "kept"
@@ -23,7 +23,7 @@ class Status(StrEnum):
     FAILED = "failed"
     """Wrong usage, bad input, or an internal error."""
     OUT_OF_MEMORY = "out of memory"
-    """It asked for more memory than a worker may take, or the kernel killed it for memory."""
+    """It needed more memory than a worker may take, or the kernel killed it for memory."""
     DISK_FULL = "disk full"
     CRASHED = "crashed"
     """Its worker died, and not for memory."""
@@ -34,7 +34,7 @@ GOOD = frozenset({Status.DONE, Status.KEPT})
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a job, and its result in a few numbers."""
+    """How a job has ended, and its result in a few numbers."""
 
     name: str
     status: Status

@@ -1,4 +1,4 @@
-"""Records of jobs: what each was made from, whether its result is still there, and what became of it.
+"""Records of jobs: the input of each, whether its result is still there, and its outcome.
 
 A record holds two hashes of the input. The *stamp* covers names, sizes and times of files: it is cheap, and where it is the
 same nothing is read. The *key* covers their content: where only the stamp differs, such as after a copy, the worker compares
@@ -26,14 +26,14 @@ from femsense.many.outcome import LONGEST_REASON, Outcome, Status
 
 RECORD_FORMAT = "femsense-job-1"
 AGAIN = "--again"
-"""A word that changes no result."""
+"""A word of the command line that changes no result."""
 Stats = tuple[tuple[str, int, int], ...]
 """Path from the root, size [bytes] and time [ns] of each file below it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What stands in the record of a job."""
+    """The content of the record of a job."""
 
     outcome: Outcome
     stamp: str
@@ -60,7 +60,7 @@ def write_record(job: Job, record: Record) -> None:
 
 
 def is_valid(job: Job, record: Record | None) -> bool:
-    """Return whether a result is recorded and all of it stands there; more may stand beside it, such as a report."""
+    """Return whether a result is recorded and complete on disk; other files may lie next to it, such as a report."""
     return (
         record is not None
         and record.outcome.is_good
@@ -70,7 +70,7 @@ def is_valid(job: Job, record: Record | None) -> bool:
 
 
 def outputs_of(job: Job) -> dict[str, int]:
-    """Return what a job has made: size of each file [bytes], number of files of each folder. Hidden files do not count."""
+    """Return the output of a job: size of each file [bytes], number of files of each folder. Hidden files do not count."""
     if job.writes.is_file():
         return {job.writes.name: job.writes.stat().st_size}
     entries = [item for item in job.writes.iterdir() if not item.name.startswith(".")] if job.writes.is_dir() else []
@@ -101,7 +101,7 @@ def key_of(job: Job) -> str:
 
 
 def stats_of(path: Path) -> Stats:
-    """Return what lies at a path, without reading it: unfinished and hidden files do not count."""
+    """Return names, sizes and times of the files at a path, without reading them: unfinished and hidden files do not count."""
     return tuple(sorted(_walk(path, "")))
 
 
@@ -118,14 +118,14 @@ def _walk(path: Path, prefix: str) -> Iterator[tuple[str, int, int]]:
 
 
 def _identity(job: Job) -> list[Any]:
-    """Return version and words, without the places of what is read and written: the same content elsewhere is the same job."""
+    """Return version and words, with paths of input and output replaced: the same content elsewhere is the same job."""
     places = {str(path): f"<{i}>" for i, path in enumerate(job.reads)} | {str(job.writes): "<result>"}
     return [femsense.__version__, [places.get(word, word) for word in job.words if word != AGAIN]]
 
 
 @lru_cache(maxsize=64)
 def _content(path: Path, stats: Stats) -> str:
-    """Return the hash of what lies at a path; `stats` only says that it has not changed since."""
+    """Return the hash of the content at a path; `stats` is a part of the key of the cache, so that a change is noticed."""
     if path.is_file():
         return file_hash(path)
     from femsense.io.provenance import RECORDING_PARTS, robot_input  # takes a second, which a job that is kept need not wait for
@@ -147,12 +147,12 @@ def _hash(value: Any) -> str:
 
 
 def running_mark(job: Job) -> Path:
-    """Return the file that stands while a worker runs a job: if the worker dies, it says which job it was."""
+    """Return the file that exists while a worker runs a job: if the worker dies, it identifies the job."""
     return job.record.with_suffix(".running")
 
 
 def log_of(job: Job) -> Path:
-    """Return the file that holds what a job said, and where it crashed."""
+    """Return the log of a job: its output, and the place of a crash."""
     return job.record.with_suffix(".log")
 
 
@@ -162,7 +162,7 @@ def shortened(reason: str) -> str:
 
 
 def clear_parts(job: Job) -> None:
-    """Remove what workers that died while they wrote this job's result have left beside it."""
+    """Remove the unfinished files of workers that died while they wrote the result of a job."""
     for part in job.writes.parent.glob(f"{PART_PREFIX}*-{glob.escape(job.writes.name)}"):
         if "lock-" not in part.name:
             shutil.rmtree(part, ignore_errors=True) if part.is_dir() else part.unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -21,6 +21,7 @@ from femsense.many.jobs import MANY, RECORDS
 from femsense.many.outcome import Outcome, Scalar, Status
 from femsense.many.records import read_record
 from femsense.report.page import Chapter, render
+from femsense.report.words import counted, duration
 
 MANY_FORMAT = "femsense-many-1"
 COLUMNS = ("name", "status", "reason", "seconds", "peak_gb", "host", "folder")
@@ -173,8 +174,8 @@ def summary_page(folder: Path, command: str, lines: Sequence[Line]) -> str:
     figures = [
         ("jobs", str(len(lines)), f"femsense {command}"),
         ("with a result", str(good), f"{len(lines) - good} without"),
-        ("working time", _duration(sum(o.seconds for o in ran)), _count({o.host for o in ran}, "machine")),
-        ("slowest", _duration(slowest.seconds) if slowest else "–", slowest.name if slowest else ""),
+        ("working time", duration(sum(o.seconds for o in ran)), counted(len({o.host for o in ran}), "machine")),
+        ("slowest", duration(slowest.seconds) if slowest else "–", slowest.name if slowest else ""),
     ]
     script = files("femsense.many").joinpath("summary.js").read_text(encoding="utf-8")
     text = json_text(data, indent=None).replace("<", "\\u003c")
@@ -193,13 +194,3 @@ def _links(folder: Path, place: str) -> str:
     if not place:
         return ""
     return f"{place}/report.html" if (folder / place / "report.html").is_file() else f"{place}/"
-
-
-def _count(things: Collection[str], name: str) -> str:
-    return f"{len(things)} {name}" + ("" if len(things) == 1 else "s")
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

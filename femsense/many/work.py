@@ -44,7 +44,7 @@ SPARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What a command has said."""
+    """The result of a command."""
 
     row: Mapping[str, Scalar]
     """Column of the summary → value."""
@@ -57,13 +57,13 @@ Call = Callable[[Sequence[str]], Result]
 
 
 def work_on(job: Job, call: Call, *, memory_bytes: int | None = None, in_process: bool = False) -> Outcome:
-    """Run a job, unless its result is there, and record what became of it. Nothing is raised but what stops the worker.
+    """Run a job, unless its result is there, and record its outcome. Raises nothing but what stops the worker.
 
     Arguments:
         job: what to do.
         call: runs its words.
-        memory_bytes: more is not given to this process [bytes]; None: as the worker has it.
-        in_process: this is the process of the user: its threads, memory and output stay as they are.
+        memory_bytes: limit of this process [bytes]; None: the limit that the worker has.
+        in_process: the job runs in the process of the user, whose threads, memory and output are left as they are.
     """
     with _only_worker(job):
         known = read_record(job.record)
@@ -73,7 +73,7 @@ def work_on(job: Job, call: Call, *, memory_bytes: int | None = None, in_process
                 write_record(job, replace(known, stamp=stamp))
                 return replace(known.outcome, status=Status.KEPT)
         except (OSError, FemsenseError):
-            stamp = key = ""  # what is wrong with the input, the command says itself
+            stamp = key = ""  # the command reports what is wrong with the input
         deaths = 0 if known is None else known.outcome.deaths
         with _surroundings(job, memory_bytes, in_process):
             outcome = replace(_called(job, call), deaths=deaths)
@@ -83,7 +83,7 @@ def work_on(job: Job, call: Call, *, memory_bytes: int | None = None, in_process
 
 
 def _called(job: Job, call: Call) -> Outcome:
-    """Run the words of a job and return what became of it."""
+    """Run the words of a job and return its outcome."""
     limits.reset_peak()
     began = time.perf_counter()
     row: Mapping[str, Scalar] = {}
@@ -107,7 +107,7 @@ def _called(job: Job, call: Call) -> Outcome:
 
 
 def _kind_of(error: BaseException) -> tuple[Status, BaseException]:
-    """Return the status of a job that raised an error, and the error that says why: a full disk or memory is often the cause of what is raised."""
+    """Return the status of a job that raised an error, and the error to report: a full disk or memory is often its cause."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError):

@@ -1,4 +1,4 @@
-"""The report on a calibration: where the camera stands, the initial inputs, what the markers say."""
+"""The report on a calibration: pose of the camera, initial inputs, residuals of the markers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report on what a better model changes: runs next to each other, and the demo's errors against the truth."""
+"""The report on the gain of a better model: runs next to each other, and the demo's errors against the truth."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
+from femsense.io.result_folder import read_document, read_object
 from femsense.io.tables import validated
 from femsense.report import words
-from femsense.report.documents import read_document, read_json
 from femsense.report.drawing import image
 from femsense.report.page import Chapter, render
 from femsense.report.run.document import Demo, DemoRun, KnownLoad, RunFacts
@@ -33,7 +33,7 @@ def comparison_chapter(root: Path, runs: Sequence[Path], title: str) -> Chapter 
         InputError: a file is broken.
     """
     file = root / "demo.json"
-    demo = validated(Demo, read_json(file, "what femsense demo wrote"), file) if file.is_file() else None
+    demo = validated(Demo, read_object(file, "what femsense demo wrote"), file) if file.is_file() else None
     rows = [] if demo is None else list(zip(MEASURES, _errors(demo.declared), _errors(demo.improved)))
     compared = [_run(root, file) for file in runs] if len(runs) > 1 else []
     body = render("comparison.html", demo=demo, truth=rows, picture=_picture(root), runs=compared)
@@ -71,7 +71,7 @@ def _picture(root: Path) -> Markup:
 
 def _run(root: Path, file: Path) -> tuple[str, RunFacts, str]:
     """Return the name of a run, its facts and its error at known loads."""
-    facts = read_document(file, RunFacts, RUN_FORMAT)
+    facts = validated(RunFacts, read_document(file, RUN_FORMAT), file)
     name = file.parent.relative_to(root).as_posix()
     return name if name != "." else "this folder", facts, load_error(facts.known_loads)
 

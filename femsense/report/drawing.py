@@ -1,4 +1,4 @@
-"""Figures: one look for all of them, the body seen along an axis, and SVG that is the same each time."""
+"""Figures: one look for all of them, and SVG that is the same each time."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-
-from femsense.core.arrays import FloatArray, IntArray
-from femsense.fem.mesh import TetMesh, surface_triangles
 
 BEFORE, AFTER = "#c8641b", "#1f6f5c"
 INK, SOFT, LINE, PALE = "#1f252c", "#5b6673", "#dfe3e8", "#9aa4af"
@@ -23,58 +19,7 @@ WIDTH, HEIGHT = 4.5, 3.0
 """Of a panel [inch]: readable at the width of a phone."""
 SIZE = 9.5
 MANY = 1500
-"""So many points are drawn as pixels."""
-ROW, SIGN = 15.0, 36.0
-"""Heights below a body [pt]: of a line of text, and of the arrows that say where things point."""
-BODY = np.array([0.80, 0.84, 0.89])
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class View:
-    """A direction to look along, given by what points right and up."""
-
-    right: FloatArray
-    up: FloatArray
-    axes: tuple[str, str]
-
-    @property
-    def towards(self) -> FloatArray:
-        """Unit vector from the body to the eye, shape (3,)."""
-        return np.cross(self.right, self.up)
-
-    def flat(self, points: FloatArray) -> FloatArray:
-        """Return points or vectors (…, 3) as seen, (…, 2)."""
-        return np.asarray(points) @ np.stack([self.right, self.up], axis=1)
-
-
-X, Y, Z = np.eye(3)
-VIEWS = (View(X, Z, ("x", "z")), View(Y, Z, ("y", "z")), View(X, Y, ("x", "y")))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class DrawnSurface:
-    """The skin of a body."""
-
-    nodes: FloatArray
-    """[m], shape (n, 3)."""
-    triangles: IntArray
-    """shape (t, 3)."""
-
-
-def skin(nodes: FloatArray, tets: IntArray) -> DrawnSurface:
-    """Return the skin of a body; mid-edge nodes are left out."""
-    return DrawnSurface(np.asarray(nodes, dtype=np.float64), surface_triangles(TetMesh(nodes, tets[:, :4])))
-
-
-def best_view(points: FloatArray, vectors: FloatArray) -> View:
-    """Return the view along an axis that shows most of the vectors (k, 3), and of the points (n, 3) they stand on."""
-
-    def shown(view: View) -> float:
-        whole = float((vectors**2).sum())
-        share = float((view.flat(vectors) ** 2).sum()) / whole if whole > 0 else 1.0
-        return share * math.sqrt(float(np.prod(np.ptp(view.flat(points), axis=0))))
-
-    return max(VIEWS, key=shown)
+"""From this number on, points are drawn as pixels."""
 
 
 def nice(value: float) -> float:
@@ -88,39 +33,18 @@ def new_axes(*, width: float = WIDTH, height: float = HEIGHT) -> tuple[Any, Any]
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    axes = figure.add_subplot()
+    return figure, dress(figure.add_subplot())
+
+
+def dress(axes: Any) -> Any:
+    """Return axes with the report's look."""
     axes.set_facecolor("white")
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(PALE)
     axes.tick_params(colors=SOFT, labelsize=SIZE - 0.5, length=3, width=0.8)
     axes.grid(True, color=LINE, linewidth=0.7)
     axes.set_axisbelow(True)
-    return figure, axes
-
-
-def new_panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Any, list[list[Any]]]:
-    """Return a figure of its own with a grid of axes without a frame, for bodies."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
-    grid = figure.subplots(rows, columns, squeeze=False)
-    return figure, [list(line) for line in grid]
-
-
-def arrow_options(width: float = 0.018) -> dict[str, Any]:
-    """Return how arrows in units of the axes are drawn, their shafts so wide [inch]."""
-    return {
-        "angles": "xy",
-        "scale_units": "xy",
-        "scale": 1.0,
-        "units": "inches",
-        "width": width,
-        "headwidth": 3.6,
-        "headlength": 4.2,
-        "headaxislength": 3.8,
-        "minlength": 0.2,
-        "zorder": 5,
-    }
+    return axes
 
 
 def name_axes(axes: Any, x: str, y: str) -> None:
@@ -156,133 +80,6 @@ def whole_numbers(axes: Any) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True))
 
 
-def draw_body(axes: Any, surface: DrawnSurface, view: View) -> None:
-    """Draw the skin of a body [mm], shaded, as pixels."""
-    from matplotlib.collections import PolyCollection
-
-    corners = 1e3 * surface.nodes[surface.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    facing = normals @ view.towards
-    front = np.flatnonzero(facing > 0)
-    order = front[np.argsort((corners[front] @ view.towards).mean(axis=1), kind="stable")]
-    light = 0.6 * view.towards + 0.5 * view.up - 0.3 * view.right
-    shade = 0.74 + 0.30 * np.clip(normals[order] @ light / np.linalg.norm(light), 0.0, 1.0)
-    colors = np.clip(BODY * shade[:, None], 0.0, 1.0)
-    axes.add_collection(
-        PolyCollection(list(view.flat(corners[order])), facecolors=colors, edgecolors=colors, linewidths=0.7, rasterized=True)
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Key:
-    """A length that is explained below a body."""
-
-    length_mm: float
-    text: str
-    color: str
-    width: float | None = 0.018
-    """Of the shaft of its arrow [inch]; None for a bar."""
-
-
-def body_height(low: FloatArray, high: FloatArray, *, width: float = WIDTH, most: float = 4.9) -> float:
-    """Return how high a picture of a rectangle with its title and keys is [inch], where it takes the whole width."""
-    across, up = high - low + 0.08 * float((high - low).max())
-    return min(most, float((width - 0.1) * up / across) + (2 * ROW + SIGN) / 72.0 + 0.6)
-
-
-def frame_body(
-    axes: Any,
-    view: View,
-    low: FloatArray,
-    high: FloatArray,
-    *,
-    key: Key | None = None,
-    cameras: Sequence[FloatArray] = (),
-    corner: bool = True,
-) -> None:
-    """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key,
-    and which way the cameras look, or else (where `corner`) the axes of the robot frame."""
-    margin = 0.04 * float((high - low).max())
-    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
-    axes.axis("off")
-    bar = nice(0.3 * float((high - low).max()))
-    keys = [Key(bar, f"{bar:g} mm", INK, None), *([key] if key else [])]
-    for i, one in enumerate(keys):
-        _draw_key(axes, one, low[0], (i + 0.5) * ROW)
-    below = len(keys) * ROW
-    if len(cameras):
-        _draw_cameras(axes, view, cameras, low[0], below)
-    elif corner:
-        _draw_cross(axes, view, low[0], below)
-    room = _below(axes, 0.0, below + SIGN)  # the same in all pictures, whatever stands there
-    axes.plot([low[0]], [0.0], "o", color="none", markersize=1, transform=room, clip_on=False)
-    axes.dataLim.set_points(axes.viewLim.get_points())
-    axes.set_autoscale_on(True)  # limits may be widened
-    axes.set_aspect("equal", adjustable="datalim")  # widens what is shown: the layout knows nothing of a box that shrinks
-
-
-def _below(axes: Any, right: float, down: float) -> Any:
-    """Return the transform from x [mm] and a height to so many points right of and below the lower edge of the axes."""
-    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
-
-    edge = blended_transform_factory(axes.transData, axes.transAxes)
-    return edge + ScaledTranslation(right / 72.0, -down / 72.0, axes.figure.dpi_scale_trans)
-
-
-def _draw_key(axes: Any, key: Key, x: float, down: float) -> None:
-    """Draw a bar or an arrow of the length of a key from x [mm], with its text on the right."""
-    line = _below(axes, 0.0, down)
-    if key.width is None:
-        axes.plot(
-            [x, x + key.length_mm], [0.0, 0.0], color=key.color, linewidth=2, solid_capstyle="butt", transform=line, clip_on=False
-        )
-    else:
-        axes.quiver(
-            [x], [0.0], [key.length_mm], [0.0], color=key.color, transform=line, clip_on=False, **arrow_options(key.width)
-        )
-    _write(axes, x + key.length_mm, 6.0, down, key.text)
-
-
-def _write(
-    axes: Any, x: float, right: float, down: float, text: str, *, color: str = INK, size: float = SIZE - 0.5, ha: str = "left"
-) -> None:
-    axes.text(x, 0.0, text, transform=_below(axes, right, down), ha=ha, va="center_baseline", fontsize=size, color=color)
-
-
-def _draw_cameras(axes: Any, view: View, directions: Sequence[FloatArray], x: float, down: float) -> None:
-    """Draw which way the cameras look, beside each other; across the page as a ring with a dot (to the eye) or a cross."""
-    middle = down + 0.5 * SIGN
-    for i, direction in enumerate(directions[:2]):
-        right = 12.0 + 72.0 * i
-        flat = 11.0 * view.flat(direction)
-        if float(np.linalg.norm(flat)) > 0.35 * 11.0:
-            _draw_way(axes, x, (right - flat[0], middle + flat[1]), (right + flat[0], middle - flat[1]), "-|>", INK, 1.1)
-        else:
-            place = _below(axes, right, middle)
-            axes.plot([x], [0.0], "o", color="white", markeredgecolor=INK, markersize=8, transform=place, clip_on=False)
-            inner = "." if float(direction @ view.towards) > 0 else "x"
-            axes.plot([x], [0.0], inner, color=INK, markersize=4, transform=place, clip_on=False)
-        _write(axes, x, right + 16.0, middle, "camera" if len(directions) == 1 else f"camera {i + 1}")
-
-
-def _draw_cross(axes: Any, view: View, x: float, down: float) -> None:
-    """Draw which way the axes of the robot frame point."""
-    foot = (5.0, down + SIGN - 9.0)
-    for name, (dx, dy) in zip(view.axes, ((1.0, 0.0), (0.0, 1.0))):
-        _draw_way(axes, x, foot, (foot[0] + 14.0 * dx, foot[1] - 14.0 * dy), "->", SOFT, 0.9)
-        _write(axes, x, foot[0] + 19.5 * dx, foot[1] - 19.5 * dy, name, color=SOFT, size=SIZE - 1, ha="center")
-
-
-def _draw_way(
-    axes: Any, x: float, start: tuple[float, float], end: tuple[float, float], style: str, color: str, width: float
-) -> None:
-    """Draw an arrow between two places, each so many points right of x [mm] and below the axes."""
-    tail, tip = (_below(axes, *place) for place in (start, end))
-    arrow = {"arrowstyle": style, "color": color, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", xy=(x, 0.0), xycoords=tip, xytext=(x, 0.0), textcoords=tail, arrowprops=arrow, annotation_clip=False)
-
-
 def marker_bars(rms_m: Mapping[str, float | None], title: str, *, most: int, axis: str) -> Markup | None:
     """Return the residuals of markers [m] as bars, the `most` largest of them, the largest on top; None where none is known."""
     sizes = sorted(((1e3 * v, name) for name, v in rms_m.items() if v is not None and math.isfinite(v)), reverse=True)
@@ -297,9 +94,7 @@ def marker_bars(rms_m: Mapping[str, float | None], title: str, *, most: int, axi
 def _draw_bars(names: Sequence[str], values_mm: Sequence[float], axis: str) -> Any:
     figure, axes = new_axes(height=max(1.5, 0.55 + 0.26 * len(names)))
     places = np.arange(len(names))
-    axes.barh(places, values_mm, height=0.62, color=AFTER)
-    for place, value in zip(places, values_mm):
-        axes.text(value, place, f" {value:.2f}", va="center", fontsize=SIZE - 1, color=INK)
+    axes.bar_label(axes.barh(places, values_mm, height=0.62, color=AFTER), fmt=" %.2f", fontsize=SIZE - 1, color=INK)
     axes.set_yticks(places, [clipped(name) for name in names])
     axes.invert_yaxis()
     axes.margins(x=0.14)
@@ -309,7 +104,7 @@ def _draw_bars(names: Sequence[str], values_mm: Sequence[float], axis: str) -> A
 
 
 def clipped(name: str, width: int = 22) -> str:
-    """Return a name that fits beside an axis, without what matplotlib takes for mathematics."""
+    """Return a name that fits next to an axis; dollar signs are escaped, which matplotlib reads as mathematics."""
     text = name if len(name) <= width else name[: width - 1] + "…"
     return text.replace("$", r"\$")
 

@@ -1,25 +1,36 @@
-"""Finding what a folder holds: loops, runs and calibrations, in it and in its subfolders."""
+"""The results in a folder and its subfolders: loops, runs and calibrations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from femsense.calib.files import CALIBRATION_FORMAT
 from femsense.core.errors import InputError
 from femsense.io.files import PART_PREFIX
 
-MARKERS = {"loop.json": "loop", "run.json": "run", "calibration.json": "calibration"}
-ORDER = ("loop", "run", "calibration")
 HEAD = 400
-"""So many bytes of a JSON file tell its format."""
+"""Number of bytes of a JSON file in which its format stands."""
+
+
+class Kind(StrEnum):
+    """Results that a report shows, in the order of their chapters."""
+
+    LOOP = "loop"
+    RUN = "run"
+    CALIBRATION = "calibration"
+
+
+MARKERS = {f"{kind}.json": kind for kind in Kind}
+"""File whose presence says that a result is there → its kind."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
     """One result: its kind, and its file."""
 
-    kind: str
+    kind: Kind
     file: Path
 
     @property
@@ -40,7 +51,10 @@ def find_results(folder: str | Path) -> tuple[Found, ...]:
             "not a folder", where=root, found="a file" if root.is_file() else "nothing", expected="a folder of results", hint=hint
         )
     inner = sorted(part for part in root.iterdir() if part.is_dir() and not part.name.startswith((".", PART_PREFIX)))
-    groups = [_in_folder(root), *sorted(map(_in_folder, inner), key=lambda group: not any(item.kind == "loop" for item in group))]
+    groups = [
+        _in_folder(root),
+        *sorted(map(_in_folder, inner), key=lambda group: not any(item.kind is Kind.LOOP for item in group)),
+    ]
     found = tuple(item for group in groups for item in group)
     if not found:
         raise InputError(
@@ -56,9 +70,11 @@ def find_results(folder: str | Path) -> tuple[Found, ...]:
 def _in_folder(folder: Path) -> list[Found]:
     named = [Found(kind, folder / name) for name, kind in MARKERS.items() if (folder / name).is_file()]
     others = [
-        Found("calibration", file) for file in sorted(folder.glob("*.json")) if file.name not in MARKERS and _is_calibration(file)
+        Found(Kind.CALIBRATION, file)
+        for file in sorted(folder.glob("*.json"))
+        if file.name not in MARKERS and _is_calibration(file)
     ]
-    return sorted([*named, *others], key=lambda item: ORDER.index(item.kind))
+    return sorted([*named, *others], key=lambda item: list(Kind).index(item.kind))
 
 
 def _is_calibration(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Numbers and names as people read them: mm, N or mN, so many digits as the uncertainty allows, "–" where nothing is known."""
+"""Numbers and names as people read them: mm, N or mN, as many digits as the uncertainty allows, "–" for unknown values."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ VERDICTS = {
 }
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), "1": (1.0, "")}
-"""What is shown instead of the units of files: factor and name."""
+"""Unit of the files → factor and name of the unit that is shown."""
 MILLI = 0.1
 """Forces below this [N] are shown in mN."""
 NIL = 1e-4
-"""Differences of χ² below this are none."""
+"""Differences of χ² below this are rounding errors."""
 HUGE = 1e6
-"""Deviations from this on are shown as powers of ten."""
+"""Standard deviations of at least this are shown as powers of ten."""
 
 
 def known(value: Any) -> bool:
@@ -31,7 +31,7 @@ def known(value: Any) -> bool:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Return a number with so many digits, "–" for None and NaN."""
+    """Return a number with some significant digits, "–" for None and NaN."""
     if not known(value):
         return NOTHING
     if value == 0:
@@ -66,7 +66,7 @@ def nearly(share: Any, digits: int = 0) -> str:
 
 
 def statistic(value: Any, digits: int = 3) -> str:
-    """Return a difference of χ² or BIC; what is nothing but rounding is 0."""
+    """Return a difference of χ² or BIC; one within the rounding error is 0."""
     return "0" if known(value) and abs(value) < NIL else number(value, digits)
 
 
@@ -82,7 +82,7 @@ def force_unit(largest_n: float) -> tuple[float, str]:
 
 
 def with_std(value: Any, std: Any, unit: str | None = None) -> str:
-    """Return value ± standard deviation with its unit; two digits of the deviation decide how many are shown."""
+    """Return value ± standard deviation with its unit; the deviation has two significant digits, and the value as many decimals."""
     if isinstance(value, str | bool):
         return str(value)
     factor, name = UNITS.get(unit or "1", (1.0, unit or ""))
@@ -105,7 +105,7 @@ def interval(ends_m: Sequence[Any] | None) -> str:
 
 
 def entries(value: Any, std: Any) -> list[tuple[str, Any, Any]]:
-    """Return the named parts of a value with their deviations: those of a table, else the value itself with an empty name."""
+    """Return the named parts of a value with their standard deviations: the entries of a table, else the value with an empty name."""
     if not isinstance(value, Mapping):
         return [("", value, std)]
     deviations = std if isinstance(std, Mapping) else {}
@@ -141,6 +141,13 @@ def joined(text: str, unit: str) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun: 1 frame, 2 frames."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in seconds, minutes or hours."""
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def _minus(text: str) -> str:

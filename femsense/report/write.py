@@ -10,17 +10,17 @@ from femsense.io.files import check_target, write_text
 from femsense.io.own_files import REPORT
 from femsense.report.calibration import calibration_chapter
 from femsense.report.compare import comparison_chapter
-from femsense.report.found import Found, find_results
+from femsense.report.found import Found, Kind, find_results
 from femsense.report.loop.chapter import loop_chapter
 from femsense.report.page import Chapter, render
 from femsense.report.run.chapter import run_chapter
 
-CHAPTERS: dict[str, Callable[[Path, str], Chapter]] = {
-    "loop": loop_chapter,
-    "run": run_chapter,
-    "calibration": calibration_chapter,
+CHAPTERS: dict[Kind, tuple[str, Callable[[Path, str], Chapter]]] = {
+    Kind.LOOP: ("What the model lacks", loop_chapter),
+    Kind.RUN: ("Forces", run_chapter),
+    Kind.CALIBRATION: ("Calibration", calibration_chapter),
 }
-NAMES = {"loop": "What the model lacks", "run": "Forces", "calibration": "Calibration"}
+"""Kind of result → title of its chapter, and the function that makes it of a file."""
 
 
 def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
@@ -55,10 +55,10 @@ def report_html(folder: str | Path) -> str:
     """Return the report of a folder as HTML. Raises InputError; see `write_report`."""
     root = Path(folder).expanduser()
     found = find_results(root)
-    chapters = [CHAPTERS[item.kind](item.file, _title(item, root, found)) for item in found]
-    loops = sum(item.kind == "loop" for item in found)
+    chapters = [CHAPTERS[item.kind][1](item.file, _title(item, root, found)) for item in found]
+    loops = sum(item.kind is Kind.LOOP for item in found)
     compared = comparison_chapter(
-        root, [item.file for item in found if item.kind == "run"], "What it changes" if loops else "Comparison"
+        root, [item.file for item in found if item.kind is Kind.RUN], "What it changes" if loops else "Comparison"
     )
     chapters[loops:loops] = [compared] if compared else []
     subject = next((chapter.subject for chapter in chapters if chapter.subject), "") or root.resolve().name
@@ -71,4 +71,5 @@ def _title(item: Found, root: Path, found: Sequence[Found]) -> str:
     alike = [other for other in found if other.kind == item.kind and other.folder == item.folder]
     if len(alike) > 1:
         place = item.file.relative_to(root).as_posix()
-    return NAMES[item.kind] if place == "." else f"{NAMES[item.kind]} ({place})"
+    title = CHAPTERS[item.kind][0]
+    return title if place == "." else f"{title} ({place})"

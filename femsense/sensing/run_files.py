@@ -166,8 +166,8 @@ def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
     known = robot or _robot_of_run(document, root)
     recording = table_of(table_of(document, "inputs", root / "run.json"), "recording", root / "run.json").get("path")
     return Run(
-        contacts=_read_contacts(root / "contacts.csv"),
-        frames=_read_frames(root / "frames.csv"),
+        contacts=read_contacts(root / "contacts.csv"),
+        frames=read_frames(root / "frames.csv"),
         states=read_states(root / "states.npz"),
         robot=known,
         recording_folder=None if recording is None else Path(recording),
@@ -264,7 +264,8 @@ def _read_known_loads(document: Mapping[str, Any], file: Path) -> tuple[LoadComp
         raise InputError("broken known_loads", where=file, found=document["known_loads"], expected=f"tables of {names}") from None
 
 
-def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
+def read_contacts(file: Path) -> tuple[ContactForce, ...]:
+    """Read contacts.csv. Raises InputError."""
     from femsense.sensing.types import ContactForce
 
     table = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
@@ -293,7 +294,8 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
     )
 
 
-def _read_frames(file: Path) -> tuple[FrameReport, ...]:
+def read_frames(file: Path) -> tuple[FrameReport, ...]:
+    """Read frames.csv. Raises InputError."""
     from femsense.sensing.types import FrameReport
 
     table = read_csv(file, required=FRAME_COLUMNS, optional=(NOTE_COLUMN,), prefixes=("tension_", "pressure_"))

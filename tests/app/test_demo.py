@@ -13,7 +13,7 @@ from small_run import make_run
 
 from femsense.app.demo import demo
 from femsense.app.demo.picture import draw_demo
-from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
+from femsense.app.demo.truth import force_errors, true_effects
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.robot_toml import load_robot, robot_names
@@ -21,6 +21,7 @@ from femsense.loop.files import saved_loop
 from femsense.model.robot import Robot
 from femsense.report.loop.text import effect_text, loop_text
 from femsense.report.text import columns, run_text
+from femsense.sensing.comparison import TrueContact, read_truth
 from femsense.sensing.types import Run
 
 LOOP: dict[str, Any] = {

@@ -234,15 +234,23 @@ def test_a_calibration(tmp_path: Path) -> None:
         "rms_m": 1e-3,
         "status": "converged",
         "cable_tension_n": {"top": 0.5},
+        "cable_displacement_m": {},
+        "marker_rms_m": {},
         "history": [{"iteration": 0, "rms_m": 1e-2}],
+        "std": {},
     }
     file = tmp_path / "calibration.json"
     file.write_text(json.dumps(data))
     report = inspect(file)
     assert (report["kind"], report["rms_m"], report["iterations"], report["problems"]) == ("calibration", 1e-3, 1, [])
-    file.write_text(json.dumps({**data, "format": "x", "T_robot_camera": np.diag([2.0, 1, 1, 1]).tolist()}))
-    problems = inspect(file)["problems"]
-    assert "another format" in problems[0] and "not a rigid transform" in problems[1]
+    for key, value, said in (
+        ("format", "x", "another kind of file"),
+        ("T_robot_camera", np.diag([2.0, 1, 1, 1]).tolist(), "not a rigid transform"),
+        ("marker_rms_m", 1, "not a table"),
+    ):
+        file.write_text(json.dumps({**data, key: value}))
+        (problem,) = inspect(file)["problems"]
+        assert said in problem
 
 
 def test_a_loop_with_its_robot(tmp_path: Path) -> None:
@@ -265,7 +273,9 @@ def test_a_loop_with_its_robot(tmp_path: Path) -> None:
     assert report["problems"] == []
     del data["verdict"]
     (tmp_path / "loop.json").write_text(json.dumps(data))
-    assert "keys are missing" in inspect(tmp_path / "loop.json")["problems"][0]
+    assert "expected: verdict" in inspect(tmp_path / "loop.json")["problems"][0]
+    (tmp_path / "loop.json").write_text(json.dumps({**data, "verdict": "effects", "noise_m": "little"}))
+    assert "noise_m" in inspect(tmp_path / "loop.json")["problems"][0]
 
 
 def test_a_run_and_what_it_lacks(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def page(tmp_path: Path) -> Path:
 def test_two_runs_reach_a_viewer_of_a_viewer(tmp_path: Path, page: Path) -> None:
     run = write_run_with_mesh(tmp_path / "bar")
     with (
-        stream_runs([run, run], StreamOptions(page=page, broker_port=0, json_mirror=True)) as live,
+        stream_runs([run, run], StreamOptions(port=0, page=page, broker_port=0, json_mirror=True)) as live,
         show_stream(live.url, page=page) as shown,
     ):
         said = stream_document(live)
@@ -94,7 +94,7 @@ def test_a_run_without_its_mesh_says_that_it_is_made_and_streams_what_was_measur
         Calibration(here, (here,), ("",), {}, {}, 0.0, {}, (), here, unknown, {}, {}, "given"), run / "calibration.json"
     )
     said: list[str] = []
-    with stream_runs([run], StreamOptions(page=page), say=said.append) as live:
+    with stream_runs([run], StreamOptions(port=0, page=page), say=said.append) as live:
         assert said == [f"making the mesh of {run}"]
         newest, topic = live.hub.newest, f"femsense/{made.robot.name}/cloud"
         assert within(30.0, lambda: topic in newest() and len(newest()[topic].payload) > 100)
@@ -104,14 +104,14 @@ def test_a_run_without_its_mesh_says_that_it_is_made_and_streams_what_was_measur
 
 def test_a_run_that_is_played_once_ends_and_says_so(tmp_path: Path, page: Path) -> None:
     run = write_run_with_mesh(tmp_path / "bar")
-    with stream_runs([run], StreamOptions(page=page), loop=False) as live:
+    with stream_runs([run], StreamOptions(port=0, page=page), loop=False) as live:
         live.wait()
         assert b"ended" in live.hub.newest()["femsense/bar/status"].payload and live.publishers[0].sent > 100
 
 
 def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, page: Path) -> None:
     run, said = write_run_with_mesh(tmp_path / "bar"), []
-    nowhere = stream_runs([run], StreamOptions(page=page, mqtt="127.0.0.1:1"), loop=False)
+    nowhere = stream_runs([run], StreamOptions(port=0, page=page, mqtt="127.0.0.1:1"), loop=False)
     with nowhere, show_stream("http://127.0.0.1:1", page=page) as shown:
         assert within(5.0, lambda: "Connection refused" in shown.trouble)
         assert within(5.0, lambda: REFUSED in nowhere.trouble)
@@ -119,13 +119,13 @@ def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, 
         Timer(4.0, shown.stop.set).start()
         shown.wait(said.append)
         assert len(said) == 1 and said[0].startswith("no connection to http://127.0.0.1:1 (")
-    with stream_runs([run], StreamOptions(page=page)) as live, show_stream(live.url, page=page) as shown:
+    with stream_runs([run], StreamOptions(port=0, page=page)) as live, show_stream(live.url, page=page) as shown:
         assert within(5.0, lambda: shown.trouble == "")
 
 
 def test_a_stream_that_ends_has_ended_for_a_viewer_of_a_viewer_too(tmp_path: Path, page: Path) -> None:
     run = write_run_with_mesh(tmp_path / "bar")
-    with stream_runs([run], StreamOptions(page=page, broker_port=0)) as live:
+    with stream_runs([run], StreamOptions(port=0, page=page, broker_port=0)) as live:
         broker = show_stream(f"mqtt://127.0.0.1:{live.broker.port}", page=page) if live.broker else None
         shown = [one for one in (broker, show_stream(live.url, page=page)) if one is not None]
         for one in shown:
@@ -146,10 +146,10 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with stream_sensors("mqtt://me:secret@127.0.0.1:1/arm", model, StreamOptions(page=page)) as live:
+    with stream_sensors("mqtt://me:secret@127.0.0.1:1/arm", model, StreamOptions(port=0, page=page)) as live:
         assert within(5.0, lambda: REFUSED in live.trouble)
         assert live.trouble == f"no readings of mqtt://127.0.0.1:1/arm (no connection, {REFUSED}), waiting"
-    with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(page=page)) as live:
+    with stream_sensors(f"udp://127.0.0.1:{port}", model, StreamOptions(port=0, page=page)) as live:
         assert live.trouble == f"no readings of udp://127.0.0.1:{port} (nothing has come yet), waiting"
 
         def state() -> object:
@@ -177,7 +177,7 @@ def test_sensors_that_say_nothing_are_said_until_readings_come(tmp_path: Path, p
 
 def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FEMSENSE_PASSWORD", "secret")
-    with stream_runs([write_run_with_mesh(tmp_path / "bar")], StreamOptions(page=page)) as live:
+    with stream_runs([write_run_with_mesh(tmp_path / "bar")], StreamOptions(port=0, page=page)) as live:
         assert "unencrypted" in stream_text(live) and "secret" not in stream_text(live)
     (tmp_path / "empty").write_text("\n", encoding="utf-8")
     with pytest.raises(InputError, match="password is empty"):
@@ -214,7 +214,7 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
     run = write_run(made, tmp_path / "run", inputs=run_inputs(made.robot, recording, None))
     marker = made.robot.glued_names[0]
     place = dict(zip("xyz", map(float, made.robot.marker_points[0] + [0.0, 0.0, 0.002])))
-    with stream_runs([run], StreamOptions()) as live:  # kernels that are compiled here are there for the command too
+    with stream_runs([run], StreamOptions(port=0)) as live:  # kernels that are compiled here are there for the command too
         server = let_drag(live, run, DragOptions())
         answered = server.answer(marker, (place["x"], place["y"], place["z"]))
         while answered.status == "converging":
@@ -260,7 +260,7 @@ def test_commands_over_a_broker_that_lets_anybody_in_are_refused_unless_that_is_
     run, hub = write_run_with_mesh(tmp_path / "bar"), Hub()
     elsewhere = EmbeddedBroker(hub, port=0)
     way = {"broker_port": 0} if embedded else {"mqtt": f"127.0.0.1:{elsewhere.port}"}
-    options = StreamOptions(page=page, commands=True, **way)
+    options = StreamOptions(port=0, page=page, commands=True, **way)
     with pytest.raises(InputError, match=r"lets anybody in[\s\S]*--insecure"):
         stream_runs([run], options)
     with stream_runs([run], replace(options, insecure=True)) as live:
@@ -287,7 +287,7 @@ def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> 
     )
     readings = tmp_path / "sensors.csv"
     readings.write_text("time_s,bend\n0,1\n", encoding="utf-8")
-    with stream_runs([run], StreamOptions(page=page)) as live:
+    with stream_runs([run], StreamOptions(port=0, page=page)) as live:
         let_drag(live, run, DragOptions())
         hand = Hand(live.hub, robot=made.robot.name)
         with pytest.raises(InputError, match="markers that the robot does not have"):

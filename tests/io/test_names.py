@@ -11,8 +11,8 @@ from helpers import RECORDING_FILES, write_block_robot, write_small_recording
 
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.options import Options
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot, save_robot
 from femsense.model.recording_checks import check_against

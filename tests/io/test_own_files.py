@@ -13,7 +13,8 @@ from helpers import changed, write_block_robot
 from small_run import write_run_with_a_cloud
 
 from femsense.app.commands import script_plan
-from femsense.app.learn_command import LearnFiles, learn_into
+from femsense.app.learn_command import learn_into
+from femsense.app.learn_options import LearnTask
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_text, write_toml
 from femsense.io.own_files import GLB, MODEL, RUN, SCRIPT, VIEW, check_files, check_replaceable
@@ -114,7 +115,7 @@ def test_nothing_is_made_from_what_it_replaces(run: Path, tmp_path: Path) -> Non
     for name in ("s.csv", "m.csv"):
         (tmp_path / name).write_text(OTHER)
         with pytest.raises(InputError, match="would replace what it is made from"):
-            learn_into(LearnFiles(((tmp_path / "s.csv", tmp_path / "m.csv"),)), tmp_path / name)
+            learn_into(LearnTask(((tmp_path / "s.csv", tmp_path / "m.csv"),)), tmp_path / name)
 
 
 def test_a_pipe_is_no_file_of_femsense(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,16 @@ from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import read_loop, saved_loop
 from femsense.report import words, write_report
+from femsense.report.bodies import VIEWS, Key, best_view, body_height, frame_body, new_panels, skin
 from femsense.report.compare import load_error
-from femsense.report.drawing import VIEWS, Key, best_view, body_height, frame_body, new_axes, new_panels, nice, skin
+from femsense.report.drawing import new_axes, nice
 from femsense.report.loop.chapter import recovered
 from femsense.report.loop.effects import is_beyond, smallest_words
-from femsense.report.loop.residual_at_rest import draw_mean_residual, mean_residual
-from femsense.report.loop.residual_in_frames import draw_frame_residuals, frame_residuals
+from femsense.report.loop.residual_at_rest import mean_residual
+from femsense.report.loop.residual_in_frames import frame_residuals
 from femsense.report.run.document import KnownLoad
+from femsense.report.run.forces import forces_figure
+from femsense.sensing.run_files import read_contacts, read_frames
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
 SENTENCE = "The model lacks gravity (vector_m_s2 [0.1, 0.02, -9.7] m/s²); held-out error 2.04 mm before, 0.17 mm after."
@@ -1162,7 +1166,7 @@ def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path) ->
     cameras = loop.evidence.pictures.camera_axes
     mean, frames = mean_residual(loop, loop.residuals.known(), robot, rest), frame_residuals(loop.evidence.pictures, rest)
     assert mean is not None and frames is not None
-    bodies = [*(draw_mean_residual(mean, title, cameras) for title in mean.means), draw_frame_residuals(frames, cameras)]
+    bodies = [*mean.figures(cameras), frames.figure(cameras)]
     assert [len(figure.axes) for figure in bodies] == [1, 1, 6]
     for figure in bodies:
         check_apart(figure)
@@ -1210,3 +1214,16 @@ def test_what_draws_pages_is_loaded_beside_other_work_and_may_be_missing() -> No
 
     commands.load_pages(missing)
     assert asked == ["femsense.report"]
+
+
+def test_a_force_is_hollow_where_its_frame_is_not_ok(tmp_path: Path) -> None:
+    write_run_folder(tmp_path)
+    frames, contacts = read_frames(tmp_path / "frames.csv"), read_contacts(tmp_path / "contacts.csv")
+
+    def hollow(doubtful: int) -> list[float]:
+        doubted = [replace(frame, status="not explained") if frame.frame == doubtful else frame for frame in frames]
+        (axes,) = forces_figure(contacts, doubted).axes
+        lines = [line for line in axes.lines if line.get_markerfacecolor() == "white"]
+        return sorted({float(x) for line in lines for x in line.get_xdata()})
+
+    assert hollow(10) == pytest.approx([1.0]) and hollow(28) == []

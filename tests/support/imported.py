@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_sources
+from femsense.io.importers.options import Options
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.model.recording import Recording

@@ -109,7 +109,7 @@ def test_the_robot_follows_a_pointer_never_jumps_and_stays_when_the_connection_i
     run = moving_run(tmp_path)
     other = load_robot(write_block_robot(tmp_path / "other", block=to_quadratic(block_mesh((6, 2, 2)))))
     options = DragOptions(gate=GateOptions(allowed=True))
-    with stream_runs([run], StreamOptions(page=built_page, commands=True)) as live:
+    with stream_runs([run], StreamOptions(port=0, page=built_page, commands=True)) as live:
         server = let_drag(live, run, options)
         here, targets = Hub(), []
         bridge = Bridge(here, live.url)

@@ -16,6 +16,7 @@ import numpy as np
 from femsense.app.accuracy.errors import Answer, space_name
 from femsense.app.accuracy.loads import (
     Load,
+    LoadKind,
     Patches,
     SolvedSpace,
     body_on,
@@ -47,12 +48,12 @@ def expected_duration(options: AccuracyOptions | None = None) -> str:
 
 
 def assess_accuracy(robot: Robot, *, options: AccuracyOptions | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Return what the mesh of a robot costs in motion and in force, and what would be better, as plain tables.
+    """Return the discretisation error of a robot in motion and in force, and a recommended mesh, as plain tables.
 
     Arguments:
         robot: as it is declared.
-        options: how far finer spaces are looked at, and what is fine enough.
-        progress: called with what is being done.
+        options: limits on finer spaces, and the errors that are fine enough.
+        progress: called with the name of each step.
 
     Returns:
         `declared`, `reference` (what was taken as the truth), `loads` (a row each), `forces`, `spaces` (what each would cost) and
@@ -125,7 +126,7 @@ def _answer(
         return None, None
     ties = embed_points(body.mesh, places)
     rest = ties.positions(states[0].positions)
-    motions = [rest - places] if loads and loads[0].kind == "gravity" else []
+    motions = [rest - places] if loads and loads[0].kind is LoadKind.GRAVITY else []
     motions += [ties.positions(state.positions) - rest for state in states[1:]]
     times = []
     for _ in range(2):  # the first one may have to analyse the mesh

@@ -1,9 +1,10 @@
-"""What acts on every space alike: the weight, inputs of a size that the body bears, contact forces on patches of its surface."""
+"""Loads that are equal on every space: the weight, feasible inputs, contact forces on patches of the surface."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,9 @@ from femsense.model.remeshing import body_on_mesh, finer_mesh
 from femsense.model.robot import Robot
 
 MOST_INPUTS = 4
-"""So many cables and chambers are looked at, spread over their list."""
+"""Number of cables and chambers that are tried, spread over their list."""
 FORCE_POINTS = 6
-"""Contact forces are tried at so many features …"""
+"""Number of features at which contact forces are tried …"""
 FELT = 0.05
 """… at which a force moves the rest of the body by this share of the most at least: next to the clamp nothing is sensed."""
 PART_OF_LARGEST = 0.5
@@ -34,12 +35,19 @@ PATCH = 0.06
 """Radius of the patch that carries a contact force, over the diagonal; one and a half edges of the surface at least."""
 
 
+class LoadKind(StrEnum):
+    """What a load is."""
+
+    GRAVITY = "gravity"
+    CABLE = "cable"
+    CHAMBER = "chamber"
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Load:
     """Something that moves the body from its rest under its own weight; the weight itself is measured from the unloaded shape."""
 
-    kind: str
-    """"gravity", "cable" or "chamber"."""
+    kind: LoadKind
     name: str
     size: float
     unit: str
@@ -77,7 +85,7 @@ def feasible_loads(body: BodyModel) -> tuple[list[Load], SolvedSpace]:
         states = states_under(body, loads, start)
         if states is not None:
             return loads, SolvedSpace(body.mesh, states)
-        loads = [load if load.kind == "gravity" else replace(load, size=0.5 * load.size) for load in loads]
+        loads = [load if load.kind is LoadKind.GRAVITY else replace(load, size=0.5 * load.size) for load in loads]
     raise DataError("the declared model does not converge under its cables and chambers, even by an eighth of their usual inputs")
 
 
@@ -87,7 +95,7 @@ def sized_loads(body: BodyModel) -> list[Load]:
     How far an input moves the body is taken from the stiffness at rest of quadratic elements.
     """
     chosen = _inputs(body)
-    weight = [Load("gravity", "own weight", 1.0, "")] if body.gravity.any() else []
+    weight = [Load(LoadKind.GRAVITY, "own weight", 1.0, "")] if body.gravity.any() else []
     if not chosen:
         return weight
     quadratic = finer_mesh(body.mesh, "tet10", 0)
@@ -103,25 +111,25 @@ def sized_loads(body: BodyModel) -> list[Load]:
 
 def row_of(body: BodyModel, load: Load) -> int:
     """Return the number of an input: cables first, then chambers."""
-    if load.kind == "cable":
+    if load.kind is LoadKind.CABLE:
         return body.cable_names.index(load.name)
     return len(body.cables) + body.chamber_names.index(load.name)
 
 
 def _inputs(body: BodyModel) -> list[Load]:
-    cables = [Load("cable", cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
-    chambers = [Load("chamber", chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
+    cables = [Load(LoadKind.CABLE, cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
+    chambers = [Load(LoadKind.CHAMBER, chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
     return [(cables + chambers)[i] for i in spread_evenly(len(cables) + len(chambers), MOST_INPUTS)]
 
 
 def spread_evenly(count: int, most: int) -> list[int]:
-    """Return at most so many indices of a list, spread evenly."""
+    """Return at most `most` indices of a list, spread evenly."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def drive_of_load(load: Load) -> dict[str, Any]:
     """Return a load as an argument of `solve_equilibrium`."""
-    return {"tension" if load.kind == "cable" else "pressure": {load.name: load.size}}
+    return {"tension" if load.kind is LoadKind.CABLE else "pressure": {load.name: load.size}}
 
 
 def felt_features(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
@@ -172,7 +180,7 @@ def _facing(middles: FloatArray, area: FloatArray, centre: FloatArray, radius: f
 def states_under(body: BodyModel, loads: Sequence[Load], before: SolvedSpace) -> tuple[Equilibrium, ...] | None:
     """Return the equilibria without and under each load; None where one does not converge."""
     ties = None if body.mesh is before.mesh else embed_points(before.mesh, body.mesh.nodes)
-    drives = [{}, *(drive_of_load(load) for load in loads if load.kind != "gravity")]
+    drives = [{}, *(drive_of_load(load) for load in loads if load.kind is not LoadKind.GRAVITY)]
     states: list[Equilibrium] = []
     for i, drive in enumerate(drives):
         known = before.states[i] if i < len(before.states) else states[0]

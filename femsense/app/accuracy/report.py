@@ -10,11 +10,12 @@ import numpy as np
 
 from femsense.app.accuracy.errors import Answer, Errors, errors_of, reference_of, space_name
 from femsense.app.accuracy.loads import Load, Patches
+from femsense.report.text import columns
 
 
 @dataclass(frozen=True, slots=True)
 class AccuracyOptions:
-    """How far finer spaces are looked at, and what is fine enough."""
+    """Limits on the finer spaces that are solved, and the errors below which a space is fine enough."""
 
     most_unknowns: int = 400_000
     """A finer space with more unknowns is not solved …"""
@@ -101,15 +102,13 @@ def _force_table(error: Errors, patches: Patches, declared: Answer) -> dict[str,
 
 
 def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
-    """Return which space would serve, in words; the spaces of the report get a mark where they do."""
+    """Return the recommended space in words; the spaces of the report that are fine enough get a mark."""
     best = _best(report["spaces"], options)
     declared = next(space for space in report["spaces"] if space["declared"])
     plain = next((space for space in report["spaces"] if space["element"] == "tet10" and not space["refinements"]), None)
     if declared["force_percent"] is None and declared["motion_percent"] is None:
-        return (
-            "the declared space is the finest that is affordable here: nothing to compare it with; a coarser mesh of the "
-            "same body would show its error"
-        )
+        hint = "a coarser mesh of the same body would show its error"
+        return f"the declared space is the finest that is affordable here: nothing to compare it with; {hint}"
     if declared["good_enough"]:
         return "the declared mesh is fine enough"
     if best is not None and not best["refinements"]:
@@ -118,73 +117,63 @@ def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
         return f"no space that was tried is known to be fine enough; the nearest is {_change(plain or declared, declared)}"
     factor = 1.1 * _lack(plain, options) ** 1.5
     wanted, unknowns = (int(float(f"{factor * plain[key]:.2g}")) for key in ("tetrahedra", "unknowns"))
-    changes = ['element = "tet10"'] * (declared["element"] != "tet10") + [
-        f"a mesh of about {wanted} tetrahedra (femsense mesh --max-tets {wanted})"
-    ]
-    return (
-        f"better: {' and '.join(changes)}: about {unknowns} unknowns instead of {declared['unknowns']}, judged by errors "
-        f"that fall with the square of the edges"
-    )
+    mesh = f"a mesh of about {wanted} tetrahedra (femsense mesh --max-tets {wanted})"
+    changes = mesh if declared["element"] == "tet10" else f'element = "tet10" and {mesh}'
+    cost = f"about {unknowns} unknowns instead of {declared['unknowns']}"
+    return f"better: {changes}: {cost}, judged by errors that fall with the square of the edges"
 
 
 def _lack(space: Mapping[str, Any], options: AccuracyOptions) -> float:
-    """Return the error of a space over what is fine enough; 0 where it is not known."""
+    """Return the error of a space over the error that is fine enough; 0 where it is not known."""
     motion, force = space["motion_percent"] or 0.0, space["force_percent"] or 0.0
     return max(motion / (100 * options.good_motion), force / (100 * options.good_force))
 
 
 def _change(space: Mapping[str, Any], declared: Mapping[str, Any]) -> str:
-    element = f'element = "{space["element"]}"'
-    return (
-        f"{element}: {space['unknowns']} unknowns instead of {declared['unknowns']}, {space['step_ms']:.0f} ms a Newton step "
-        f"instead of {declared['step_ms']:.0f} ms"
-    )
+    unknowns = f"{space['unknowns']} unknowns instead of {declared['unknowns']}"
+    time = f"{space['step_ms']:.0f} ms a Newton step instead of {declared['step_ms']:.0f} ms"
+    return f'element = "{space["element"]}": {unknowns}, {time}'
 
 
 def accuracy_text(report: Mapping[str, Any]) -> str:
     """Return a report of `assess_accuracy` as tables."""
-    d, good = report["declared"], report["good_enough"]
+    d, good, left_out = report["declared"], report["good_enough"], report["reference"]["left_out"]
     lines = [
         f"the declared mesh: {d['element']}, {d['tetrahedra']} tetrahedra, {d['unknowns']} unknowns",
         f"compared with: {report['reference']['text']}",
+        "",
+        columns([("load", "motion", "error", "of the motion", "doubt"), *map(_load_cells, report["loads"])], right=True),
     ]
-    lines += ["", f"  {'load':<28}{'motion':>10}{'error':>12}{'of the motion':>15}{'doubt':>11}"]
     if not report["loads"]:
         lines.append("  none: the robot has neither weight nor cables nor chambers; forces alone are looked at")
-    for row in report["loads"]:
-        load = f"{row['name']} {_size(row)}".strip()
-        lines.append(
-            f"  "
-            f"{load:<28}{_mm(row['motion_mm']):>10}{_mm(row['error_mm']):>12}{_percent(row['error_percent']):>15}{_mm(row['doubt_mm']):>13}"
-        )
-    lines += _force_lines(report["forces"])
-    lines += ["", f"  {'space':<24}{'tetrahedra':>10}{'unknowns':>10}{'ms a step':>11}{'motion':>9}{'force':>9}"]
-    for space in report["spaces"]:
-        name = f"{space_name(space['element'], space['refinements'])}{' *' if space['declared'] else ''}"
-        lines.append(
-            f"  {name:<24}{space['tetrahedra']:>10}{space['unknowns']:>10}{space['step_ms']:>11.0f}"
-            f"{_percent(space['motion_percent']):>9}{_percent(space['force_percent']):>9}"
-        )
-    lines += [
-        (
-            f"  * declared; errors are the worst of all loads and places; fine enough: {good['motion_percent']:.0f} % of "
-            f"motion, {good['force_percent']:.0f} % of force"
-        )
+    if len(report["forces"]["places_mm"]):
+        lines += ["", columns([("force at [mm]", "moves it", "sensed force"), *_force_cells(report["forces"])], right=True)]
+        lines.append("  (+: sensed too large, the mesh is too stiff)")
+    head = ("space", "tetrahedra", "unknowns", "ms a step", "motion", "force")
+    lines += ["", columns([head, *map(_space_cells, report["spaces"])], right=True)]
+    enough = f"{good['motion_percent']:.0f} % of motion, {good['force_percent']:.0f} % of force"
+    lines.append(f"  * declared; errors are the worst of all loads and places; fine enough: {enough}")
+    lines += [f"  left out: {'; '.join(left_out)}"] if left_out else []
+    return "\n".join([*lines, "", report["advice"]])
+
+
+def _load_cells(row: Mapping[str, Any]) -> list[str]:
+    sizes = [_mm(row["motion_mm"]), _mm(row["error_mm"]), _percent(row["error_percent"]), _mm(row["doubt_mm"])]
+    return [f"{row['name']} {_size(row)}".strip(), *sizes]
+
+
+def _force_cells(forces: Mapping[str, Any]) -> list[list[str]]:
+    errors = forces["error_percent"] or [None] * len(forces["places_mm"])
+    return [
+        [f"[{', '.join(f'{x:.0f}' for x in place)}]", f"{motion:.3g} mm/N", "?" if error is None else f"{error:+.1f} %"]
+        for place, motion, error in zip(forces["places_mm"], forces["motion_mm_per_n"], errors)
     ]
-    if report["reference"]["left_out"]:
-        lines.append(f"  left out: {'; '.join(report['reference']['left_out'])}")
-    lines += ["", report["advice"]]
-    return "\n".join(lines)
 
 
-def _force_lines(forces: Mapping[str, Any]) -> list[str]:
-    """Return the table of contact forces."""
-    lines = ["", f"  {'force at [mm]':<28}{'moves it':>14}{'sensed force':>18}"]
-    for i, place in enumerate(forces["places_mm"]):
-        at = f"[{', '.join(f'{value:.0f}' for value in place)}]"
-        off = "?" if forces["error_percent"] is None else f"{forces['error_percent'][i]:+.1f} %"
-        lines.append(f"  {at:<28}{forces['motion_mm_per_n'][i]:>9.3g} mm/N{off:>18}")
-    return [*lines, "  (+: sensed too large, the mesh is too stiff)"] if len(lines) > 2 else []
+def _space_cells(space: Mapping[str, Any]) -> list[str]:
+    name = space_name(space["element"], space["refinements"]) + (" *" if space["declared"] else "")
+    counts = [str(space["tetrahedra"]), str(space["unknowns"]), f"{space['step_ms']:.0f}"]
+    return [name, *counts, _percent(space["motion_percent"]), _percent(space["force_percent"])]
 
 
 def _size(row: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""What a command says: its answer, its progress, and lines beside."""
+"""The output of a command: its answer, its progress, and lines on standard error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import typer
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ManyJobs:
-    """A command that is asked of many recordings; `femsense.app.many_command` runs it."""
+    """A command on many recordings; `femsense.app.many_command` runs it."""
 
     command: Any
     """Of the command line, with its parameters."""
@@ -23,22 +23,22 @@ class ManyJobs:
     robot: str | None
     """For all jobs."""
     units: Sequence[str | Path]
-    """What each job is about; may hold patterns. Empty: `jobs` says it."""
+    """Recordings, scripts or folders, one or several a job; may hold patterns. Empty: those of `jobs`."""
     jobs: str | None
     """A table, or a pattern."""
     output: Path | None
-    """Folder of all results; None: each result stands in what it is about."""
+    """Folder of all results; None: each result is written into the folder that it is about."""
     workers: int | None
     dask: str | None
     memory_gb: float | None
     again: bool
     others: frozenset[str]
-    """Options of other commands: their columns of a table are of no concern here."""
+    """Options of other commands: their columns of a table are ignored here."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """What a command has to say."""
+    """The answer of a command."""
 
     document: dict[str, Any]
     """For `--json`."""
@@ -46,14 +46,14 @@ class Answer:
     """For people."""
     exit_status: int = 0
     then: Callable[[], None] | None = field(default=None)
-    """What goes on after it was said, until Ctrl-C."""
+    """Called after the answer was printed; runs until Ctrl-C."""
     many: ManyJobs | None = None
-    """Jobs to run first: what they come to is the answer."""
+    """Jobs whose outcomes replace this answer."""
 
 
 @contextlib.contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
-    """Yield what a library function reports its progress to: a bar on a terminal, else None."""
+    """Yield the function to which a library function reports its progress: a bar on a terminal, else None."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -61,9 +61,9 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Column
 
-    label = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # a long one is cut, what stands beside it is not
+    cut = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # a long label is cut, the other columns are not
     columns = (
-        TextColumn("{task.description}", table_column=label),
+        TextColumn("{task.description}", table_column=cut),
         BarColumn(),
         TextColumn("{task.fields[count]}"),
         TimeElapsedColumn(),
@@ -71,10 +71,10 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
     with Progress(*columns, console=Console(stderr=True), transient=True, expand=True) as bar:
         task = bar.add_task(title, total=None, count="")
 
-        def advance(done: int | str, total: int | None = None) -> None:
+        def advance(done: int | str, total: int | None = None, label: str = title) -> None:
             nonlocal task
             if isinstance(done, int):
-                bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
+                bar.update(task, completed=done, total=total, description=label, count=f"{done}/{total}")
                 return
             words, clock = label_and_clock(done)
             if bar.tasks[-1].total is None:
@@ -87,11 +87,11 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
 
 
 def label_and_clock(text: str) -> tuple[str, str]:
-    """Return what is going on, and how far that is where it ends with that in brackets: "refitting (40%, about 3 min left)"."""
+    """Return the label of a text and the clock in the brackets at its end, such as "refitting (40%, about 3 min left)"."""
     words, opened, rest = text.rpartition(" (")
     return (words, rest[:-1]) if opened and rest.endswith(" left)") else (text, "")
 
 
 def say(text: str) -> None:
-    """Tell people what happens, on standard error."""
+    """Write a line for people on standard error."""
     typer.echo(text, err=True)

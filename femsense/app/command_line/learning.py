@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar
-from femsense.app.command_line.parameters import Json, argument, filled, option
+from femsense.app.command_line.parameters import argument, option
+from femsense.app.learn_options import LearnTask
 
 
+@command()
 def learn(
     files: Annotated[
         list[Path],
@@ -18,31 +22,11 @@ def learn(
         ),
     ],
     output: Annotated[Path, option("-o --output", "MODEL", "The ONNX file.")],
-    test: Annotated[
-        tuple[Path, Path] | None, option("--test", "SENSORS MARKERS", "State the error on another recording, too.")
-    ] = None,
-    adapt: Annotated[
-        Path | None, option("--adapt", "MODEL", "Correct this model by a few labelled frames of another day.")
-    ] = None,
-    end_to_end: Annotated[bool, option("--end-to-end", help="A second network from readings to bones.")] = False,
-    bones: Annotated[int, option("--bones", help="How many bones.")] = 8,
-    plane: Annotated[str | None, option("--plane", "X,Y,Z", "Normal of the plane in which the body bends.")] = None,
-    calibration: Annotated[
-        Path | None, option("-c --calibration", "FILE", "Take a camera's markers into the robot's frame.")
-    ] = None,
-    robot_frame: Annotated[bool, option("--robot-frame", help="The markers are in the robot's frame already.")] = False,
-    json: Json = False,
+    task: LearnTask,
 ) -> Answer:
     """Learn markers and bones from sensors in the body."""
-    from femsense.app.learn_command import LearnFiles, learn_into, pairs_of
+    from femsense.app.learn_command import learn_into, pairs_of
 
     with progress_bar("learn") as progress:
-        document, text = learn_into(
-            filled(LearnFiles, locals(), pairs=pairs_of(files), in_robot_frame=robot_frame),
-            output,
-            end_to_end=end_to_end,
-            bones=bones,
-            plane=plane,
-            progress=progress,
-        )
+        document, text = learn_into(replace(task, pairs=pairs_of(files)), output, progress=progress)
     return Answer(document, text)

@@ -8,15 +8,18 @@ from typing import Annotated
 
 import typer
 
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, OneRobot, argument, filled, option, required, split_names
-from femsense.app.command_line.several import Dask, Jobs, Memory, several, spread_over
+from femsense.app.command_line.parameters import RobotPath, argument, filled, missing, option, split_names
+from femsense.app.command_line.several import Dask, Memory, Several, spread_over
 from femsense.core.errors import InputError
+from femsense.io.importers.options import Inputs
 
 
+@command(Several.TOGETHER)
 def improve(
     context: typer.Context,
-    robot: OneRobot = None,
+    robot: RobotPath,
     recordings: Annotated[list[Path] | None, argument("RECORDING", "What the effects are found on.")] = None,
     output: Annotated[Path | None, option("-o --output", "OUT", "The folder to write; with --plan a script (TOML).")] = None,
     validation: Annotated[list[Path] | None, option("--validation", "RECORDING …", "What they are tested on.")] = None,
@@ -60,11 +63,9 @@ def improve(
     given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: what is recorded already.")] = None,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
     frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
-    actuation: Annotated[str, option("--actuation", "tension|displacement", "With --plan: what drives the cables.")] = "tension",
-    jobs: Jobs = None,
+    actuation: Annotated[Inputs, option("--actuation", help="With --plan: what drives the cables.")] = Inputs.tension,
     dask: Dask = None,
     memory: Memory = None,
-    json: Json = False,
 ) -> Answer:
     """Find what the model lacks and write the better robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
@@ -75,9 +76,6 @@ def improve(
     from femsense.many.jobs import expanded
     from femsense.report.loop.text import loop_text
 
-    if (many := several(context, recordings, one_each=False)) is not None:
-        return many
-    robot = required(context, robot, "'ROBOT'", "argument")
     set_workers(workers or None)
     if plan and recordings:
         raise InputError(
@@ -92,8 +90,11 @@ def improve(
             return Answer(
                 *plan_into(output, robot, given=given, noise=1e-3 * noise, frames=frames, control=actuation, progress=progress)
             )
-    recordings = expanded(required(context, recordings, "'RECORDING...'", "argument"))
-    output = required(context, output, "'-o' / '--output'", "option")
+    if not recordings:
+        raise missing(context, "recordings")
+    if output is None:
+        raise missing(context, "output")
+    recordings = expanded(recordings)
     references = [load_recording(path) for path in reference or []]
     options = filled(ImproveOptions, locals(), user_effects=user_effect or [])
     with (

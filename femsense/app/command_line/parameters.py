@@ -1,7 +1,8 @@
-"""Parameters that several commands have, and how they are read."""
+"""Parameters that several commands share, and readers of their texts."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -17,9 +18,10 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     OptionsType = TypeVar("OptionsType", bound=DataclassInstance)
-T = TypeVar("T")
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
+FREE = ("", "*")
+"""A coordinate that is written so is left free."""
 
 
 def option(flags: str, metavar: str | None = None, help: str = "", **limits: Any) -> Any:
@@ -44,11 +46,9 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
 
 
 RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-OneRobot = Annotated[str | None, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-"""A robot that a table of jobs may name instead."""
-Recordings = Annotated[
-    list[Path] | None, argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")
-]
+Recordings = Annotated[list[Path], argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")]
+
+
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
 Json = Annotated[bool, option("--json", help="One JSON object on standard output, nothing else there.")]
 
@@ -78,27 +78,39 @@ def repeat_options(words: list[str]) -> list[str]:
     return result
 
 
-def required(context: typer.Context, value: T | None, name: str, kind: str) -> T:
-    """Return what only --plan or --jobs can do without."""
-    if value is None:
-        error = TyperException(f"Missing {kind} {name}.")
-        error.ctx = context  # type: ignore[attr-defined]
-        raise error
-    return value
+def missing(context: typer.Context, name: str) -> TyperException:
+    """Return the error of a parameter that is missing: what --plan or --jobs can do without."""
+    parameter = next(p for p in context.command.params if p.name == name)
+    is_argument = parameter.param_type_name == "argument"
+    names = [str(parameter.metavar).rstrip("…")] if is_argument else parameter.opts
+    error = TyperException(f"Missing {parameter.param_type_name} {' / '.join(map(repr, names))}.")
+    error.ctx = context  # type: ignore[attr-defined]
+    return error
 
 
-def places(texts: Sequence[str]) -> list[list[float]] | None:
+def three_numbers(text: str, *, free: bool = False) -> tuple[float, float, float] | None:
+    """Return the numbers of X,Y,Z; None where the text is another one.
+
+    Arguments:
+        text: of the command line.
+        free: an empty number, or "*", is left free: NaN.
+    """
+    try:
+        x, y, z = (math.nan if free and part.strip() in FREE else float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return (x, y, z) if free or all(map(math.isfinite, (x, y, z))) else None
+
+
+def places(texts: Sequence[str]) -> list[tuple[float, float, float]] | None:
     """Return places given as x,y,z [m]; None where none is given. Raises typer.BadParameter."""
-    places = []
+    found = []
     for text in texts:
-        try:
-            place = [float(part) for part in text.split(",")]
-        except ValueError:
-            place = []
-        if len(place) != 3:
+        place = three_numbers(text)
+        if place is None:
             raise typer.BadParameter(f"{text!r} is not a place: three numbers in metres are, such as --at 0.1,0,0.015")
-        places.append(place)
-    return places or None
+        found.append(place)
+    return found or None
 
 
 def split_names(texts: Sequence[str] | None) -> list[str] | None:

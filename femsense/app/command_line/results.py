@@ -6,17 +6,18 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, say
-from femsense.app.command_line.parameters import Json, RunPath, argument, filled, option, run_of
-from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
+from femsense.app.command_line.parameters import RunPath, argument, option, run_of
+from femsense.app.command_line.several import Several
+from femsense.app.stream_options import StreamOptions, is_encrypted, need_model, need_one, need_stream, need_with
 from femsense.core.errors import InputError
 
 if TYPE_CHECKING:
     from femsense.app.stream_command import LiveStream
 
 
+@command()
 def export(
     run: RunPath,
     output: Annotated[Path, option("-o --output", "FILE", "The file to write: .glb or .usdz.")] = Path("robot.glb"),
@@ -27,7 +28,6 @@ def export(
     skin_unit: Annotated[str | None, option("--skin-unit", "m|cm|mm", "Of its coordinates.")] = None,
     vertices: Annotated[int, option("--vertices", help="Of --skin at most; more are decimated.", min=100)] = 100_000,
     arrows: Annotated[bool, option("--arrows", help="Contact forces too, as arrows that move; in .glb.")] = False,
-    json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF, USDZ)."""
     run = run_of(run)
@@ -63,6 +63,7 @@ def export(
     return Answer({"path": str(output), **document}, f"{text}\n\nwritten: {output}")
 
 
+@command()
 def view(
     run: Annotated[Path | None, argument("RUN", "A folder that femsense estimate wrote.")] = None,
     stream: Annotated[str | None, option("--stream", "URL", "Show what streams there instead: http:// or mqtt://.")] = None,
@@ -72,11 +73,8 @@ def view(
     output: Annotated[Path | None, option("-o --output", "DIR", "Write the page for a web server instead.")] = None,
     password_file: Annotated[Path | None, option("--password-file", "FILE", "Of the stream.")] = None,
     authority: Annotated[Path | None, option("--authority", "PEM", "Of the stream's certificate.")] = None,
-    json: Json = False,
 ) -> Answer:
     """Show a run or a stream on a page for browsers and headsets."""
-    from femsense.app.stream_options import is_encrypted, need_one, need_with
-
     if live is not None:
         from femsense.app.live_command import page_of_session
 
@@ -115,7 +113,9 @@ def view(
     return Answer({"url": server.url}, f"{server.url}\nCtrl-C ends it", then=wait)
 
 
+@command()
 def stream(
+    options: StreamOptions,
     runs: Annotated[list[Path] | None, argument("RUN", "Runs to play.")] = None,
     sensors: Annotated[
         str | None, option("--sensors", "SOURCE", "CSV file, udp://, mqtt://, serial: – alone, or with --drag.")
@@ -124,46 +124,25 @@ def stream(
     skin: Annotated[Path | None, option("--skin", "FILE", "With --sensors: the robot's surface, GLB, STL, OBJ, PLY.")] = None,
     skin_unit: Annotated[str | None, option("--skin-unit", "UNIT", "Of its coordinates: m, cm or mm.")] = None,
     drag: Annotated[bool, option("--drag", help="Let viewers drag the robot of the first run.")] = False,
-    commands: Annotated[bool, option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
-    insecure: Annotated[bool, option("--insecure", help="With --commands: also over a broker that lets anybody in.")] = False,
-    host: Annotated[str, option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
-    names: Annotated[list[str] | None, option("--name", "NAME", "By which others know this machine.")] = None,
-    port: Annotated[int, option("--port", help="Of the page and its WebSocket; 0: a free one.", min=0, max=65535)] = 8010,
-    mqtt: Annotated[str | None, option("--mqtt", "HOST[:PORT]", "Send to this broker; mqtts:// encrypts.")] = None,
-    broker: Annotated[bool, option("--broker", help="Serve a broker for this machine.")] = False,
-    broker_port: Annotated[
-        int | None, option("--broker-port", help="Of --broker; 1883 if not given, 0: a free one.", min=0, max=65535)
-    ] = None,
-    json_mirror: Annotated[bool, option("--json-mirror", help="Send pose_json too, for Unity's JsonUtility.")] = False,
-    rate_hz: Annotated[float, option("--rate", help="Most poses a second.", min=0.1, max=1000.0)] = 60.0,
     once: Annotated[bool, option("--once", help="Play once and end.")] = False,
-    password_file: Annotated[Path | None, option("--password-file", "FILE", "Or variable FEMSENSE_PASSWORD.")] = None,
-    certificate: Annotated[Path | None, option("--certificate", "PEM", "Encrypt with this.")] = None,
-    key: Annotated[Path | None, option("--key", "PEM", "Of the certificate.")] = None,
-    authority: Annotated[Path | None, option("--authority", "PEM", "Of the broker's certificate.")] = None,
     browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = False,
-    json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
-    from femsense.app.stream_options import is_encrypted, need_model, need_stream, need_with
-
     runs = [run_of(run) for run in runs or []]
     need_stream(runs, sensors, drag=drag)
     need_model(sensors, model)
     need_with("--skin", skin is not None, "--sensors alone", sensors is not None and not runs)
     need_with("--skin-unit", skin_unit is not None, "--skin", skin is not None)
-    need_with("--commands", commands, "--drag", drag)
-    need_with("--insecure", insecure, "--commands", commands)
+    need_with("--commands", options.commands, "--drag", drag)
+    need_with("--insecure", options.insecure, "--commands", options.commands)
     need_with("--drag", drag, "RUN", bool(runs))
     need_with("--once", once, "RUN", bool(runs))
-    need_with("--broker-port", broker_port is not None, "--broker", broker)
-    need_with("--authority", authority is not None, "--mqtt mqtts://HOST", is_encrypted(mqtt))
+    need_with("--broker-port", options.broker_port is not None, "--broker", options.broker)
+    need_with("--authority", options.authority is not None, "--mqtt mqtts://HOST", is_encrypted(options.mqtt))
     for what in [str(run) for run in runs or []] + ([] if model is None else [str(model)]):
         say(f"reading {what}")
-    from femsense.app.stream_command import StreamOptions, let_drag, measure_by_sensors, stream_runs, stream_sensors
+    from femsense.app.stream_command import let_drag, measure_by_sensors, stream_runs, stream_sensors
 
-    served = (1883 if broker_port is None else broker_port) if broker else None
-    options = filled(StreamOptions, locals(), broker_port=served, names=tuple(names or ()))
     if sensors is not None and model is not None and not runs:
         from femsense.xr.user_skin import read_skin
 
@@ -175,7 +154,7 @@ def stream(
         from femsense.xr.stream.drag_server import DragOptions
 
         say("making ready for drags")
-        let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=commands)))
+        let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=options.commands)))
         if sensors is not None and model is not None:
             measure_by_sensors(live, sensors, model, say)
     return _live(live, browser)
@@ -198,21 +177,12 @@ def _live(live: LiveStream, browser: bool) -> Answer:
     return Answer(stream_document(live), stream_text(live), then=wait)
 
 
+@command(Several.EACH)
 def report(
-    context: typer.Context,
-    folders: Annotated[
-        list[Path] | None, argument("DIR…", "A folder of results; several, or one of many jobs, are many jobs.")
-    ] = None,
-    jobs: Jobs = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    memory: Memory = None,
-    json: Json = False,
+    folders: Annotated[list[Path], argument("DIR…", "A folder of results; several, or one of many jobs, are many jobs.")],
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
-    if (many := several(context, folders, output=False)) is not None:
-        return many
-    page = write_report(run_of(only(context, folders)))
+    page = write_report(run_of(folders[0]))
     return Answer({"report": str(page)}, f"written: {page}")

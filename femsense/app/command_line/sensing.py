@@ -8,9 +8,11 @@ from typing import Annotated
 
 import typer
 
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, OneRobot, Recordings, RobotPath, filled, option, places, required
-from femsense.app.command_line.several import Dask, Jobs, Memory, Workers, only, several
+from femsense.app.command_line.parameters import Recordings, RobotPath, filled, option, places
+from femsense.app.command_line.several import Several
+from femsense.app.live_options import LiveOptions
 
 USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
 
@@ -22,17 +24,12 @@ class SensingMethod(StrEnum):
     paper = "paper"
 
 
+@command(Several.EACH)
 def calibrate(
-    context: typer.Context,
-    robot: OneRobot = None,
-    recordings: Recordings = None,
+    robot: RobotPath,
+    recordings: Recordings,
     output: Annotated[Path, option("-o --output", "FILE", "The file to write.")] = Path("calibration.json"),
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
-    jobs: Jobs = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    memory: Memory = None,
-    json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
     from femsense.app.force_resolution import force_resolution
@@ -45,12 +42,8 @@ def calibrate(
     from femsense.io.robot_toml import load_robot
     from femsense.report.text import calibration_text
 
-    if (many := several(context, recordings)) is not None:
-        return many
-    robot = required(context, robot, "'ROBOT'", "argument")
-    recording = only(context, recordings)
     check_target(output, folder=False, kind=CALIBRATION)
-    body, frames = load_robot(robot), load_recording(recording)
+    body, frames = load_robot(robot), load_recording(recordings[0])
     warn_of_pictures(body, frames)
     calibration = calibrate_recording(body, frames, correct=correct)
     if not calibration.settled:
@@ -62,11 +55,11 @@ def calibrate(
     return Answer({"path": str(output), **calibration_document(calibration), "force_resolution": resolved}, text)
 
 
+@command(Several.EACH)
 def estimate(
-    context: typer.Context,
-    robot: OneRobot = None,
-    recordings: Recordings = None,
-    output: Annotated[Path | None, option("-o --output", "RUN", "The folder to write.")] = None,
+    robot: RobotPath,
+    recordings: Recordings,
+    output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
     calibration: Annotated[
         Path | None,
         option("-c --calibration", "FILE", "Of femsense calibrate, or its folder of many; made first where not given."),
@@ -83,11 +76,6 @@ def estimate(
     smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
     again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
-    jobs: Jobs = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    memory: Memory = None,
-    json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into
@@ -97,11 +85,7 @@ def estimate(
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
-    if (many := several(context, recordings)) is not None:
-        return many
-    robot = required(context, robot, "'ROBOT'", "argument")
-    recording = only(context, recordings)
-    output = required(context, output, "'-o' / '--output'", "option")
+    (recording,) = recordings
     if push and not at:
         raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
     options = filled(SensingOptions, locals(), method=method.value)
@@ -126,97 +110,29 @@ def estimate(
     )
 
 
-class Inputs(StrEnum):
-    """What inputs are that come live."""
-
-    tension = "tension"
-    displacement = "displacement"
-
-
-class Zero(StrEnum):
-    """Whether the zero of live inputs is known."""
-
-    absolute = "absolute"
-    unknown = "unknown"
-
-
+@command()
 def live(
     robot: RobotPath,
     camera: Annotated[
         str,
-        typer.Option(
+        option(
             "--camera",
-            metavar="SOURCE",
-            help="realsense[:SERIAL], orbbec[:SERIAL], oak[:ID], mcap:FILE, foxglove:ws://…, a folder that grows, or a recording.",
-            show_default=False,
+            "SOURCE",
+            "realsense[:SERIAL], orbbec[:SERIAL], oak[:ID], mcap:FILE, foxglove:ws://…, a folder that grows, or a recording.",
         ),
     ],
-    actuation: Annotated[
-        str | None,
-        typer.Option(
-            "--actuation",
-            metavar="SOURCE",
-            help="mqtt://HOST/TOPIC, udp://HOST:PORT, ws://…, serial:PORT, a CSV file that grows, or fixed:NAME=VALUE,…",
-            show_default=False,
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option("-c", "--calibration", metavar="FILE", help="Made on the fly where it is not given.", show_default=False),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="SESSION", help="Record into this folder.", show_default=False)
-    ] = None,
-    fast: Annotated[
-        bool, typer.Option("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
-    ] = False,
-    delay: Annotated[float, typer.Option("--delay", metavar="SECONDS", min=0.0, help="From an input to its effect.")] = 0.0,
-    inputs: Annotated[
-        Inputs, typer.Option("--inputs", help="What the inputs of cables are; a recording says it itself.")
-    ] = Inputs.tension,
-    zero: Annotated[Zero, typer.Option("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute,
-    contact_free: Annotated[
-        int, typer.Option("--contact-free", metavar="N", min=0, help="Contact-free frames first, with -c and after a zero.")
-    ] = 8,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0.0, help="End after this time.", show_default=False)] = None,
-    page: Annotated[bool, typer.Option("--page/--no-page", help="Serve the page.")] = True,
-    host: Annotated[str, typer.Option("--host", help="Of the page; beyond this machine a password is needed.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0 takes a free one.")] = 0,
-    mqtt: Annotated[
-        str | None, typer.Option("--mqtt", metavar="URL", help="Send to this broker too.", show_default=False)
-    ] = None,
-    broker: Annotated[
-        int | None,
-        typer.Option("--broker", metavar="PORT", help="Serve a broker of our own; 0: a free port.", show_default=False),
-    ] = None,
-    mcap: Annotated[
-        Path | None, typer.Option("--mcap", metavar="FILE", help="Write the messages to this file too.", show_default=False)
-    ] = None,
-    password_file: Annotated[
-        Path | None, typer.Option("--password-file", metavar="FILE", help="Of page and brokers.", show_default=False)
-    ] = None,
-    json: Json = False,
+    options: LiveOptions,
 ) -> Answer:
     """Calibrate and sense while it happens, from a camera."""
-    from femsense.app.live_command import LiveOptions, OutletOptions, sense_live, summary_text
-    from femsense.live.actuation import ActuationLimits
-    from femsense.live.feed import FeedOptions
+    from femsense.app.live_command import sense_live, summary_text
     from femsense.live.link import LinkState
-    from femsense.live.session import SessionOptions
 
-    options = LiveOptions(
-        actuation,
-        ActuationLimits(delay_s=delay),
-        FeedOptions(as_fast_as_possible=fast),
-        SessionOptions(calibration, output, inputs.value, zero.value, contact_free),
-        OutletOptions(page, host, port, mqtt, broker, password_file, mcap),
-        seconds,
-    )
     document = sense_live(robot, camera, options, say=say)
     lost = document["link"] == LinkState.GAVE_UP.value
     return Answer(document, summary_text(document), exit_status=1 if lost else 0)
 
 
+@command()
 def reach(
     robot: RobotPath,
     target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],
@@ -225,7 +141,6 @@ def reach(
     calibration: Annotated[Path | None, option("-c --calibration", "FILE", "Commands count from its initial inputs.")] = None,
     output: Annotated[Path | None, option("-o --output", "FILE", "A JSON file to write.")] = None,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
-    json: Json = False,
 ) -> Answer:
     """Find the inputs that bring points of the body to places."""
     from femsense.app.reach_command import reach_targets

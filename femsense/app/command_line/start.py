@@ -1,17 +1,18 @@
-"""Where one starts: `demo`, `inspect`, `docs`, `doctor`."""
+"""First commands: `demo`, `inspect`, `docs`, `doctor`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
+from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Json, argument, option
+from femsense.app.command_line.parameters import argument, option
 
 
+@command()
 def demo(
     output: Annotated[Path, option("-o --output", "DIR", "Where the results go.")] = Path("femsense-demo"),
-    json: Json = False,
 ) -> Answer:
     """Run the whole chain on a recording that comes along."""
     from femsense.app.demo.demo import demo_text, run_demo
@@ -21,11 +22,11 @@ def demo(
     return Answer(document, demo_text(document))
 
 
+@command()
 def inspect(
     path: Annotated[str, argument("PATH", "A file, a folder, or the name of a robot.")],
     accuracy: Annotated[bool, option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")] = False,
     robot: Annotated[str | None, option("--robot", "ROBOT", "Compare a recording with this robot.")] = None,
-    json: Json = False,
 ) -> Answer:
     """Say what a file or folder is and what is wrong with it."""
     from femsense.app.inspect import describe, inspect_accuracy, inspect_path
@@ -43,10 +44,10 @@ def inspect(
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
 
 
+@command()
 def docs(
     page: Annotated[str | None, argument("PAGE", "Such as statuses or effects/creep; by default the home page.")] = None,
     browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,
-    json: Json = False,
 ) -> Answer:
     """Open the documentation of this version, offline."""
     from femsense.app.site import find_page, site_folder
@@ -59,7 +60,8 @@ def docs(
     return Answer({"page": address}, address)
 
 
-def doctor(json: Json = False) -> Answer:
+@command()
+def doctor() -> Answer:
     """Check the installation, and list the cameras."""
     from femsense.app.doctor import diagnose, doctor_text
     from femsense.app.doctor_cameras import camera_checks

@@ -1,4 +1,4 @@
-"""The whole chain on a recording that comes along, measured against the truth beside it."""
+"""The whole chain on a recording of this package, compared with its truth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from femsense.app.commands import estimate_into, improve_into
-from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
-from femsense.core.errors import FemsenseError, InputError
+from femsense.app.commands import estimate_into, improve_into, written_page
+from femsense.app.demo.truth import force_errors, true_effects
+from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_json
 from femsense.io.own_files import DEMO, check_files
 from femsense.io.provenance import versions
@@ -17,6 +17,7 @@ from femsense.io.robot_toml import robot_names
 from femsense.loop.files import saved_loop
 from femsense.report.loop.text import effect_text
 from femsense.report.text import columns, run_document
+from femsense.sensing.comparison import TrueContact, read_truth
 
 if TYPE_CHECKING:
     from femsense.sensing.types import Run
@@ -45,8 +46,8 @@ def run_demo(
 
     Arguments:
         folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.
-        say: told in one line what happens.
-        progress: called with what is done and how much there is.
+        say: called with a line on each step.
+        progress: called with (items done, items in all).
         steps: other ways to estimate and to improve.
 
     Returns:
@@ -74,7 +75,8 @@ def run_demo(
     draw_demo(before, after, truth, document, out / "picture.png")
     document["report"] = str(out / "report.html")
     write_json(out / "demo.json", document)
-    document["report"] = _report(out, say)
+    page = written_page(out, say=say)
+    document["report"] = None if page is None else str(page)
     return document
 
 
@@ -140,17 +142,6 @@ def demo_text(document: Mapping[str, Any]) -> str:
 
 def _entry(effect: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in effect.items() if key != "name")
-
-
-def _report(folder: Path, say: Callable[[str], None]) -> str | None:
-    """Write the report where this installation can."""
-    try:
-        from femsense.report import write_report
-
-        return str(write_report(folder))
-    except (ImportError, FemsenseError) as error:
-        say(f"no report: {' '.join(str(error).split())}")
-        return None
 
 
 def _figure(value: float | None, scale: float, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""The truth that the virtual rig leaves beside a recording, and how far a run is from it."""
+"""The truth that the virtual rig writes next to a recording, and the errors of a run against it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.sensing.comparison import TrueContact, compare, read_truth
+from femsense.sensing.comparison import TrueContact, compare
 
 if TYPE_CHECKING:
     from femsense.sensing.types import Run
-
-__all__ = ["TrueContact", "force_errors", "read_truth", "true_effects"]
 
 
 def true_effects(recording: Path) -> list[dict[str, Any]]:

@@ -1,1 +1,1 @@
-"""What is in a file, by its kind. `femsense.app.inspect` says which kind it is."""
+"""Reports on files and folders, by their kind. `femsense.app.inspect` determines the kind."""

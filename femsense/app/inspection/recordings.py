@@ -1,4 +1,4 @@
-"""Recordings, clouds and images, looked into."""
+"""Reports on recordings, clouds and images."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.app.inspection.reports import Report, attempt
+from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
 from femsense.io.clouds.images import read_color, read_png
@@ -22,17 +23,18 @@ from femsense.io.tables import read_toml
 from femsense.model.plausibility import doubts_of_cloud_places, doubts_of_recording, warn_of
 from femsense.model.recording import Recording
 
+JPEG = (".jpg", ".jpeg")
 CLOUDS_READ = 8
-"""So many clouds of a recording are read whole; of the others only the name and the size are checked."""
+"""Number of clouds of a recording that are read whole; of the others only the name and the size are checked."""
 
 
-def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_recording(path: Path, report: Report, problems: Problems) -> None:
     """Report frames, markers, clouds and inputs of a recording."""
     folder = path if path.is_dir() else path.parent
     toml = folder / "recording.toml"
     if toml.is_file():
         found = recording_problems(read_toml(toml), toml)
-        problems += [str(problem) for problem in found]
+        problems += found
         if found:
             return
     loaded = load_recording(folder)
@@ -46,7 +48,7 @@ def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
     _warn_of_unmatched(loaded, folder)
 
 
-def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_cloud(file: Path, report: Report, problems: Problems) -> None:
     """Report points and colours of a cloud."""
     from femsense.io.clouds.cloud_files import read_cloud, viewpoint_doubt
 
@@ -57,46 +59,30 @@ def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
     if not len(cloud):
         problems.append(f"{file}: the cloud has no points")
         return
-    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-    report.update(
-        {
-            "low_mm": 1e3 * low,
-            "high_mm": 1e3 * high,
-            "median_distance_mm": 1e3 * float(np.median(np.linalg.norm(cloud.points, axis=1))),
-        }
-    )
-    if np.abs(cloud.points).max() > TOO_FAR:
-        problems.append(
-            f"{file}: coordinates of this size look like millimetres\n  found:    up to "
-            f"{np.abs(cloud.points).max():.4g}\n  expected: metres"
-        )
+    report |= {"low_mm": 1e3 * cloud.points.min(axis=0), "high_mm": 1e3 * cloud.points.max(axis=0)}
+    report["median_distance_mm"] = 1e3 * float(np.median(np.linalg.norm(cloud.points, axis=1)))
+    largest = float(np.abs(cloud.points).max())
+    if largest > TOO_FAR:
+        text = "coordinates of this size look like millimetres"
+        problems.append(InputError(text, where=file, found=f"up to {largest:.4g}", expected="metres"))
 
 
-def inspect_image(file: Path, report: Report, problems: list[str]) -> None:
-    """Report size and content of a PNG image."""
-    image = read_png(file)
+def inspect_image(file: Path, report: Report, problems: Problems) -> None:
+    """Report size and content of a PNG or JPEG image."""
+    jpeg = file.suffix.lower() in JPEG
+    image = read_color(file) if jpeg else read_png(file)
     depth = image.ndim == 2 and image.dtype == np.uint16
     channels = 1 if image.ndim == 2 else image.shape[2]
-    report.update({"width": image.shape[1], "height": image.shape[0], "channels": channels, "bits": 8 * image.dtype.itemsize})
+    bits = 8 if jpeg else 8 * image.dtype.itemsize
+    report.update({"width": image.shape[1], "height": image.shape[0], "channels": channels, "bits": bits})
     report["content"] = "depth" if depth else "colour" if channels >= 3 else "grey"
     if depth:
         valid = image[image > 0]
-        report.update(
-            {
-                "valid_share": float((image > 0).mean()),
-                "depth_min": int(valid.min()) if valid.size else None,
-                "depth_median": float(np.median(valid)) if valid.size else None,
-                "depth_max": int(valid.max()) if valid.size else None,
-            }
-        )
+        depths = {"min": int(valid.min()), "median": float(np.median(valid)), "max": int(valid.max())} if valid.size else {}
+        report["valid_share"] = float((image > 0).mean())
+        report |= {f"depth_{name}": depths.get(name) for name in ("min", "median", "max")}
         if not valid.size:
             problems.append(f"{file}: no pixel has a depth")
-
-
-def inspect_jpeg(file: Path, report: Report, problems: list[str]) -> None:
-    """Report size of a JPEG image."""
-    image = read_color(file)
-    report.update({"width": image.shape[1], "height": image.shape[0], "channels": 3, "bits": 8, "content": "colour"})
 
 
 def _recording_report(r: Recording) -> Report:
@@ -173,8 +159,8 @@ def _load_report(r: Recording) -> Report | None:
     }
 
 
-def _check_clouds(r: Recording, report: Report, problems: list[str]) -> None:
-    """Read some clouds whole; say which files are empty and what extent the read ones have."""
+def _check_clouds(r: Recording, report: Report, problems: Problems) -> None:
+    """Read some clouds whole; report empty files and the number of points."""
     frames = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
     if not frames:
         return
@@ -200,14 +186,8 @@ def _warn_of_gaps(r: Recording, steps: FloatArray) -> None:
         return
     gaps = np.flatnonzero(steps > 5.0 * np.median(steps))
     if len(gaps):
-        k = int(gaps[0])
-        warnings.warn(
-            (
-                f"{len(gaps)} gaps in time of more than five frames, the first of {steps[k]:.3g} s before frame "
-                f"{r.frame_numbers[k + 1]}"
-            ),
-            stacklevel=2,
-        )
+        first = f"{steps[gaps[0]]:.3g} s before frame {r.frame_numbers[gaps[0] + 1]}"
+        warnings.warn(f"{len(gaps)} gaps in time of more than five frames, the first of {first}", stacklevel=2)
 
 
 def _warn_of_unmatched(r: Recording, folder: Path) -> None:
@@ -215,16 +195,11 @@ def _warn_of_unmatched(r: Recording, folder: Path) -> None:
     numbers = set(r.frame_numbers.tolist())
     for kind, endings in FOLDERS.items():
         for name in r.camera_names:
-            outliers = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
+            place = folder / kind / name
+            outliers = sorted(set(numbered_files(place, endings)) - numbers)
             if outliers:
-                warnings.warn(
-                    (
-                        f"{folder / kind / name}: {len(outliers)} files whose number is not in frames.csv, the first is "
-                        f"{outliers[0]}"
-                    ),
-                    stacklevel=2,
-                )
+                text = f"{len(outliers)} files whose number is not in frames.csv, the first is {outliers[0]}"
+                warnings.warn(f"{place}: {text}", stacklevel=2)
     if any((folder / "clouds").glob("*/*.p[lc][yd]")) and r.camera_names == ("",):
-        warnings.warn(
-            f"{folder / 'clouds'}: folders of clouds, but recording.toml has no [cameras.NAME]: they are not used", stacklevel=2
-        )
+        text = "folders of clouds, but recording.toml has no [cameras.NAME]: they are not used"
+        warnings.warn(f"{folder / 'clouds'}: {text}", stacklevel=2)

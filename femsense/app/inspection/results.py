@@ -1,26 +1,27 @@
-"""Scripts, results of commands, captures of other programs, and what is none of these, looked into."""
+"""Reports on scripts, results of commands, captures of other programs, and files of no known kind."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from femsense.app.inspection.reports import Report, attempt, read_object
+from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.app.inspection.robots import inspect_robot
+from femsense.calib.files import CALIBRATION_FORMAT, read_calibration
 from femsense.core.errors import InputError
-from femsense.core.pose import check_pose
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.importers.foreign import export_hint
 from femsense.io.meshing.robot_from_line import line_report
+from femsense.io.result_folder import read_document, read_object, value_of
+from femsense.loop.files import read_loop, saved_loop
+from femsense.many.summary import MANY_FORMAT
 from femsense.rig.script import read_script
 
 
-def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_script(file: Path, report: Report, problems: Problems) -> None:
     """Report sweeps and frames of a script of the rig."""
     script = read_script(file)
     report["actuation"] = script.actuation
@@ -34,54 +35,46 @@ def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
     report["clouds"] = script.clouds.kind
 
 
-def inspect_line(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_line(file: Path, report: Report, problems: Problems) -> None:
     """Report what the description of a body along a line holds."""
     report.update(line_report(file))
 
 
-def inspect_unfinished(folder: Path, report: Report, problems: list[str]) -> None:
+def inspect_unfinished(folder: Path, report: Report, problems: Problems) -> None:
     """Report the work that a stopped command left."""
     report["holds"] = f"{(folder / UNFINISHED).stat().st_size / 1e6:.0f} MB of work that is done"
     problems.append(
-        str(
-            InputError("a command was stopped here", where=folder, hint="run the same command again: it goes on where it stopped")
-        )
+        InputError("a command was stopped here", where=folder, hint="run the same command again: it goes on where it stopped")
     )
 
 
-def inspect_many(folder: Path, report: Report, problems: list[str]) -> None:
+def inspect_many(folder: Path, report: Report, problems: Problems) -> None:
     """Report the results of many recordings."""
-    data = read_object(folder / "many.json")
-    problems += _expect(data, "femsense-many-1", ("command", "jobs", "counts"), folder / "many.json")
-    report |= {key: data[key] for key in ("command", "jobs", "counts") if key in data}
+    file = folder / "many.json"
+    data = read_document(file, MANY_FORMAT)
+    report |= {key: value_of(data, key, file) for key in ("command", "jobs", "counts")}
     report["table"], report["page"] = str(folder / "summary.csv"), str(folder / "summary.html")
 
 
-def inspect_calibration(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_calibration(file: Path, report: Report, problems: Problems) -> None:
     """Report poses, inputs and residuals of calibration.json."""
-    data = read_object(file)
-    problems += _expect(data, "femsense-calibration-1", ("T_robot_camera", "rms_m", "status"), file)
-    for key in ("status", "rms_m", "T_robot_camera", "cable_tension_n", "cable_displacement_m", "marker_rms_m"):
-        if key in data:
-            report[key] = data[key]
+    data = read_document(file, CALIBRATION_FORMAT)
+    keys = ("status", "rms_m", "T_robot_camera", "cable_tension_n", "cable_displacement_m", "marker_rms_m")
+    report |= {key: data[key] for key in keys if key in data}
     report["iterations"] = len(data.get("history") or [])
-    pose = data.get("T_robot_camera")
-    if isinstance(pose, list):
-        attempt(lambda: check_pose(pose, f"{file}: T_robot_camera"), problems)
+    attempt(lambda: read_calibration(file), problems)
 
 
-def inspect_loop(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_loop(path: Path, report: Report, problems: Problems) -> None:
     """Report verdict, effects and errors of loop.json."""
     file = path / "loop.json" if path.is_dir() else path
-    data = read_object(file)
-    problems += _expect(data, "femsense-loop-1", ("verdict", "before", "after", "effects"), file)
-    for key in ("verdict", "noise_m", "before", "after", "left", "next_experiment"):
-        if key in data:
-            report[key] = data[key]
-    effects = data.get("effects")
-    names = [entry.get("name", "?") if isinstance(entry, dict) else str(entry) for entry in effects or []]
-    report["effects"] = names
-    report["candidates"] = len(data.get("candidates") or [])
+    data = read_loop(file)
+    keys = ("verdict", "noise_m", "before", "after", "left", "next_experiment")
+    report |= {key: data[key] for key in keys if key in data}
+    attempt(lambda: [value_of(data, key, file) for key in ("verdict", "before", "after", "effects")], problems)
+    loop = attempt(lambda: saved_loop(data, file), problems)
+    if loop is not None:
+        report |= {"effects": [effect.name for effect in loop.effects], "candidates": len(loop.candidates)}
     improved = file.parent / "robot.toml"
     if path.is_dir() and improved.is_file():
         inner: Report = {}
@@ -89,7 +82,7 @@ def inspect_loop(path: Path, report: Report, problems: list[str]) -> None:
         report["robot"] = inner
 
 
-def inspect_run(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_run(path: Path, report: Report, problems: Problems) -> None:
     """Report frames, contacts and files of a run."""
     folder = path if path.is_dir() else path.parent
     expected = ("contacts.csv", "frames.csv", "states.npz", "run.json")
@@ -116,7 +109,7 @@ def inspect_run(path: Path, report: Report, problems: list[str]) -> None:
         report["states"] = attempt(lambda: _npz_report(folder / "states.npz"), problems)
 
 
-def inspect_table(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_table(file: Path, report: Report, problems: Problems) -> None:
     """Report a table by its columns, or as a capture."""
     from femsense.io.importers.guess import guess_format
 
@@ -127,7 +120,7 @@ def inspect_table(file: Path, report: Report, problems: list[str]) -> None:
     report.update(_csv_report(file))
 
 
-def inspect_capture(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_capture(path: Path, report: Report, problems: Problems) -> None:
     """Ask the importer what is in it; frames are not read here."""
     from femsense.io.importers.guess import contents
 
@@ -137,8 +130,35 @@ def inspect_capture(path: Path, report: Report, problems: list[str]) -> None:
         report.update({**found, "next": "femsense import reads its frames and makes a recording of it"})
 
 
-def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
-    """Report a folder by what it holds."""
+def inspect_cad(file: Path, report: Report, problems: Problems) -> None:
+    """Report what the text of a CAD file says; its shapes are not read."""
+    data = file.read_bytes()
+    report["bytes"] = len(data)
+    if file.suffix.lower() not in (".step", ".stp"):
+        return
+    report["solids"] = data.count(b"MANIFOLD_SOLID_BREP(") + data.count(b"BREP_WITH_VOIDS(")
+    if b"ISO-10303-21" not in data[:1000]:
+        problems.append(InputError("no STEP file", where=file, found=f"begins {data[:12]!r}", expected="ISO-10303-21"))
+
+
+def inspect_unknown(path: Path, report: Report, problems: Problems) -> None:
+    """Report a file of no known kind, or a folder by what it holds."""
+    if path.is_dir():
+        _inspect_folder(path, report, problems)
+        return
+    report["bytes"] = path.stat().st_size
+    problems.append(
+        InputError(
+            "not a kind of file that femsense knows",
+            where=path,
+            found=path.suffix or "no ending",
+            expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
+            hint=export_hint(path),
+        )
+    )
+
+
+def _inspect_folder(folder: Path, report: Report, problems: Problems) -> None:
     from femsense.io.importers.guess import guess_format
 
     if guess_format(folder) is not None:
@@ -148,56 +168,14 @@ def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
     endings = Counter(item.suffix.lower() or "(none)" for item in folder.iterdir() if item.is_file())
     report.update({"files": dict(endings), "folders": sorted(item.name for item in folder.iterdir() if item.is_dir())})
     problems.append(
-        str(
-            InputError(
-                "nothing that femsense knows",
-                where=folder,
-                found=", ".join(f"{n} {e}" for e, n in endings.items()) or "no files",
-                expected="robot.toml, recording.toml, run.json or loop.json",
-                hint="femsense import makes a recording of folders of clouds or images",
-            )
+        InputError(
+            "nothing that femsense knows",
+            where=folder,
+            found=", ".join(f"{n} {e}" for e, n in endings.items()) or "no files",
+            expected="robot.toml, recording.toml, run.json or loop.json",
+            hint="femsense import makes a recording of folders of clouds or images",
         )
     )
-
-
-def inspect_cad(file: Path, report: Report, problems: list[str]) -> None:
-    """Report what the text of a CAD file says; its shapes are not read."""
-    data = file.read_bytes()
-    report["bytes"] = len(data)
-    if file.suffix.lower() not in (".step", ".stp"):
-        return
-    report["solids"] = data.count(b"MANIFOLD_SOLID_BREP(") + data.count(b"BREP_WITH_VOIDS(")
-    if b"ISO-10303-21" not in data[:1000]:
-        problems.append(str(InputError("no STEP file", where=file, found=f"begins {data[:12]!r}", expected="ISO-10303-21")))
-
-
-def inspect_unknown(file: Path, report: Report, problems: list[str]) -> None:
-    """Report a file of no known kind."""
-    report["bytes"] = file.stat().st_size
-    problems.append(
-        str(
-            InputError(
-                "not a kind of file that femsense knows",
-                where=file,
-                found=file.suffix or "no ending",
-                expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
-                hint=export_hint(file),
-            )
-        )
-    )
-
-
-def _expect(data: Mapping[str, Any], name: str, keys: Sequence[str], file: Path) -> list[str]:
-    """Return the texts of a wrong format and of missing keys."""
-    texts = []
-    if data.get("format") != name:
-        texts.append(
-            str(InputError("another format", where=f"{file}: format", found=repr(data.get("format")), expected=repr(name)))
-        )
-    missing = [key for key in keys if key not in data]
-    if missing:
-        texts.append(str(InputError("keys are missing", where=file, found=", ".join(data), expected=", ".join(missing))))
-    return texts
 
 
 def _csv_report(file: Path) -> Report:

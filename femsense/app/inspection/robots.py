@@ -1,4 +1,4 @@
-"""Robots, meshes, surfaces and scenes, looked into."""
+"""Reports on robots, meshes, surfaces and scenes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.app.inspection.reports import Report, attempt, read_object
+from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import Cable, Chamber
@@ -18,6 +18,7 @@ from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, trian
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.mesh_files import closed_surface, ordered_tets, radius_ratio, read_tets, read_triangles
 from femsense.io.meshes.reading import read_content
+from femsense.io.result_folder import read_object
 from femsense.io.robot_body import read_declared_mesh
 from femsense.io.robot_tables import RobotTable, robot_problems
 from femsense.io.robot_toml import load_robot
@@ -30,13 +31,13 @@ POOR_QUALITY = 0.05
 """A radius ratio below this is worth a warning."""
 
 
-def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
+def inspect_robot(path: Path, report: Report, problems: Problems) -> None:
     """Report what robot.toml declares."""
     file = path / "robot.toml" if path.is_dir() else path
     document = read_toml(file)
     report["name"] = str(document.get("name", ""))
     found = robot_problems(document, file)
-    problems += [str(problem) for problem in found]
+    problems += found
     if found:
         return
     loaded = attempt(lambda: load_robot(path, effects=False), problems)
@@ -52,25 +53,23 @@ def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def _warn_of_gaps(robot: Robot, file: Path) -> None:
-    """Warn of what a robot needs before it can be calibrated, and of values that `femsense mesh` guessed and nobody has confirmed."""
+    """Warn of missing tables without which a robot cannot be calibrated, and of guesses of `femsense mesh` that nobody has confirmed."""
+    texts = []
     guessed = guessed_tables(file.read_text(encoding="utf-8-sig"))
     if guessed:
-        warnings.warn(
-            f"{file.name}: still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word",
-            stacklevel=3,
-        )
+        texts.append(f"still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word")
     if not robot.body.cables and not robot.body.chambers:
-        warnings.warn(
-            f"{file.name}: neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it "
-            "at rest alone, and improve has no inputs to compare with",
-            stacklevel=3,
+        texts.append(
+            "neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it at rest alone, "
+            "and improve has no inputs to compare with"
         )
     if not robot.marker_names:
-        warnings.warn(
-            f"{file.name}: no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
-            "(femsense docs calibration), and there are no forces without clouds",
-            stacklevel=3,
+        texts.append(
+            "no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
+            "(femsense docs calibration), and there are no forces without clouds"
         )
+    for text in texts:
+        warnings.warn(f"{file.name}: {text}", stacklevel=3)
 
 
 def guessed_tables(text: str) -> list[str]:
@@ -85,7 +84,7 @@ def guessed_tables(text: str) -> list[str]:
     return found
 
 
-def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_mesh(file: Path, report: Report, problems: Problems) -> None:
     """Report cells, size and quality of a mesh."""
     content = read_content(file, str(file))
     points, cells = content.points, content.cells
@@ -102,14 +101,14 @@ def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
     _warn_of_quality(report["radius_ratio_min"], file.name)
 
 
-def inspect_surface(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_surface(file: Path, report: Report, problems: Problems) -> None:
     """Report size and gaps of a surface."""
     points, triangles = read_triangles(file)
     _surface_report(points, triangles, report)
     attempt(lambda: closed_surface(points, triangles, str(file)), problems)
 
 
-def inspect_scene(file: Path, report: Report, problems: list[str]) -> None:
+def inspect_scene(file: Path, report: Report, problems: Problems) -> None:
     """A .glb is what `femsense export` writes; its header is checked, its content is for viewers."""
     with file.open("rb") as stream:
         head = stream.read(12)
@@ -121,7 +120,7 @@ def inspect_scene(file: Path, report: Report, problems: list[str]) -> None:
     announced = int.from_bytes(head[8:12], "little")
     if head[:4] != b"glTF" or announced != report["bytes"]:
         found = f"{announced} bytes announced, {report['bytes']} there" if head[:4] == b"glTF" else repr(head[:4])
-        problems.append(str(InputError("not a whole .glb file", where=file, found=found, expected="glTF and its length")))
+        problems.append(InputError("not a whole .glb file", where=file, found=found, expected="glTF and its length"))
 
 
 def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:
@@ -197,32 +196,17 @@ def _mesh_report(mesh: TetMesh, to_mm: float) -> Report:
 
 def _warn_of_quality(worst: float, name: str) -> None:
     if worst < POOR_QUALITY:
-        warnings.warn(
-            (
-                f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): a sliver makes the model stiff "
-                f"and the solver slow"
-            ),
-            stacklevel=2,
-        )
+        text = "a sliver makes the model stiff and the solver slow"
+        warnings.warn(f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): {text}", stacklevel=2)
 
 
 def _without_unit(report: Report) -> Report:
     """Rename lengths of a file whose unit is not known."""
-    names = {"low_mm": "low", "high_mm": "high", "size_mm": "size"}
-    return {"lengths": "in the unit of the file"} | {
-        names.get(key, key): value for key, value in report.items() if key != "volume_cm3"
-    }
+    own = {key.removesuffix("_mm"): value for key, value in report.items() if key != "volume_cm3"}
+    return {"lengths": "in the unit of the file"} | own
 
 
 def _surface_report(points: FloatArray, triangles: Any, report: Report) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
-    report.update(
-        {
-            "lengths": "in the unit of the file",
-            "points": len(points),
-            "triangles": len(triangles),
-            "low": low,
-            "high": high,
-            "size": high - low,
-        }
-    )
+    report |= {"lengths": "in the unit of the file", "points": len(points), "triangles": len(triangles)}
+    report |= {"low": low, "high": high, "size": high - low}

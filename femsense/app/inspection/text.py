@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from femsense.report.text import columns
+
 
 def section_text(items: Mapping[str, Any]) -> list[str]:
     """Return lines of aligned labels and values."""
@@ -53,8 +55,7 @@ def _grid(rows: Sequence[Any], indent: int) -> list[str]:
         return [" " * indent + _value("", row) for row in rows]
     keys = [key for key in rows[0] if any(row.get(key) is not None for row in rows)]
     cells = [[_label(key) for key in keys]] + [[_value(key, row.get(key)) for key in keys] for row in rows]
-    widths = [max(len(row[j]) for row in cells) for j in range(len(keys))]
-    return [(" " * indent + "  ".join(cell.ljust(width) for cell, width in zip(row, widths))).rstrip() for row in cells]
+    return columns(cells, indent=indent).splitlines()
 
 
 def _label(key: str) -> str:

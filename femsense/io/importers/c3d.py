@@ -18,7 +18,8 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
+from femsense.io.importers.frames import Frame, Source, check_size, unit_of, upright
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.mapping import MARKER
 
 BLOCK = 512

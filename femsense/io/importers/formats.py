@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from femsense.io.importers.c3d import list_c3d, open_c3d
-from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.frames import Source
 from femsense.io.importers.images.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.images.kinect import open_kinect
+from femsense.io.importers.options import Options
 from femsense.io.importers.ros.bag import BEGINNINGS, ENDINGS
 from femsense.io.importers.ros.source import list_ros, open_ros, topics_of
 from femsense.io.importers.tables.csv_tables import header_of

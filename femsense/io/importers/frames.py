@@ -14,14 +14,13 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.units import length_unit
+from femsense.io.importers.options import UNITS, Options
 from femsense.pointcloud.cloud import PointCloud
 
 SMALLEST, LARGEST = 2e-3, 100.0
 """Scenes of motion capture are between these sizes [m]: ten times less than a finger's markers span, ten times a large hall."""
 FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
-UNITS = ("m", "cm", "mm", "in", "ft")
-"""Units of length that `--unit` takes, in any spelling that `core.units` knows."""
 MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
 DepthImage = npt.NDArray[np.uint16]
 ColorImage = npt.NDArray[np.uint8]
@@ -116,38 +115,6 @@ class Source:
     """See `Options.free`."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Name that `--map` may take → what it may become; see `mapping.check_names`."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Options:
-    """What a person says about a source; empty where nothing was said."""
-
-    format: str | None = None
-    topics: Sequence[str] = ()
-    """Topics, streams, tracks or names to take."""
-    columns: Mapping[str, str] = field(default_factory=dict)
-    """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02;
-    may end in *FACTOR."""
-    unit: str | None = None
-    """Of lengths, one of UNITS."""
-    depth_unit: float | None = None
-    """Metres in one unit of whole-numbered depth images, where the source says another or none."""
-    up: str | None = None
-    """The source's vertical axis: "x", "y" or "z"; turned to z."""
-    clock: str = "auto"
-    """"header", "record" or "auto"."""
-    rate: float | None = None
-    """Frames a second where a source has no times."""
-    base: str | None = None
-    """Coordinate frame of a bag's static transforms that is the robot's: poses of cameras are taken from them."""
-    shifts: Mapping[str, float] = field(default_factory=dict)
-    """Camera → seconds to add to its times, where clocks differ."""
-    every: int = 1
-    """Of so many frames one is taken."""
-    free: Sequence[tuple[float, float]] = ()
-    """From and to [s] after the first frame: nothing touches the robot meanwhile."""
-    log_names: Sequence[str] = ()
-    """Columns of a log of actuation beside it, for messages."""
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:

@@ -13,7 +13,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Frame, Options, Source
+from femsense.io.importers.frames import Frame, Source
+from femsense.io.importers.options import Options
 
 OVERLAP = 0.5
 """Clocks are one where the times that two sources share are this share of the shorter one."""

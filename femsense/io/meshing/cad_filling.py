@@ -28,11 +28,11 @@ from femsense.io.meshing.filling import (
     SETTLED,
     TRIES,
     Filled,
-    MeshOptions,
     Progress,
     deviation_of,
     first_edge,
 )
+from femsense.io.meshing.options import MeshOptions
 from femsense.io.meshing.surface import ClosedSurface
 from femsense.io.meshing.tetrahedra import compact
 

@@ -15,6 +15,7 @@ from femsense.core.units import PER_METRE
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles
 from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.mesh_files import radius_ratio
+from femsense.io.meshing.options import MeshOptions
 from femsense.io.meshing.surface import ClosedSurface, repaired, shared_edges
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to
 from femsense.io.meshing.tetrahedra import FILL_SECONDS, Unfinished, tetrahedralise
@@ -64,24 +65,6 @@ class Mesher(Protocol):
     ) -> TetMesh:
         """Return the tetrahedra of a surface [m]; arguments as those of `tetrahedralise`."""
         ...
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class MeshOptions:
-    """What a user asks of a mesh."""
-
-    unit: str | None = None
-    """Of the surface file: "m", "cm" or "mm"; required."""
-    size_mm: float | None = None
-    """Wanted edge length; by default from `most_tets`."""
-    most_tets: int | None = None
-    """Not more tetrahedra than this; where nobody says, MOST_TETS, or up to ENOUGH_TETS where the body needs them."""
-    tolerance_mm: float | None = None
-    """How far the mesh may leave the surface; by default a share of the edge length."""
-    element: str = "tet10"
-    close_holes: bool = False
-    fill_cavities: bool = False
-    part: int | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -24,7 +24,8 @@ from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
 from femsense.io.meshing.cad_filling import fill_cad
-from femsense.io.meshing.filling import POOR, Filled, Mesher, MeshOptions, Progress, fill
+from femsense.io.meshing.filling import POOR, Filled, Mesher, Progress, fill
+from femsense.io.meshing.options import MeshOptions
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import check_finite
 from femsense.io.meshing.tetrahedra import tetrahedralise

@@ -1,4 +1,4 @@
-"""The report on a closed loop: what the model lacked, how well the data say so, and what they cannot say."""
+"""The report on a closed loop: the effects that the model lacked, their evidence, and the limits of the data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from femsense.loop.result.loop_result import UNEXPLAINED, SavedLoop
 from femsense.loop.result.records import ModelError, Residuals
 from femsense.model.robot import Robot
 from femsense.report import words
-from femsense.report.drawing import DrawnSurface, marker_bars, skin
+from femsense.report.bodies import DrawnSurface, skin
+from femsense.report.drawing import marker_bars
 from femsense.report.loop.confounding_map import confounding_map
 from femsense.report.loop.effects import OUTCOMES, lacks, outcome, ranked_values, smallest_sizes, value_rows
 from femsense.report.loop.force_field import force_field
@@ -48,7 +49,7 @@ def loop_chapter(file: Path, title: str) -> Chapter:
     """Return the report on a loop.
 
     Arguments:
-        file: loop.json; the improved robot beside it is drawn if it is there.
+        file: loop.json; the improved robot next to it is drawn if it is there.
         title: of the chapter.
 
     Raises:
@@ -108,7 +109,7 @@ def _pictures(
 
 
 def _tests(tests: Tests) -> list[tuple[str, str]]:
-    """Return the tests of structure that were made, by name and in words."""
+    """Return the names of the tests of structure that were made, each with its words."""
     made = {**tests.before.structure.tests, **tests.after.structure.tests}
     return [
         (name, TESTS.get(name, name)) for name in sorted(made, key=lambda name: (name not in TESTS, [*TESTS, name].index(name)))
@@ -148,7 +149,7 @@ def _ratios(evidence: Evidence) -> tuple[float, float, float] | None:
 
 
 def recovered(before_m: float | None, after_m: float | None, noise_m: float | None) -> float | None:
-    """Return the share of the excess over the noise (in squares) that is gone; None where there is none to speak of."""
+    """Return the share of the excess over the noise that is gone, (b² − a²) / (b² − n²); None where the excess is below a tenth of b²."""
     if before_m is None or after_m is None or noise_m is None or not np.isfinite([before_m, after_m, noise_m]).all():
         return None
     excess = before_m**2 - noise_m**2

@@ -13,7 +13,7 @@ from femsense.loop.result.evidence import ConfoundingMap
 from femsense.report.drawing import BEFORE, INK, SIZE, as_image, clipped, new_axes
 
 WIDE = 6
-"""Beyond so many effects the map takes the whole width."""
+"""A map of more effects than this takes the whole width."""
 
 
 def confounding_map(confounding: ConfoundingMap) -> Markup | None:

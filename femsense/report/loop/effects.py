@@ -1,4 +1,4 @@
-"""Effects in words: what each means, its values with their plausible range, and the smallest size that would have been seen."""
+"""Effects in words: their meaning, values with the plausible range, and the smallest size that would have been detected."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def value_rows(effect: NamedEffect) -> list[tuple[str, str]]:
 
 
 def outcome(tried: TriedEffect) -> str:
-    """Return what became of an effect that was tried."""
+    """Return the outcome of an effect that was tried."""
     text = tried.verdict.replace("dBIC ", "ΔBIC\u00a0").replace("\u00a0-", "\u00a0−")
     if text in OUTCOMES or not text or text.startswith("not testable"):
         return OUTCOMES.get(text, text) or words.NOTHING

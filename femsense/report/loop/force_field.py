@@ -7,19 +7,8 @@ from markupsafe import Markup
 
 from femsense.loop.result.evidence import ForceField
 from femsense.report import words
-from femsense.report.drawing import (
-    SERIES,
-    DrawnSurface,
-    Key,
-    arrow_options,
-    as_image,
-    best_view,
-    body_height,
-    draw_body,
-    frame_body,
-    new_axes,
-    nice,
-)
+from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure
+from femsense.report.drawing import SERIES, as_image, nice
 
 FIELD_SHARE = 0.25
 
@@ -35,27 +24,16 @@ def force_field(field: ForceField, surface: DrawnSurface | None) -> Markup | Non
     size = float(np.linalg.norm(np.ptp(surface.nodes, axis=0)))
     scale = FIELD_SHARE * size / largest
     view = best_view(surface.nodes, forces)
-    tips = points + scale * forces
-    corners = 1e3 * np.vstack([view.flat(surface.nodes), view.flat(tips)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    figure, axes = new_axes(height=body_height(low, high))
-    draw_body(axes, surface, view)
-    front = points @ view.towards >= np.median(points @ view.towards)
-    for rows, alpha in ((~front, 0.35), (front, 1.0)):
-        axes.quiver(
-            *(1e3 * view.flat(points[rows])).T,
-            *(1e3 * scale * view.flat(forces[rows])).T,
-            color=SERIES[6],
-            alpha=alpha,
-            **arrow_options(),
-        )
+    depth = points @ view.towards
+    front = depth >= np.median(depth)
+    arrows = [Arrows(points[rows], scale * forces[rows], SERIES[6], alpha) for rows, alpha in ((~front, 0.35), (front, 1.0))]
     factor, unit = words.force_unit(largest)
-    key = nice(largest)
-    frame_body(axes, view, low, high, key=Key(1e3 * scale * key, f"{factor * key:g} {unit}", SERIES[6]))
+    length = nice(largest)
+    key = Key(1e3 * scale * length, f"{factor * length:g} {unit}", SERIES[6])
     total = [words.number(factor * v, 2) for v in field.total_n]
     sum_words = f" Together they make ({', '.join(total)}) {unit}." if len(total) == 3 else ""
     return as_image(
-        figure,
+        body_figure([[Panel(surface, tuple(arrows), SERIES[6])]], view, key),
         alt=f"Equivalent forces in frame {field.frame}, the largest {words.quantity(largest, 'N', 2)}.",
         caption=f"Not evidence: the smallest forces on the surface that would bend the model to the measurement in frame "
         f"{field.frame}, the one with the largest residual "

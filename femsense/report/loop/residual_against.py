@@ -1,4 +1,4 @@
-"""What the residual goes with: the leading pattern against its covariates, and the way of the tip."""
+"""The leading pattern of the residual against its covariates, and the path of the tip."""
 
 from __future__ import annotations
 
@@ -15,45 +15,38 @@ from femsense.report import words
 from femsense.report.drawing import AFTER, BEFORE, INK, PALE, SERIES, add_legend, as_image, clipped, name_axes, new_axes
 
 SWEEPS = len(SERIES)
-"""So many sweeps have a colour of their own."""
+"""Number of sweeps that have a colour of their own."""
 
 
 def residual_against(frames: FrameTable, score: Pattern, tip: Tip) -> list[Markup | None]:
-    """Return the leading pattern against its best covariate, coloured by direction and by sweep, and the way of the tip."""
-    figures = list[Markup | None]()
-    if score.covariate and len(score.covariate_values) == len(frames.score_before_m) > 0:
-        x, y, z = (np.asarray(values, float) for values in (score.covariate_values, frames.score_before_m, frames.score_after_m))
-        best = score.goes_with_before[0] if score.goes_with_before else None
-        strength = "" if best is None else f" (rank correlation {words.number(best.rank_correlation, 2)})"
-        x = x + _spread(x)
-        by_way = [
-            ("loading", BEFORE, ~np.asarray(frames.unloading, bool)),
-            ("unloading", SERIES[0], np.asarray(frames.unloading, bool)),
-        ]
-        figures.append(
-            as_image(
-                _scatter(x, y, z, by_way, score.covariate),
-                alt=f"Leading pattern of the residual against {score.covariate}{strength}, by direction.",
-                caption=(
-                    f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker "
-                    f"taken off; it goes best with: {score.covariate}{strength}."
-                ),
-            )
-        )
-        labels = sweep_labels(frames)
-        names = list(dict.fromkeys(labels))
-        chosen = names if len(names) <= SWEEPS else names[: SWEEPS - 1]
-        groups = [(clipped(n, 12), SERIES[i], np.array([v == n for v in labels])) for i, n in enumerate(chosen)]
-        if len(names) > len(chosen):
-            groups.append((f"{len(names) - len(chosen)} others", PALE, np.array([v not in chosen for v in labels])))
-        figures.append(
-            as_image(
-                _scatter(x, y, None, groups, score.covariate),
-                alt=f"Leading pattern of the residual against {score.covariate}, by sweep.",
-                caption=f"The same, by sweep ({words.counted(len(names), 'sweep')}).",
-            )
-        )
-    return [*figures, _tip_loop(frames, tip)]
+    """Return the leading pattern against its best covariate, coloured by direction and by sweep, and the path of the tip."""
+    if not score.covariate or not len(score.covariate_values) == len(frames.score_before_m) > 0:
+        return [_tip_loop(frames, tip)]
+    x, y, z = (np.asarray(values, float) for values in (score.covariate_values, frames.score_before_m, frames.score_after_m))
+    best = score.goes_with_before[0] if score.goes_with_before else None
+    strength = "" if best is None else f" (rank correlation {words.number(best.rank_correlation, 2)})"
+    title = f"Leading pattern of the residual against {score.covariate}"
+    x, unloading = x + _spread(x), np.asarray(frames.unloading, bool)
+    by_direction = as_image(
+        _scatter(x, y, z, [("loading", BEFORE, ~unloading), ("unloading", SERIES[0], unloading)], score.covariate),
+        alt=f"{title}{strength}, by direction.",
+        caption=(
+            f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker "
+            f"taken off; it goes best with: {score.covariate}{strength}."
+        ),
+    )
+    labels = sweep_labels(frames)
+    names = list(dict.fromkeys(labels))
+    chosen = names if len(names) <= SWEEPS else names[: SWEEPS - 1]
+    groups = [(clipped(n, 12), SERIES[i], np.array([v == n for v in labels])) for i, n in enumerate(chosen)]
+    if len(names) > len(chosen):
+        groups.append((f"{len(names) - len(chosen)} others", PALE, np.array([v not in chosen for v in labels])))
+    by_sweep = as_image(
+        _scatter(x, y, None, groups, score.covariate),
+        alt=f"{title}, by sweep.",
+        caption=f"The same, by sweep ({words.counted(len(names), 'sweep')}).",
+    )
+    return [by_direction, by_sweep, _tip_loop(frames, tip)]
 
 
 def _spread(x: FloatArray) -> FloatArray:
@@ -79,14 +72,10 @@ def _scatter(x: FloatArray, y: FloatArray, after: FloatArray | None, groups: Seq
 
 
 def _with_unit(name: str) -> str:
+    if name == "unloading":
+        return "unloading (0: no, 1: yes)"
     units = {"time": "s", "time since the last reversal": "s", "known load": "N", "distance from the camera": "m"}
-    return (
-        f"{clipped(name, 40)} [{units[name]}]"
-        if name in units
-        else "unloading (0: no, 1: yes)"
-        if name == "unloading"
-        else clipped(name, 40)
-    )
+    return clipped(name, 40) + (f" [{units[name]}]" if name in units else "")
 
 
 def sweep_labels(frames: FrameTable) -> list[str]:
@@ -96,7 +85,7 @@ def sweep_labels(frames: FrameTable) -> list[str]:
 
 
 def _tip_loop(frames: FrameTable, tip: Tip) -> Markup | None:
-    """Draw the way of the tip against actuation: measured, before and after."""
+    """Draw the path of the tip against actuation: measured, before and after."""
     place = {key: i for i, key in enumerate(zip(frames.recording, frames.frame))}
     rows = [(place[key], i) for i, key in enumerate(zip(tip.recording, tip.frame)) if key in place]
     if len(rows) < 3:
@@ -109,17 +98,13 @@ def _tip_loop(frames: FrameTable, tip: Tip) -> Markup | None:
             runs.append([])
         runs[-1].append(at)
     figure, axes = new_axes()
-    kinds = (("measured", INK, tip.measured_m), ("before", BEFORE, tip.before_m), ("after", AFTER, tip.after_m))
-    for title, color, way in kinds:
+    dots = {"linestyle": "none", "marker": "o", "markersize": 3.4, "markeredgewidth": 0, "zorder": 3}
+    line = {"linewidth": 1.3, "zorder": 2}
+    kinds = (("measured", INK, tip.measured_m, dots), ("before", BEFORE, tip.before_m, line), ("after", AFTER, tip.after_m, line))
+    for title, color, way, style in kinds:
         for n, run in enumerate(runs):
-            x = [frames.actuation[a] for a, _ in run]
-            y = [1e3 * way[b] for _, b in run]
-            style = (
-                {"linestyle": "none", "marker": "o", "markersize": 3.4, "markeredgewidth": 0}
-                if title == "measured"
-                else {"linewidth": 1.3}
-            )
-            axes.plot(x, y, color=color, label=title if n == 0 else None, zorder=3 if title == "measured" else 2, **style)
+            x, y = [frames.actuation[a] for a, _ in run], [1e3 * way[b] for _, b in run]
+            axes.plot(x, y, color=color, label=None if n else title, **style)
     name_axes(axes, "actuation (sum of the inputs)", f"{clipped(tip.marker, 12)} along its main way [mm]")
     add_legend(axes)
     gap = [_gap(tip.measured_m, way) for way in (tip.before_m, tip.after_m)]

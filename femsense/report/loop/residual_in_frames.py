@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,24 +12,9 @@ from markupsafe import Markup
 from femsense.core.arrays import FloatArray
 from femsense.loop.result.evidence import Pictures, Snapshot
 from femsense.report import words
-from femsense.report.drawing import (
-    AFTER,
-    BEFORE,
-    INK,
-    SIZE,
-    DrawnSurface,
-    Key,
-    View,
-    arrow_options,
-    as_image,
-    best_view,
-    body_height,
-    draw_body,
-    frame_body,
-    new_panels,
-    nice,
-)
-from femsense.report.loop.residual_at_rest import exaggeration
+from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure, exaggeration, largest_of
+from femsense.report.drawing import AFTER, BEFORE, as_image, nice
+from femsense.report.loop.residual_at_rest import ARROW_SHARE
 
 WIDTH = 9.4
 """Of the whole figure [inch]."""
@@ -44,37 +30,42 @@ class FrameResiduals:
 
     titles: tuple[str, ...]
     shapes: tuple[DrawnSurface | None, ...]
-    """What the declared model looks like there."""
+    """Shape of the declared model."""
     measured: tuple[FloatArray, ...]
     """Of each marker [m], shape (m, 3)."""
-    residuals: dict[str, tuple[FloatArray, ...]]
-    """Measured minus modelled "before" and "after" [m], shape (m, 3)."""
-
-    @property
-    def largest_m(self) -> float:
-        return max(float(np.linalg.norm(r, axis=1).max(initial=0.0)) for part in self.residuals.values() for r in part)
-
-    @property
-    def everything(self) -> FloatArray:
-        """All points of bodies and markers [m]."""
-        return np.vstack([*self.measured, *(shape.nodes for shape in self.shapes if shape is not None)])
+    before: tuple[FloatArray, ...]
+    """Measured minus modelled [m], shape (m, 3)."""
+    after: tuple[FloatArray, ...]
+    """Likewise."""
 
     @property
     def factor(self) -> float:
-        """So many times longer arrows are drawn: by the largest body, not by how far bodies lie apart."""
-        bodies = [*self.measured, *(shape.nodes for shape in self.shapes if shape is not None)]
-        largest = max(bodies, key=lambda points: float(np.linalg.norm(np.ptp(points, axis=0))))
-        return exaggeration(largest, [r for part in self.residuals.values() for r in part])
+        """Exaggeration of the arrows: relative to the largest body, not to the distance between bodies."""
+        largest = max(self._bodies, key=lambda points: float(np.linalg.norm(np.ptp(points, axis=0))))
+        return exaggeration(largest, [*self.before, *self.after], share=ARROW_SHARE)
 
     @property
-    def view(self) -> View:
-        return best_view(self.everything, np.vstack(self.residuals["before"]))
+    def _bodies(self) -> list[FloatArray]:
+        return [*self.measured, *(shape.nodes for shape in self.shapes if shape is not None)]
 
-    def reach(self, view: View, factor: float) -> tuple[FloatArray, FloatArray]:
-        """Return the corners of what all pictures show [mm]."""
-        tips = [m + (factor - 1.0) * r for part in self.residuals.values() for m, r in zip(self.measured, part)]
-        corners = 1e3 * np.vstack([view.flat(self.everything), view.flat(np.vstack(tips))])
-        return corners.min(axis=0), corners.max(axis=0)
+    def figure(self, cameras: Sequence[FloatArray]) -> Any:
+        """Return a figure with two rows, before and after, and a column a frame; `cameras` are the axes along which cameras look."""
+        length = nice(largest_of([*self.before, *self.after]))
+        key = Key(1e3 * self.factor * length, f"{1e3 * length:g} mm residual", BEFORE, SHAFT)
+        view = best_view(np.vstack(self._bodies), np.vstack(self.before))
+        rows = [self._panels("before", self.before, BEFORE), self._panels("after", self.after, AFTER)]
+        return body_figure(rows, view, key, cameras=cameras, width=WIDTH, most=TALLEST)
+
+    def _panels(self, name: str, residuals: Sequence[FloatArray], color: str) -> list[Panel]:
+        return [
+            Panel(
+                shape,
+                (Arrows(measured - residual, self.factor * residual, color, rings=True),),
+                color,
+                f"{name}, {title}\n{1e3 * _rms(residual):.2f} mm",
+            )
+            for title, shape, measured, residual in zip(self.titles, self.shapes, self.measured, residuals)
+        ]
 
 
 def frame_residuals(pictures: Pictures, rest: DrawnSurface | None) -> FrameResiduals | None:
@@ -82,15 +73,11 @@ def frame_residuals(pictures: Pictures, rest: DrawnSurface | None) -> FrameResid
     shown = [f for f in pictures.frames if f.measured_m]
     if not shown:
         return None
-    return FrameResiduals(
-        tuple(f"{f.title} (frame {f.frame})" for f in shown),
-        tuple(_shape(f, pictures, rest) for f in shown),
-        tuple(np.asarray(f.measured_m, float) for f in shown),
-        {
-            "before": tuple(np.asarray(f.before_m, float) for f in shown),
-            "after": tuple(np.asarray(f.after_m, float) for f in shown),
-        },
+    measured, before, after = (
+        tuple(np.asarray(getattr(f, name), float) for f in shown) for name in ("measured_m", "before_m", "after_m")
     )
+    titles = tuple(f"{f.title} (frame {f.frame})" for f in shown)
+    return FrameResiduals(titles, tuple(_shape(f, pictures, rest) for f in shown), measured, before, after)
 
 
 def _shape(snapshot: Snapshot, pictures: Pictures, rest: DrawnSurface | None) -> DrawnSurface | None:
@@ -113,37 +100,10 @@ def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Mark
     )
     sizes = ", ".join(
         f"{title} {words.length(_rms(before))} before and {words.length(_rms(after))} after"
-        for title, before, after in zip((f.title for f in pictures.frames if f.measured_m), *frames.residuals.values())
+        for title, before, after in zip((f.title for f in pictures.frames if f.measured_m), frames.before, frames.after)
     )
-    picture = as_image(
-        draw_frame_residuals(frames, pictures.camera_axes),
-        alt=f"Residuals in {len(frames.titles)} frames: {sizes}.",
-        wide=True,
-    )
-    return Markup("<p>{}</p>\n{}").format(text, picture)
-
-
-def draw_frame_residuals(frames: FrameResiduals, cameras: list[FloatArray]) -> Any:
-    """Return a figure with two rows, before and after, and a column a frame; `cameras` are the axes along which cameras look."""
-    view, factor, count = frames.view, frames.factor, len(frames.titles)
-    low, high = frames.reach(view, factor)
-    height = 2 * body_height(low, high, width=WIDTH / count, most=TALLEST)
-    figure, grid = new_panels(2, count, width=WIDTH, height=height)
-    length = nice(frames.largest_m)
-    for line, (name, color) in zip(grid, (("before", BEFORE), ("after", AFTER))):
-        key = Key(1e3 * factor * length, f"{1e3 * length:g} mm residual", color, SHAFT)
-        columns = zip(line, frames.titles, frames.shapes, frames.measured, frames.residuals[name])
-        for axes, title, shape, measured, residual in columns:
-            first = axes is line[0]
-            if shape is not None:
-                draw_body(axes, shape, view)
-            foot = 1e3 * view.flat(measured - residual)
-            axes.plot(*foot.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.7, markersize=2.8)
-            axes.quiver(*foot.T, *(1e3 * factor * view.flat(residual)).T, color=color, **arrow_options(SHAFT))
-            frame_body(axes, view, low, high, key=key, cameras=cameras if first and line is grid[0] else (), corner=first)
-            text = f"{name}, {title}\n{1e3 * _rms(residual):.2f} mm"
-            axes.set_title(text, fontsize=SIZE, color=color, loc="center", fontweight="bold")
-    return figure
+    alt = f"Residuals in {len(frames.titles)} frames: {sizes}."
+    return Markup("<p>{}</p>\n{}").format(text, as_image(frames.figure(pictures.camera_axes), alt=alt, wide=True))
 
 
 def _rms(values: FloatArray) -> float:

@@ -20,7 +20,7 @@ from femsense.report.text import columns
 from femsense.report.words import VERDICTS, known
 
 SURE = 0.05
-"""What remains goes with a quantity whose probability under chance, corrected for many tests (Holm), is below this."""
+"""The residual goes with a covariate whose p-value, corrected for multiple tests (Holm), is below this."""
 
 
 def loop_text(loop: Loop) -> str:
@@ -65,7 +65,7 @@ def _value_rows(parameters: Mapping[str, Value]) -> list[list[str]]:
 
 
 def open_pairs(loop: Loop) -> list[ConfoundedPair]:
-    """Return the pairs that the data cannot distinguish: those of what is named, or all where nothing is."""
+    """Return the pairs that the data cannot distinguish: those that hold a named effect, or all where no effect is named."""
     names = {effect.name for effect in loop.effects}
     return [row for row in loop.confounded if names & set(row.pair) or not names]
 
@@ -76,21 +76,21 @@ def _untestable(effect: Untestable) -> str:
 
 
 def _seen(loop: Loop) -> str:
-    """Return in one line from which size on effects that are testable, and were not found, would have been seen."""
+    """Return in one line the smallest sizes at which testable effects that were not found would have been detected."""
     hidden = {effect.name for effect in loop.not_testable}
     shown = {name: entry for name, entry in loop.detectable.items() if name not in hidden and entry.would_be_seen}
     return ", ".join(f"{name} ({_size(entry)})" for name, entry in shown.items() if entry.smallest)
 
 
 def _size(entry: Detectable) -> str:
-    """Return the smallest size that would be seen in all places."""
+    """Return the smallest size that would be detected at all places."""
     largest = max((size for size in entry.smallest.values() if size is not None), default=float("nan"))
     size = f"{largest:.{4 if entry.kind == 'factor' else 3}g}" + ("" if entry.unit in (None, "", "1") else f" {entry.unit}")
     return {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(entry.kind or "", size)
 
 
 def _left(left: Left) -> str:
-    """Return in one line how large the remaining residual is, where, when, what it goes with, and whether it has structure."""
+    """Return in one line the size of the remaining residual, its place, frame and covariate, and whether it has structure."""
     if not known(left.rms_m):
         return ""
     words = [f"{1e3 * left.rms_m:.3g} mm rms" + (" in held-out data" if left.held_out else "")]
@@ -134,7 +134,7 @@ def _rows(loop: Loop) -> list[list[str]]:
 
 
 def correction_text(own: CorrectionRecord) -> str:
-    """Return what an empirical correction does to held-out markers, and whether it is handed back."""
+    """Return what an empirical correction does to held-out markers, and whether it is returned."""
     before, after = own.validation_rms_before_m, own.validation_rms_after_m
     sizes = "" if before is None or after is None else f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms held out; "
     return f"{sizes}{own.verdict}; it is {'handed back, as no cause' if own.accepted else 'not handed back'}"

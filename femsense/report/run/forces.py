@@ -1,4 +1,4 @@
-"""Contact forces of a run: over time, on the body, beside declared loads, one by one."""
+"""Contact forces of a run: over time, on the body, next to declared loads, one by one."""
 
 from __future__ import annotations
 
@@ -10,97 +10,90 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray
 from femsense.report import words
-from femsense.report.drawing import (
-    MANY,
-    SERIES,
-    DrawnSurface,
-    Key,
-    add_legend,
-    as_image,
-    best_view,
-    body_height,
-    draw_body,
-    frame_body,
-    name_axes,
-    new_axes,
-    nice,
-    skin,
-)
-from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
-from femsense.sensing.run_arrays import NOISE, undetermined_text
+from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure, skin
+from femsense.report.drawing import INK, MANY, SERIES, add_legend, as_image, name_axes, new_axes, nice
+from femsense.report.run.document import SavedRun
+from femsense.report.run.frames import column
+from femsense.report.text import strongest_contact
+from femsense.sensing.run_arrays import NOISE, sensed, undetermined, undetermined_text
 from femsense.sensing.run_files import read_states
+from femsense.sensing.types import ContactForce, FrameReport
 
 ROWS = 150
-"""So many contacts are listed one by one."""
+"""Number of contacts that are listed one by one."""
 SHOWN = len(SERIES)
+"""Contacts that get a colour: those with the largest forces."""
 ARROW_SHARE = 0.3
 """The longest arrow, in sizes of the body."""
-ARROW: dict[str, Any] = {"arrowstyle": "-|>,head_length=0.55,head_width=0.28", "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0}
+SHAFT = 0.03
+"""Width of an arrow [inch]."""
 
 
 def force_text(size: float, std: float) -> str:
-    """Return a force with its deviation, in N or mN."""
+    """Return a force with its standard deviation, in N or mN."""
     factor, unit = words.force_unit(abs(size))
     return words.joined(words.with_std(factor * float(size), factor * float(std)), unit)
 
 
-def force_pictures(contacts: ContactTable | None, frames: FrameTable | None, folder: Path) -> list[Markup | None]:
+def force_pictures(run: SavedRun) -> list[Markup | None]:
     """Return the forces over time, and on the body in the frame of the strongest."""
-    if contacts is None or not np.isfinite(contacts.size_n).any():
+    contacts = [c for c in run.contacts or () if np.isfinite(c.force_n)]
+    if not contacts:
         return []
-    numbers = _largest_series(contacts)
-    times = contacts.time_s if frames is None or not len(frames) else frames.time_s
-    more = len(set(contacts.contact.tolist())) - len(numbers)
-    rest = f" The {len(numbers)} strongest of {len(numbers) + more}." if more > 0 else ""
-    strongest = strongest_contact(contacts, frames)
-    largest = (
-        "none of them above the noise"
-        if strongest is None
-        else f"the largest {force_text(contacts.size_n[strongest], contacts.std_n[strongest])}"
-    )
+    tracks, shown = len({c.track for c in contacts}), len(largest_tracks(contacts))
+    rest = f" The {shown} strongest of {tracks}." if tracks > shown else ""
+    strongest = strongest_contact(contacts, run.frames or ())
+    largest = "none of them above the noise"
+    if strongest is not None:
+        largest = f"the largest {force_text(strongest.force_n, strongest.std_n)}"
     over_time = as_image(
-        _force_figure(contacts, frames, numbers, (float(times.min()), float(times.max()))),
-        alt=f"Force of {words.counted(len(numbers), 'contact')} over time; {largest}.",
+        forces_figure(contacts, run.frames or ()),
+        alt=f"Force of {words.counted(shown, 'contact')} over time; {largest}.",
         caption=f"Size of each force; the bands are ± 1 and ± 2 standard deviations.{rest}",
     )
-    return [over_time, None if strongest is None else _force_on_body(contacts, frames, folder, contacts.frame[strongest])]
+    return [over_time, None if strongest is None else _force_on_body(run, contacts, strongest.frame)]
 
 
-def _largest_series(contacts: ContactTable) -> list[int]:
-    """Return the numbers of the contacts to draw: those with the largest forces, in order."""
-    largest = {int(c): float(np.nanmax(contacts.size_n[contacts.contact == c], initial=0.0)) for c in np.unique(contacts.contact)}
-    return sorted(sorted(largest, key=lambda c: -largest[c])[:SHOWN])
+def largest_tracks(contacts: Sequence[ContactForce]) -> list[int]:
+    """Return the tracks to draw: those with the largest forces, in order."""
+    largest: dict[int, float] = {}
+    for c in contacts:
+        largest[c.track] = max(largest.get(c.track, 0.0), c.force_n)
+    return sorted(sorted(largest, key=lambda track: -largest[track])[:SHOWN])
 
 
-def _force_figure(contacts: ContactTable, frames: FrameTable | None, numbers: Sequence[int], span: tuple[float, float]) -> Any:
+def forces_figure(contacts: Sequence[ContactForce], frames: Sequence[FrameReport]) -> Any:
+    """Return a matplotlib figure of the size of each force over time, with bands of one and two standard deviations.
+
+    A point is hollow where its frame is not ok.
+
+    Arguments:
+        contacts: with sizes that are finite.
+        frames: of the run; none where they are not known.
+    """
     figure, axes = new_axes()
-    factor, unit = words.force_unit(float(np.nanmax(contacts.size_n)))
-    order = contacts.frame if frames is None else frames.frame
-    place = {int(frame): i for i, frame in enumerate(np.unique(order))}
-    for color, number in zip(SERIES, numbers):
-        rows = np.flatnonzero((contacts.contact == number) & np.isfinite(contacts.size_n))
-        rows = rows[np.argsort(contacts.frame[rows], kind="stable")]
-        at = np.array([place.get(int(f), -1) for f in contacts.frame[rows]])
-        for run in np.split(rows, np.flatnonzero(np.diff(at) != 1) + 1):
-            _draw_run(axes, contacts.time_s[run], factor * contacts.size_n[run], factor * contacts.std_n[run], color)
-        many = len(rows) > MANY
-        axes.plot(
-            contacts.time_s[rows],
-            factor * contacts.size_n[rows],
-            "o",
-            color=color,
-            markersize=2.0 if len(rows) > 150 else 3.8,
-            markeredgewidth=0,
-            label=f"contact {number}",
-            rasterized=many,
-            zorder=4,
-        )
-    size, std = factor * contacts.size_n, factor * np.nan_to_num(contacts.std_n)
-    top = min(float(np.nanmax(size + 2 * std)), 2.5 * float(np.nanmax(size)))
-    margin = 0.03 * (span[1] - span[0]) or 1.0
-    axes.set(ylim=(0.0, 1.06 * max(top, 1e-3)), xlim=(span[0] - margin, span[1] + margin))
+    size, std = column(contacts, "force_n"), np.nan_to_num(column(contacts, "std_n"))
+    factor, unit = words.force_unit(float(size.max()))
+    order = {frame: i for i, frame in enumerate(sorted({row.frame for row in frames or contacts}))}
+    doubtful = {frame.frame for frame in frames if frame.status != "ok"}
+    for color, track in zip(SERIES, largest_tracks(contacts)):
+        rows = sorted((c for c in contacts if c.track == track), key=lambda c: c.frame)
+        at = np.array([order.get(c.frame, -1) for c in rows])
+        time, own, spread = (column(rows, name) for name in ("time_s", "force_n", "std_n"))
+        for run in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(at) != 1) + 1):
+            _draw_run(axes, time[run], factor * own[run], factor * spread[run], color)
+        dots = {"markersize": 2.0 if len(rows) > 150 else 3.8, "rasterized": len(rows) > MANY, "zorder": 4}
+        axes.plot(time, factor * own, "o", color=color, markeredgewidth=0, label=f"contact {track}", **dots)
+        hollow = np.array([c.frame in doubtful for c in rows])
+        axes.plot(time[hollow], factor * own[hollow], "o", mfc="white", mec=color, **dots)
+    if any(c.frame in doubtful for c in contacts):
+        axes.plot([], [], "o", markersize=3.8, mfc="white", mec=INK, label="frame not ok")
+    top = factor * min(float((size + 2 * std).max()), 2.5 * float(size.max()))
+    times = column(frames or contacts, "time_s")
+    margin = 0.03 * float(np.ptp(times)) or 1.0
+    axes.set(ylim=(0.0, 1.06 * max(top, 1e-3)), xlim=(times.min() - margin, times.max() + margin))
     name_axes(axes, "time [s]", f"force [{unit}]")
     add_legend(axes)
     return figure
@@ -118,49 +111,43 @@ def _draw_run(axes: Any, time: FloatArray, size: FloatArray, std: FloatArray, co
     axes.plot(time, size, color=color, linewidth=1.3, rasterized=many)
 
 
-def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Path, number: int) -> Markup | None:
+def _force_on_body(run: SavedRun, contacts: Sequence[ContactForce], number: int) -> Markup | None:
     """Draw the body in the frame of the strongest force, with the forces on it."""
-    surface = None if frames is None else _surface_at(folder / "states.npz", frames, number)
-    whole = np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
-    rows = np.flatnonzero((contacts.frame == number) & whole)
-    if surface is None or not len(rows) or not contacts.size_n[rows].max() > 0:
+    surface = _surface_at(run.folder / "states.npz", run.frames or (), number)
+    shown = [c for c in contacts if c.frame == number and np.isfinite([c.force_n_xyz, c.position_m]).all()]
+    if surface is None or not shown or not max(c.force_n for c in shown) > 0:
         return None
-    text = "; ".join(f"contact {contacts.contact[i]} {force_text(contacts.size_n[i], contacts.std_n[i])}" for i in rows)
+    text = "; ".join(f"contact {c.track} {force_text(c.force_n, c.std_n)}" for c in shown)
     return as_image(
-        _draw_forces(surface, contacts, rows),
+        _draw_forces(surface, shown),
         alt=f"The deformed body in frame {number} with the forces on it: {text}.",
         caption=f"Frame {number}, with the strongest force: {text}.",
     )
 
 
-def _surface_at(file: Path, frames: FrameTable, number: int) -> DrawnSurface | None:
+def _surface_at(file: Path, frames: Sequence[FrameReport], number: int) -> DrawnSurface | None:
     """Return the surface of the body in a frame; None where its state is not known."""
-    index = np.flatnonzero(frames.frame == number)
-    if not file.is_file() or not len(index):
+    k = next((k for k, frame in enumerate(frames) if frame.frame == number), None)
+    if not file.is_file() or k is None:
         return None
     states = read_states(file)
-    if index[0] >= len(states.nodes_m) or not np.isfinite(states.nodes_m[index[0]]).all():
+    if k >= len(states.nodes_m) or not np.isfinite(states.nodes_m[k]).all():
         return None
-    return skin(np.asarray(states.nodes_m[index[0]], dtype=np.float64), states.tets)
+    return skin(np.asarray(states.nodes_m[k], dtype=np.float64), states.tets)
 
 
-def _draw_forces(surface: DrawnSurface, contacts: ContactTable, rows: IntArray) -> Any:
-    view = best_view(surface.nodes, contacts.force_n[rows])
-    largest = float(contacts.size_n[rows].max())
+def _draw_forces(surface: DrawnSurface, contacts: Sequence[ContactForce]) -> Any:
+    largest = max(c.force_n for c in contacts)
     scale = ARROW_SHARE * float(np.linalg.norm(np.ptp(surface.nodes, axis=0))) / max(largest, 1e-12)
-    tips = contacts.place_m[rows]
-    tails = tips - scale * contacts.force_n[rows]
-    flat = 1e3 * view.flat(np.vstack([surface.nodes, tips, tails]))
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    figure, axes = new_axes(height=body_height(low, high))
-    draw_body(axes, surface, view)
-    for i, tail, tip in zip(rows, 1e3 * view.flat(tails), 1e3 * view.flat(tips)):
-        arrow = ARROW | {"color": SERIES[int(contacts.contact[i]) % len(SERIES)]}
-        axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops=arrow, zorder=6)
+    arrows = []
+    for c in contacts:
+        vector = scale * c.force_n_xyz
+        arrows.append(Arrows((c.position_m - vector)[None], vector[None], SERIES[c.track % len(SERIES)]))
     factor, unit = words.force_unit(largest)
-    bar = nice(largest)
-    frame_body(axes, view, low, high, key=Key(1e3 * scale * bar, f"{factor * bar:g} {unit}", SERIES[0], None))
-    return figure
+    length = nice(largest)
+    key = Key(1e3 * scale * length, f"{factor * length:g} {unit}", INK, SHAFT)
+    view = best_view(surface.nodes, np.array([c.force_n_xyz for c in contacts]))
+    return body_figure([[Panel(surface, tuple(arrows), INK)]], view, key)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -172,36 +159,42 @@ class ListedContacts:
     rows: Sequence[tuple[str, ...]]
     """Frame, time, contact, force, its components, its place, its source."""
     note: str
-    """What is not listed."""
+    """How many are not listed, and why."""
 
 
-def listed_contacts(contacts: ContactTable) -> ListedContacts | None:
-    """Return the contacts one by one, the first of many, also those that were seen and whose size is not determined.
+def listed_contacts(contacts: Sequence[ContactForce]) -> ListedContacts | None:
+    """Return the significant contacts one by one, the first of many, and the visible ones whose size is not determined.
 
     Other forces that noise may make are counted. None where there are none.
     """
-    if not (contacts.sensed | contacts.undetermined).any():
+    weak = {id(c) for c in undetermined(contacts)}
+    felt = weak | {id(c) for c in sensed(contacts)}
+    shown = [c for c in contacts if id(c) in felt]
+    if not shown:
         return None
-    felt = np.flatnonzero(contacts.sensed | contacts.undetermined)
-    factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
+    factor, unit = words.force_unit(float(np.nanmax(column(contacts, "force_n"), initial=0.0)))
     rows = [
         (
-            str(contacts.frame[i]),
-            words.number(float(contacts.time_s[i])),
-            str(contacts.contact[i]),
-            undetermined_text(contacts.size_n[i], contacts.std_n[i]) if contacts.undetermined[i] else size,
-            _vector(factor * contacts.force_n[i]),
-            _vector(1e3 * contacts.place_m[i], 1),
-            contacts.source[i] or words.NOTHING,
+            str(c.frame),
+            words.number(c.time_s),
+            str(c.track),
+            undetermined_text(c.force_n, c.std_n) if id(c) in weak else words.with_std(factor * c.force_n, factor * c.std_n),
+            _vector(factor * c.force_n_xyz),
+            _vector(1e3 * c.position_m, 1),
+            c.source or words.NOTHING,
         )
-        for i in felt[:ROWS]
-        for size in [words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i]))]
+        for c in shown[:ROWS]
     ]
-    note = first_of(len(felt), ROWS, "contacts.csv")
-    if len(felt) < len(contacts):
-        left_out = words.counted(len(contacts) - len(felt), "row")
+    note = first_of(len(shown), ROWS, "contacts.csv")
+    if len(shown) < len(contacts):
+        left_out = words.counted(len(contacts) - len(shown), "row")
         note += f" Of less than {NOISE:g} standard deviations, and so none: {left_out} more of contacts.csv."
     return ListedContacts(unit, rows, note)
+
+
+def first_of(count: int, shown: int, file: str) -> str:
+    """Return a note on what a table leaves out; empty where it shows all."""
+    return f" The first {shown} of {count}; all of them are in {file}." if count > shown else ""
 
 
 def _vector(values: FloatArray, decimals: int | None = None) -> str:

@@ -10,8 +10,8 @@ from helpers import DATA
 
 from femsense.core.errors import InputError
 from femsense.io.importers.c3d import open_c3d
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
+from femsense.io.importers.options import Axis, Options
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.model.recording import marker_grid
@@ -87,7 +87,7 @@ def test_metres_missing_points_and_the_vertical(tmp_path: Path) -> None:
     grid = marker_grid(load_recording(tmp_path / "same"))
     assert np.isnan(grid[2:4, 1]).all() and np.isfinite(grid).sum() == 3 * (21 - 2)
     np.testing.assert_allclose(grid[:, 0], points[:, 0], rtol=1e-6)
-    write_recording(open_source(file, Options(up="y")), tmp_path / "turned", identity={})
+    write_recording(open_source(file, Options(up=Axis.y)), tmp_path / "turned", identity={})
     turned = marker_grid(load_recording(tmp_path / "turned"))
     np.testing.assert_allclose(turned[:, 0, 2], points[:, 0, 1], rtol=1e-6)
     edges = (turned[:, 1] - turned[:, 0], turned[:, 2] - turned[:, 0])

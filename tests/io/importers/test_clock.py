@@ -10,7 +10,7 @@ from imported import imported
 
 from femsense.core.errors import InputError
 from femsense.core.units import unit_named
-from femsense.io.importers.frames import Options
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.clock import seconds_of
 

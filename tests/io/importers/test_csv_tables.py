@@ -10,8 +10,8 @@ from imported import imported
 
 from femsense.core.errors import InputError
 from femsense.io.clouds.xyz import read_xyz_columns
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import column_unit
 from femsense.model.recording import marker_grid

@@ -14,9 +14,9 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
 from femsense.io.importers.images.folders import read_points
+from femsense.io.importers.options import Options
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.model.recording import Recording

@@ -9,7 +9,8 @@ import pytest
 from imported import imported
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Frame, Options, Source
+from femsense.io.importers.frames import Frame, Source
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.input_samples import samples_of
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording

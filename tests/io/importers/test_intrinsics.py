@@ -11,8 +11,8 @@ import pytest
 from imported import imported
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options
 from femsense.io.importers.images.intrinsics import read_lens
+from femsense.io.importers.options import Options
 
 WIDTH, HEIGHT = 160, 120
 FX, FY, CX, CY = 131.25, 131.5, 79.5, 59.5

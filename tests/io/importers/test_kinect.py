@@ -12,9 +12,9 @@ from kinect_writer import COLOR_MODEL, DEPTH_MODEL, calibration, write_kinect
 
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
 from femsense.io.importers.images.kinect import calibrated_lens
+from femsense.io.importers.options import Options
 
 SMALL = (288, 320)
 

@@ -10,8 +10,8 @@ import pytest
 from imported import imported
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source, open_sources
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 
 NEXUS = "Trajectories\n100\n,,arm:base,,,arm:tip,,\nFrame,Sub Frame,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n" + "".join(

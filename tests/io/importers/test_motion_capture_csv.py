@@ -11,8 +11,8 @@ import pytest
 from helpers import DATA
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
+from femsense.io.importers.options import Axis, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
@@ -71,7 +71,7 @@ def test_motive(unit: str, scale: float, tmp_path: Path) -> None:
 
 def test_motive_turned_upright(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text(MOTIVE.format(unit="Meters"))
-    recording, _ = imported(tmp_path / "take.csv", tmp_path / "out", Options(up="y", topics=["tip"]))
+    recording, _ = imported(tmp_path / "take.csv", tmp_path / "out", Options(up=Axis.y, topics=["tip"]))
     np.testing.assert_allclose(recording.marker_xyz[0], [1, -3, 2])
 
 
@@ -154,7 +154,7 @@ def test_observations_and_commands_of_a_trunk(tmp_path: Path) -> None:
     columns = {f"phi{i}": f"cable_m{i}*0.0002" for i in range(1, 7)}
     columns |= {f"{axis}{i}": f"disc{i}.{axis}" for i in (1, 2, 3) for axis in "xyz"}
     recording, found = imported(
-        file, tmp_path / "out", Options(unit="m", rate=100.0, up="y", columns=columns), actuation="displacement"
+        file, tmp_path / "out", Options(unit="m", rate=100.0, up=Axis.y, columns=columns), actuation="displacement"
     )
     with gzip.open(file, "rt") as stream:
         names = stream.readline().strip().split(",")

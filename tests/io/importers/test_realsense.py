@@ -12,8 +12,8 @@ import pytest
 import realsense_writer as camera
 
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.options import Options
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.pointcloud.cloud import PointCloud

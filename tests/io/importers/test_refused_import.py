@@ -10,7 +10,7 @@ import pytest
 
 from femsense.app.import_command import import_into
 from femsense.core.errors import FemsenseError
-from femsense.io.importers.frames import Options
+from femsense.io.importers.options import Options
 
 GOOD = "time,tip_x,tip_y,tip_z\n0,0.1,0.2,0.3\n1,0.1,0.2,0.31\n2,0.1,0.2,0.32\n"
 BAD = {

@@ -16,8 +16,8 @@ from ros_writers import HEIGHT, LENS, START_NS, STEP_NS, WIDTH, BagWriter, color
 from femsense.core.errors import InputError
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.writer import write_recording
 from femsense.model.recording import marker_grid
 
@@ -318,7 +318,7 @@ def test_header_stamps_win_over_the_jitter_of_recording(tmp_path: Path) -> None:
             bag.write("/points", stamp + int(rng.integers(1, 20)) * 10**6, bag.cloud(np.ones((4, 3)), None, stamp))
     recording, _ = imported(tmp_path / "take", tmp_path / "a")
     np.testing.assert_allclose(np.diff(recording.time_s), 1e-9 * STEP_NS, atol=1e-6)
-    late, _ = imported(tmp_path / "take", tmp_path / "b", Options(clock="record"))
+    late, _ = imported(tmp_path / "take", tmp_path / "b", Options(clock=Clock.record))
     assert np.ptp(np.diff(late.time_s)) > 1e-3
 
 

@@ -20,8 +20,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from femsense.core.errors import InputError
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.options import Options
 
 FRAMES = 3
 

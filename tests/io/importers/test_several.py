@@ -16,8 +16,9 @@ from femsense.app import cli
 from femsense.app.import_command import import_into
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Frame, Images, Lens, Options, Source
+from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.guess import open_sources
+from femsense.io.importers.options import Options
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording

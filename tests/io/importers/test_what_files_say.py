@@ -15,8 +15,8 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import read_cloud, viewpoint_doubt
 from femsense.io.clouds.ply import read_ply_vertices
 from femsense.io.clouds.xyz import read_xyz_columns
-from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import contents, guess_format, open_source
+from femsense.io.importers.options import Options
 from femsense.model.recording import marker_grid
 
 # C3D

@@ -22,7 +22,8 @@ from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_li
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing import tetrahedra
 from femsense.io.meshing.cad_filling import fill_cad
-from femsense.io.meshing.filling import MeshOptions, fill
+from femsense.io.meshing.filling import fill
+from femsense.io.meshing.options import MeshOptions
 from femsense.io.meshing.robot_from_surface import mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
 from femsense.io.robot_toml import load_robot

@@ -10,8 +10,9 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options, unit_of
+from femsense.io.importers.frames import unit_of
 from femsense.io.importers.images.pictures import FINE_UNIT
+from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.ros.bag import Bag, Message
 from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
 from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
@@ -242,7 +243,7 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
     "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
     like the time of recording (those of the SDK may count from elsewhere); else "record".
     """
-    if options.clock in ("header", "record"):
+    if options.clock is not Clock.auto:
         return options.clock
     sdk = is_sdk(choice.primary.topic.name)
     if sdk and _metadata(bag, choice, "metadata"):

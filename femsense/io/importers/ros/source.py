@@ -15,10 +15,11 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
+from femsense.io.importers.frames import DepthImage, Frame, Images, Source, check_reach, upright
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.images.pictures import depth_of_metres
+from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.ros.bag import Bag, Message, open_bag
 from femsense.io.importers.ros.messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
 from femsense.io.importers.ros.plan import (
@@ -51,7 +52,7 @@ def open_ros(path: Path, options: Options) -> Source:
             return _source(bag, streams, options)
         sources = _sources(bag, streams, cameras, options)
         if len({source.found["clock"] for source in sources.values()}) > 1:
-            sources = _sources(bag, streams, cameras, replace(options, clock="record"))
+            sources = _sources(bag, streams, cameras, replace(options, clock=Clock.record))
     return joined(sources, path, options)
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
-from femsense.io.importers.frames import Lens, Options
+from femsense.io.importers.frames import Lens
 from femsense.io.importers.images.intrinsics import check_lens
+from femsense.io.importers.options import Options
 from femsense.io.importers.ros.bag import Bag, Topic
 from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options
 from femsense.io.importers.journal import Journal
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.clock import seconds_of
 from femsense.io.importers.tables.csv_tables import column_unit, read_numbers, time_column
 from femsense.io.importers.tables.input_samples import samples_of

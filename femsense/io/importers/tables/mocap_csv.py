@@ -16,7 +16,8 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
+from femsense.io.importers.frames import Frame, Source, check_size, unit_of, upright
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.csv_tables import is_cut_off, rows_of
 from femsense.io.importers.tables.mapping import MARKER
 

@@ -14,7 +14,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit
-from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+from femsense.io.importers.frames import Frame, Source, unit_of, upright
+from femsense.io.importers.options import Options
 from femsense.io.importers.tables.clock import seconds_of
 from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_time, layout_of, number_rows, time_column
 from femsense.io.importers.tables.input_samples import Samples, samples_of

@@ -1,0 +1,132 @@
+"""What a person says about a source of another program, in Python and on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+from femsense.core.errors import InputError
+from femsense.core.options import Flag
+
+UNITS = ("m", "cm", "mm", "in", "ft")
+"""Units of length that `--unit` takes, in any spelling that `core.units` knows."""
+
+
+class Axis(StrEnum):
+    """A vertical axis."""
+
+    x = "x"
+    y = "y"
+    z = "z"
+
+
+class Clock(StrEnum):
+    """Which time stamps of a bag count."""
+
+    auto = "auto"
+    header = "header"
+    record = "record"
+
+
+class Inputs(StrEnum):
+    """What the cables' values are."""
+
+    tension = "tension"
+    displacement = "displacement"
+
+
+class Zero(StrEnum):
+    """Whether the zero of the inputs is known."""
+
+    absolute = "absolute"
+    unknown = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class InputOptions:
+    """What a person says about the inputs of a recording."""
+
+    inputs: Annotated[Inputs | None, Flag("--inputs", help="What the cables' values are.")] = None
+    """None: as the source says."""
+    zero: Annotated[Zero | None, Flag("--zero", help="What they count from.")] = None
+    actuation: Annotated[Path | None, Flag("--actuation", "FILE", "A CSV file with the inputs over time.")] = None
+    offset: Annotated[float | None, Flag("--offset", "S", "The frames' time minus that file's; else from motion.")] = None
+    """None: found from the motion."""
+
+
+def columns_named(columns: Sequence[str]) -> dict[str, str]:
+    """Return the mappings NAME=TARGET of `--map` as name in the source → name in the recording. Raises InputError."""
+    pairs = [text.rpartition("=") if "@" not in text else text.partition("=") for text in columns]
+    for text, (old, mark, new) in zip(columns, pairs):
+        if not (old and mark and new):
+            raise InputError(
+                "not a mapping", where="--map", found=text, expected="NAME=TARGET, such as motor1=cable_north or 3=tip.x"
+            )
+    return {old: new for old, _, new in pairs}
+
+
+def shifts_named(shifts: Sequence[str]) -> dict[str, float]:
+    """Return the seconds CAMERA=S of `--shift` as camera → seconds. Raises InputError."""
+    found: dict[str, float] = {}
+    for text in shifts:
+        name, _, value = text.rpartition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise InputError("not a shift of a camera's times", where="--shift", found=text, expected="CAMERA=SECONDS")
+    return found
+
+
+def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
+    """Return the spans FROM:TO of `--free` [s]. Raises InputError."""
+    spans = []
+    for text in ranges:
+        try:
+            first, last = (float(part) for part in text.split(":"))
+        except ValueError:
+            first, last = 1.0, 0.0
+        if first > last:
+            raise InputError("not a span of time", where="--free", found=text, expected="FROM:TO, seconds after the first frame")
+        spans.append((first, last))
+    return spans
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Options:
+    """What a person says about a source; empty where nothing was said."""
+
+    format: Annotated[str | None, Flag("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None
+    topics: Annotated[Sequence[str], Flag("--topic", "NAME", "What to take, where there is a choice.", read=tuple)] = ()
+    """Topics, streams, tracks or names."""
+    columns: Annotated[
+        Mapping[str, str],
+        Flag("--map", "NAME=TARGET", "Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.", read=columns_named),
+    ] = field(default_factory=dict)
+    """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02;
+    may end in *FACTOR."""
+    unit: Annotated[str | None, Flag("--unit", "m|cm|mm|in|ft", "Of lengths.")] = None
+    """One of UNITS."""
+    up: Annotated[Axis | None, Flag("--up", None, "The vertical axis; it is turned to z.")] = None
+    clock: Annotated[Clock, Flag("--clock", None, "Which time stamps of a bag.")] = Clock.auto
+    rate: Annotated[float | None, Flag("--rate", "HZ", "Where the source has no times.")] = None
+    """Frames a second."""
+    base: Annotated[str | None, Flag("--base", "FRAME", "Frame of a bag's transforms that is the robot's.")] = None
+    """Coordinate frame of the static transforms: poses of cameras are taken from them."""
+    shifts: Annotated[
+        Mapping[str, float], Flag("--shift", "CAMERA=S", "Seconds to add to a camera's times.", read=shifts_named)
+    ] = field(default_factory=dict)
+    """Camera → seconds, where clocks differ."""
+    depth_unit: Annotated[float | None, Flag("--depth-unit", "M", "Metres in one unit of depth images, if it is another.")] = None
+    every: Annotated[int, Flag("--every", "N", "Take one of so many frames.", min=1)] = 1
+    free: Annotated[
+        Sequence[tuple[float, float]],
+        Flag("--free", "FROM:TO", "Seconds after the first frame; nothing touches the robot.", read=free_named),
+    ] = ()
+    """From and to [s]."""
+    log_names: Sequence[str] = ()
+    """Columns of a log of actuation beside it, for messages."""
