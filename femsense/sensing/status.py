@@ -140,9 +140,13 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
 
 
 def _std_along(best: Fit, i: int) -> float:
-    force = best.forces[i]
-    along = force / max(float(np.linalg.norm(force)), 1e-12)
-    return float(np.sqrt(max(float(along @ best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ along), 0.0)))
+    """Return the standard deviation of a force along itself [N], or along the normal where it is smaller than a thousandth of that."""
+    force, covariance = best.forces[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+    normal = best.axes[i][0]
+    across = float(np.sqrt(normal @ covariance @ normal))
+    size = float(np.linalg.norm(force))
+    along = force / size if size > 1e-3 * across else normal
+    return float(np.sqrt(max(float(along @ covariance @ along), 0.0)))
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:

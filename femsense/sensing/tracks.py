@@ -38,8 +38,6 @@ def contacts_of(
     found: list[ContactForce] = []
     for touch, force, own, place in zip(touches, forces, covariances, place_covariances):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, state)
-        if size == 0.0 and touch.source != "given":
-            continue
         std = size_std(force, own) if size > 0.0 else float(np.sqrt(max(float(normal @ own @ normal), 0.0)))
         found.append(
             ContactForce(
