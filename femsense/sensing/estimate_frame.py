@@ -27,7 +27,7 @@ from femsense.sensing.places import away_from_scenery, given_touches, object_tou
 from femsense.sensing.proposals import SAME, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
-from femsense.sensing.status import checked
+from femsense.sensing.status import SQUEEZED, checked, stretch_under_contacts
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
@@ -132,8 +132,10 @@ def measurements(rows: Rows) -> int:
 
 
 def _searched(model: Model, best: Fit) -> Fit:
-    """Return the best fit after proposals have stopped to lower J."""
+    """Return the best fit after proposals have stopped to lower J, or where it squeezes the body beyond what law and mesh hold."""
     for _ in range(ROUNDS):
+        if stretch_under_contacts(model, best) < SQUEEZED:
+            break
         best = _with_objects(model, best)
         better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:

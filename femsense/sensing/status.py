@@ -87,8 +87,7 @@ def checked(model: Model, best: Fit) -> Verdict:
     """Return the verdict of the posterior check on a fitted frame."""
     if best.contacts and not best.converged:
         return verdict(Status.NOT_CONVERGED)
-    carrying = np.unique([node for contact in best.contacts for node in contact.patch.nodes])
-    stretch = least_stretch(model.sensor.robot.body.mesh, best.state.positions, carrying)
+    stretch = stretch_under_contacts(model, best)
     if stretch < SQUEEZED:
         return verdict(Status.SQUEEZED, percent=100.0 * max(stretch, 0.0))
     if best.frame.pixels is None:
@@ -111,6 +110,12 @@ def checked(model: Model, best: Fit) -> Verdict:
         if std > UNKNOWN:
             return verdict(Status.MAY_TOUCH, force_n=max(mean, 0.0) + 2.0 * std, where=where)
     return verdict(Status.OK)
+
+
+def stretch_under_contacts(model: Model, best: Fit) -> float:
+    """Return the least principal stretch of the elements that carry contacts [1]."""
+    carrying = np.unique([node for contact in best.contacts for node in contact.patch.nodes])
+    return least_stretch(model.sensor.robot.body.mesh, best.state.positions, carrying)
 
 
 def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
