@@ -57,6 +57,10 @@ def _untaught(sensor: Sensor) -> Model:
     return contact_free.prior_model(sensor)
 
 
+def _no_radius(*given: object) -> float:
+    return 0.0
+
+
 def _nothing_seen(*given: object) -> list[Any]:
     return []
 
@@ -69,7 +73,7 @@ WAYS = (
     ),
     Way("all, but no objects: contacts by the shape alone", patches=((estimate_frame, "objects_near", _nothing_seen),)),
     Way("all, but no forces along the surface", SensingOptions(friction=0.0)),
-    Way("all, but no patch by the object", patches=((touches, "HERTZ", 0.0),)),
+    Way("all, but no patch by the object", patches=((touches, "contact_radius", _no_radius),)),
     Way("all, but no deviation of the compliance", patches=((model.Model, "compliance_std", 0.0),)),
     Way("all"),
     Way(GIVEN, given=True),

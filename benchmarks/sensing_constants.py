@@ -1,6 +1,6 @@
 """What constants of sensing do: forces of independent cases with each of them at other values.
 
-    python benchmarks/sensing_constants.py OUT [--seed S] [--case NAME …] [--only HERTZ …]
+    python benchmarks/sensing_constants.py OUT [--seed S] [--case NAME …] [--only PATCH …]
 
 Cases are made below OUT where they are not there yet, calibrated once, and estimated with each value. Needs scikit-fem.
 """
@@ -19,7 +19,7 @@ from independent.grade import grade
 from independent.make import make
 
 from femsense import calibrate, estimate, load_recording, load_robot
-from femsense.inference import pixels
+from femsense.pointcloud import primitives
 from femsense.sensing import estimate_frame, fit, model, no_penetration, odds, places, proposals, touches
 from femsense.sensing.run_files import write_run
 
@@ -27,7 +27,7 @@ VISIBLE = ("pad-slide", "arm-two", "diamond-three", "pad-plate")
 HIDDEN = ("arm-hidden", "bar-release")
 GREY = ("slab-gray", "bar-gray")
 VALUES: dict[str, tuple[ModuleType, tuple[float, ...], tuple[str, ...]]] = {
-    "HERTZ": (touches, (0.0, 1.0, touches.HERTZ, 1.6), ("pad-normal",)),
+    "PATCH": (touches, (0.3, touches.PATCH, 0.9), ("pad-normal", "bar-normal")),
     "ALIKE": (touches, (0.0, touches.ALIKE, 0.3), ("pad-normal",)),
     "VISIBLE": (odds, (0.0, odds.VISIBLE, 2 * odds.VISIBLE), VISIBLE),
     "INFERRED": (odds, (0.5 * odds.INFERRED, odds.INFERRED, 2 * odds.INFERRED), HIDDEN + GREY),
@@ -46,7 +46,9 @@ VALUES: dict[str, tuple[ModuleType, tuple[float, ...], tuple[str, ...]]] = {
     "SAME": (proposals, (0.04, proposals.SAME, 0.16), VISIBLE),
     "STALE": (model, (0.005, model.STALE, 0.1), HIDDEN),
     "PIXELS": (model, (2000, model.PIXELS, 40000), ("diamond-normal",)),
-    "GRAZING": (pixels, (0.1, pixels.GRAZING, 0.5), ("bar-normal", "arm-slide")),
+    "STRAY": (model, (1e-3, model.STRAY, 0.1), ("diamond-far", "pad-slide")),
+    "END": (primitives, (0.0, primitives.END, 1.0), ("arm-rod", "slab-rod")),
+    "SIMPLER": (primitives, (1.0, primitives.SIMPLER, 4.0), ("arm-rod", "pad-slide")),
     "BLEEDING": (places, (1.0, places.BLEEDING, 6.0), VISIBLE),
 }
 """Constants, where they are defined, values to ask with, and the cases that each matters to."""
@@ -55,7 +57,9 @@ VALUES: dict[str, tuple[ModuleType, tuple[float, ...], tuple[str, ...]]] = {
 def set_everywhere(name: str, value: float) -> None:
     """Set a constant in each module of the package that has it."""
     for module in list(sys.modules.values()):
-        if module.__name__.startswith(("femsense.sensing.", "femsense.inference.")) and name in vars(module):
+        if module.__name__.startswith(("femsense.sensing.", "femsense.inference.", "femsense.pointcloud.")) and name in vars(
+            module
+        ):
             setattr(module, name, value)
 
 

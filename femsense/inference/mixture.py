@@ -2,7 +2,8 @@
 
     −2 log[ exp(−z²/2κ²) + o ],   z = r/σ,   o = ω √(2π) σ / size
 
-ω: odds that a pixel shows something else on its side of the surface, in front or behind, rather than the robot; size: length over which that may lie. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
+ω: odds that a pixel shows something else on its side of the surface, in front or behind, rather than the robot; size: length over which that may
+lie. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
 Source of the mixture: Verbeek, Vlassis & Kröse 2003 for EM; Aitkin & Wilson 1980 for outliers as a mixture component.
 """
 

@@ -95,8 +95,7 @@ def patch_at(
 ) -> ContactPatch:
     """Return the contact patch around the point of the surface that is closest to a place.
 
-    The pressure falls off as a cone of the given radius.
-    Its nodal shares are those of the virtual work that it does on the element's own shape
+    The pressure p ∝ √(1 − r²/a²) is Hertz's, a the given radius. Its nodal shares are those of the virtual work that it does on the element's own shape
     functions: quadratic elements carry nothing at the corners of an evenly pressed face, and shares by area would dent them.
 
     Arguments:
@@ -115,7 +114,7 @@ def patch_at(
     distance = np.linalg.norm(np.einsum("pa,fac->fpc", values, positions[faces]) - centre, axis=2)
     reach = max(radius, 1.01 * float(np.partition(distance, 2, axis=None)[2]))
     area = np.linalg.norm(triangle_normals(positions, faces[:, :3]), axis=1)
-    pressed = area[:, None] * np.maximum(1.0 - distance / reach, 0.0)
+    pressed = area[:, None] * np.sqrt(np.maximum(1.0 - (distance / reach) ** 2, 0.0))
     share = np.bincount(faces.ravel(), (pressed @ values).ravel(), minlength=len(positions))
     share[clamped] = 0.0
     if share.sum() <= 0.0:  # a place on the clamp: its nearest free node

@@ -29,8 +29,8 @@ TILT = 1.5e-4
 """Gaps along a contact that differ by less than this are alike: a rod along a face touches anywhere on its length [m]."""
 ZONE = 0.15
 """Largest extent of a contact about its nearest point, relative to the body's diagonal."""
-CONE = float(np.sqrt(10.0 / 3.0))
-"""Radius of a cone of pressure over its root mean square radius."""
+HERTZ = float(np.sqrt(5.0 / 2.0))
+"""Radius of Hertz's pressure over its root mean square radius."""
 AHEAD = 1e-4
 """Step by which the slope of a distance is taken [m]."""
 WINDOWED = 2.0
@@ -210,7 +210,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         source="cloud",
         std_m=float(np.hypot(std, radius)),
         radius=curvature,
-        spread=CONE * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
+        spread=HERTZ * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
     )
     return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])), shape=shape)
 

@@ -13,17 +13,14 @@ from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
 from femsense.sensing.types import Sensor, Touch
 
-PATCH = 0.525
+PATCH = 0.455
 """Radius over which a point force is spread, in edges of elements. A linear element's shape functions are an edge wide themselves: a patch as wide
 as the edge would press on the faces beside the one that is touched."""
-DENT = 0.04
+DENT = 0.035
 """Markers do not show over what area a force acts at a given place: it is spread over so much of the body's diagonal, so that a marker beside it
 does not feel a dent that is not there (the beam of the beam study: 1 mm at the marker on its upper edge)."""
 ALIKE = 0.05
 """Patches whose radii differ by less than this share are alike: any other value changes forces by 0.1 % (docs/appendix/forces-before-0.2.md)."""
-HERTZ = float(np.sqrt(4.0 / 3.0))
-"""Radius of a cone of pressure over that of Hertz's pressure with the same root mean square radius: √(10/3) of it over √(5/2) of it.
-docs/appendix/forces-before-0.2.md has what other values give."""
 
 
 def make_touch(
@@ -61,7 +58,7 @@ def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
     """Return a touch with the patch that its object makes under a force [N], shape (3,), where that is wider than what the mesh can tell from a point."""
     if touch.source != "cloud" or not np.isfinite(touch.object_radius_m):
         return touch
-    spread = HERTZ * contact_radius(sensor, touch.object_radius_m, float(np.linalg.norm(force)))
+    spread = contact_radius(sensor, touch.object_radius_m, float(np.linalg.norm(force)))
     least = _radius(sensor)
     if abs(max(spread, least) - max(touch.spread_m, least)) < ALIKE * least:
         return touch
