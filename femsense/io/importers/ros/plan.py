@@ -13,7 +13,7 @@ from femsense.core.errors import InputError
 from femsense.io.importers.frames import Options, unit_of
 from femsense.io.importers.images.pictures import FINE_UNIT
 from femsense.io.importers.ros.bag import Bag, Message
-from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
+from femsense.io.importers.ros.messages import header_of, markers_of, sdk_values, stamp_of
 from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
 from femsense.io.importers.several import camera_names
 from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
@@ -273,14 +273,13 @@ def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
     names = {t.name: t.type for t in bag.topics}
     pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
     found = {f"{name.split('/image/')[0]}/image/metadata": name for name in pictures}
-    firsts = [next(bag.messages([topic]), None) for topic in found if names.get(topic) == "std_msgs/msg/String"]
-    told = [first is not None and device_time(bag.decode(first)) is not None for first in firsts]
-    return found if told and len(told) == len(found) and all(told) else {}
+    texts = all(names.get(topic) == "std_msgs/msg/String" for topic in found)
+    return found if texts and all(device_time(bag.first([topic])) is not None for topic in found) else {}
 
 
 def device_time(decoded: Any) -> float | None:
     """Return the device's time [s] in the text of an image's metadata; None where it holds none."""
-    parts = dict(part.split("=", 1) for part in str(decoded.data).split(";") if "=" in part)
+    parts = sdk_values(decoded)
     return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
 
 

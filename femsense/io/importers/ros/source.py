@@ -32,7 +32,7 @@ from femsense.io.importers.ros.plan import (
     named_values,
     plan_of,
 )
-from femsense.io.importers.ros.topics import Stream, cameras_of, choose, robot_pose, streams_of
+from femsense.io.importers.ros.topics import Kind, Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.input_samples import NEAR_S, Samples, samples_of
 from femsense.pointcloud.cloud import PointCloud
@@ -77,7 +77,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
     found = {
         "clock": clock,
         "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in chosen_streams(choice)],
-        "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
+        "not_taken": [s.topic.name for s in streams if s.kind is not Kind.OTHER and s not in chosen_streams(choice)] or None,
         "marker_topics": [s.topic.name for s in choice.markers] or None,
         "depth_unit_m": plan.unit if choice.lens else None,
         "lens": None if choice.lens is None else lens_line(choice.lens),
@@ -104,7 +104,7 @@ def list_ros(path: Path) -> dict[str, Any]:
         rows = [
             {"topic": s.topic.name, "holds": s.kind, "type": s.topic.type, "messages": s.topic.count, "frame": s.frame or None}
             for s in streams_of(bag)
-            if s.kind != "other"
+            if s.kind is not Kind.OTHER
         ]
         return {"topics": rows, "other_topics": sum(t.count > 0 for t in bag.topics) - len(rows)}
 
@@ -198,7 +198,7 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
 def _take(
     bag: Bag, plan: Plan, message: Message, primary: str, tracks: dict[str, _Track], waiting: deque[tuple[float, Message, Any]]
 ) -> None:
-    lazy = plan.choice.lens is not None or plan.choice.primary.kind == "cloud"
+    lazy = plan.choice.lens is not None or plan.choice.primary.kind is Kind.CLOUD
     if message.topic in plan.metadata:
         tracks[plan.metadata[message.topic]].stamp(message.record, device_time(bag.decode(message)))
         return
@@ -231,9 +231,9 @@ def _frame(
     device = tracks[message.topic].stamps.get(message.record) if plan.metadata else None
     color = None if choice.color is None else tracks[choice.color.topic.name].nearest(time, device)
     picture: Callable[[], Images | PointCloud] | None = None
-    if choice.primary.kind == "depth":
+    if choice.primary.kind is Kind.DEPTH:
         picture = partial(_images, bag, plan, message, color, rays)
-    elif choice.primary.kind == "cloud":
+    elif choice.primary.kind is Kind.CLOUD:
         picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
     now = {topic: one.at(time)[0] for topic, one in samples.items()}
