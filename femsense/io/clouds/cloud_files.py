@@ -10,7 +10,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.pcd import pcd_viewpoint, read_pcd_fields
-from femsense.io.clouds.ply import ply_viewpoint, read_ply_vertices
+from femsense.io.clouds.ply import ply_viewpoint, read_ply_vertices, write_ply
 from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.pointcloud.cloud import PointCloud
 
@@ -56,7 +56,7 @@ def viewpoint_doubt(path: str | Path) -> str | None:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write a cloud as binary PLY or PCD (PCD keeps single precision, colours become bytes).
+    """Write a cloud as binary PLY or PCD; colours become bytes, PCD keeps single precision.
 
     Raises:
         InputError: another suffix, or a place that cannot be written.
@@ -65,6 +65,9 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
     _check_suffix(file, _WRITTEN)
     if not file.parent.is_dir():
         raise InputError("no such folder", where=file.parent, expected="a folder that exists")
+    if file.suffix.lower() == ".ply":
+        write_ply(file, cloud)
+        return
     import open3d as o3d
 
     data = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.copy()))

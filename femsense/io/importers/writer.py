@@ -15,10 +15,11 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError, InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
+from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
 from femsense.io.folder_lock import only_writer
 from femsense.io.importers.frames import Frame, Images, Lens, Source
-from femsense.io.importers.images.pictures import write_cloud_file, write_color, write_depth
+from femsense.io.importers.images.pictures import write_color, write_depth
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
 from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
 from femsense.io.importers.tables.actuation import ActuationLog
@@ -263,7 +264,9 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
 
 def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[str, list[float] | None]:
     if isinstance(picture, PointCloud):
-        write_cloud_file(part / "clouds" / f"{name}.ply", picture)
+        file = part / "clouds" / f"{name}.ply"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_cloud(file, picture)
         return "cloud", picture.points.mean(axis=0).tolist() if len(picture) else None
     write_depth(part / "depth" / f"{name}.png", picture.depth)
     if picture.color is not None:

@@ -10,7 +10,8 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres, write_cloud_file
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres
 from femsense.io.importers.ros.messages import DEPTH, cloud_of, lens_of, raw_image, red_first, stamp_of
 from femsense.live.frames import Image, ImageKind, RawFrame, png_of
 from femsense.model.camera import Camera
@@ -100,5 +101,5 @@ def _depth_image(message: Any, topic: str) -> Image:
 def _cloud_image(message: Any, topic: str) -> Image:
     with tempfile.TemporaryDirectory(prefix="femsense-cloud-") as folder:
         file = Path(folder, "cloud.ply")
-        write_cloud_file(file, cloud_of(message, topic))
+        write_cloud(file, cloud_of(message, topic))
         return Image(ImageKind.CLOUD, file.read_bytes(), ".ply")

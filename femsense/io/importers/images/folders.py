@@ -14,11 +14,10 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud, viewpoint_doubt
-from femsense.io.clouds.images import png_header, read_png
+from femsense.io.clouds.images import decoded_image, png_header, read_png
 from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Options, Source, unit_of
 from femsense.io.importers.images.array_clouds import read_array_cloud
 from femsense.io.importers.images.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
-from femsense.io.importers.images.pictures import decoded_image
 from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
 

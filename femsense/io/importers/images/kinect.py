@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.io.clouds.images import decoded_image
 from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Lens, Options, Source, need
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import pixel_rays, registered_color
-from femsense.io.importers.images.pictures import decoded_image
 
 DEPTH_MODES = {
     (320, 288): ((512, 512), (96, 90)),

@@ -14,8 +14,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.pose import make_pose
 from femsense.io.clouds.cloud_files import cloud_of_fields
+from femsense.io.clouds.images import decoded_image
 from femsense.io.importers.frames import Lens
-from femsense.io.importers.images.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
 
 Pixels = npt.NDArray[Any]
