@@ -29,10 +29,9 @@ from femsense.io.robot_tables import (
     MarkerTable,
     MeshTable,
     RobotTable,
-    at_key,
     plain_dictionary,
 )
-from femsense.io.tables import beside
+from femsense.io.tables import at_key, beside
 from femsense.model.body_doubts import doubts_of_body
 from femsense.model.plausibility import warn_of
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features

@@ -22,8 +22,8 @@ from femsense.io.correction_file import read_correction, write_correction
 from femsense.io.files import plain, write_beside, write_toml
 from femsense.io.mesh_files import mesh_companions, write_mesh
 from femsense.io.robot_body import build_robot, nodes_within
-from femsense.io.robot_tables import FORMAT, RobotTable, at_key, robot_problems, table_problems
-from femsense.io.tables import beside, read_toml, validated
+from femsense.io.robot_tables import FORMAT, RobotTable, robot_problems, table_problems
+from femsense.io.tables import at_key, beside, read_toml, validated
 from femsense.model.robot import MarkerLook, Robot, plain_actuation
 
 # Loading

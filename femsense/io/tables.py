@@ -9,16 +9,17 @@ import tomllib
 import types
 import typing
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
+from femsense.core.pose import check_pose
 from femsense.core.text import did_you_mean, key_path, plain_name, short
 from femsense.core.units import PER_METRE, length_unit
 
@@ -33,6 +34,10 @@ LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
 """A unit of lengths in files, in any spelling."""
 
 
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
+
+
 class Schema(BaseModel):
     """Base of the tables of a TOML file: unknown keys, wrong types and numbers that are not finite are refused."""
 
@@ -40,6 +45,38 @@ class Schema(BaseModel):
 
 
 T = TypeVar("T")
+
+
+def at_key(path: Path, *location: int | str) -> str:
+    """Return the place of a key in a file, for messages."""
+    return f"{path}: {key_path(location)}"
+
+
+def doubles(values: Sequence[object], what: str, path: Path, kind: str, key: str) -> Iterator[InputError]:
+    """Yield a problem for each value that a table before has too; None is no value.
+
+    Arguments:
+        values: of one key of each of the tables `kind` of the file at `path`.
+        what: the name of the value in messages.
+    """
+    for i, value in enumerate(values):
+        if value is not None and value in values[:i]:
+            yield InputError(
+                f"a {what} stands twice",
+                where=at_key(path, kind, i, key),
+                found=repr(value),
+                expected=f"each {what} once",
+                hint=f"{kind}[{values.index(value)}] has it too",
+            )
+
+
+def pose_problems(pose: Any, where: str) -> Iterator[InputError]:
+    """Yield the problem of a matrix that is no pose; none of None."""
+    try:
+        if pose is not None:
+            check_pose(pose, where)
+    except InputError as problem:
+        yield problem
 
 
 # TOML
@@ -165,7 +202,7 @@ def schema_problems(schema: type[Any], document: Any, path: Path) -> list[InputE
 def _problem(schema: type[Any], item: Any, path: Path) -> InputError:
     """Translate one finding of pydantic."""
     location = tuple(item["loc"])
-    where = f"{path}: {key_path(location)}" if location else str(path)
+    where = at_key(path, *location) if location else str(path)
     kind = item["type"]
     if kind == "extra_forbidden":
         known = list(_keys_at(schema, location[:-1]))
