@@ -232,7 +232,7 @@ def recording_document(recording: Recording) -> dict[str, Any]:
     document |= {key: value for key, value in optional.items() if value is not None}
     if recording.tools:
         document["tools"] = [_tool_document(tool) for tool in recording.tools]
-    tables = [_camera_document(camera) for camera in recording.cameras]
+    tables = [camera_document(camera) for camera in recording.cameras]
     poses = [None if pose is None else pose.tolist() for pose in recording.T_robot_camera]
     if recording.camera_names == ("",):
         if poses[0] is not None:
@@ -245,7 +245,8 @@ def recording_document(recording: Recording) -> dict[str, Any]:
     return document
 
 
-def _camera_document(camera: Camera | None) -> dict[str, Any]:
+def camera_document(camera: Camera | None) -> dict[str, Any]:
+    """Return the table of a camera; empty without one."""
     if camera is None:
         return {}
     table: dict[str, Any] = {key: getattr(camera, key) for key in LENS_KEYS}

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.units import length_unit
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
 SMALLEST, LARGEST = 2e-3, 100.0
@@ -22,40 +23,9 @@ FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
 UNITS = ("m", "cm", "mm", "in", "ft")
 """Units of length that `--unit` takes, in any spelling that `core.units` knows."""
-MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
+BROWN = "brown_conrady"
 DepthImage = npt.NDArray[np.uint16]
 ColorImage = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Lens:
-    """A camera's lens; the centre of the first pixel is (0, 0)."""
-
-    width: int
-    """[px]."""
-    height: int
-    """[px]."""
-    fx: float
-    """[px]."""
-    fy: float
-    """[px]."""
-    cx: float
-    """[px]."""
-    cy: float
-    """[px]."""
-    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
-    """OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; kannala_brandt: k1 … k4. Shape (n,)."""
-    model: str = "brown_conrady"
-    """One of MODELS."""
-
-    @property
-    def storable(self) -> bool:
-        """Whether a depth image of this lens is kept as an image.
-
-        What the RealSense SDK calls inverse is not what OpenCV's polynomial taken backwards gives (20 mm at 1 m with its usual
-        coefficients): such images become clouds, which nobody can misread.
-        """
-        return not np.any(self.distortion != 0.0) or self.model != "inverse_brown_conrady"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,7 +33,7 @@ class Images:
     """What a depth camera gives in one frame."""
 
     depth: DepthImage
-    """Units of the source's `depth_unit_m`, 0 where there is none, shape (H, W)."""
+    """Units of the camera's `depth_unit`, 0 where there is none, shape (H, W)."""
     color: ColorImage | None = None
     """Red, green, blue, registered to the depth image, shape (H, W, 3)."""
 
@@ -99,9 +69,8 @@ class Source:
     """Starts from the first frame at each call; a live source may go on for ever."""
     found: Mapping[str, Any] = field(default_factory=dict)
     """What was found beyond the frames, for the report."""
-    lens: Lens | None = None
+    camera: Camera | None = None
     """Where pictures are depth images."""
-    depth_unit_m: float = 0.001
     actuation: str | None = None
     """"tension" or "displacement"; None where the source does not say."""
     count: int | None = None
@@ -148,6 +117,31 @@ class Options:
     """From and to [s] after the first frame: nothing touches the robot meanwhile."""
     log_names: Sequence[str] = ()
     """Columns of a log of actuation beside it, for messages."""
+
+
+def camera_of_numbers(
+    width: int, height: int, focal: npt.ArrayLike, middle: npt.ArrayLike, distortion: npt.ArrayLike = (), model: str = BROWN
+) -> Camera:
+    """Return a camera whose depth images count millimetres, unless it is replaced.
+
+    Arguments:
+        width, height: of its images [px].
+        focal, middle: focal lengths and principal point along x and y [px].
+        distortion: OpenCV's order, any length; more than eight numbers are cut off.
+        model: the name of a model of `Camera`.
+    """
+    numbers = np.concatenate([np.asarray(distortion, dtype=np.float64).ravel(), np.zeros(8)])[:8]
+    (fx, fy), (cx, cy) = np.asarray([focal, middle], dtype=np.float64).tolist()
+    return Camera("", width, height, fx, fy, cx, cy, freeze(numbers if numbers[5:].any() else numbers[:5]), 1e-3, model)
+
+
+def is_kept_as_image(camera: Camera) -> bool:
+    """Whether a depth image of a camera is kept as an image.
+
+    What the RealSense SDK calls inverse is not the inverse of OpenCV's polynomial (20 mm apart at 1 m with its usual coefficients):
+    such images become clouds, which nobody can misread.
+    """
+    return not np.any(camera.distortion != 0.0) or camera.distortion_model != "inverse_brown_conrady"
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:

@@ -18,12 +18,13 @@ from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
 from femsense.io.folder_lock import only_writer
-from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.frames import Frame, Images, Source
 from femsense.io.importers.images.pictures import write_color, write_depth
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
 from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
 from femsense.io.importers.tables.actuation import ActuationLog
 from femsense.io.recording_folder import load_recording
+from femsense.model.camera import Camera
 from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud
 
@@ -271,16 +272,16 @@ def _write_picture(source: Source, picture: Images | PointCloud, part: Path, nam
     write_depth(part / "depth" / f"{name}.png", picture.depth)
     if picture.color is not None:
         write_color(part / "color" / f"{name}.png", picture.color)
-    return "depth", _center(picture, source.lens, source.depth_unit_m)
+    return "depth", _center(picture, source.camera)
 
 
-def _center(picture: Images, lens: Lens | None, unit: float) -> list[float] | None:
+def _center(picture: Images, camera: Camera | None) -> list[float] | None:
     """Return the mean of the points of a depth image [m], without its lens's distortion: it serves to see motion."""
-    z = picture.depth[::4, ::4].astype(np.float64) * unit
-    if lens is None or not z.any():
+    z = picture.depth[::4, ::4].astype(np.float64) * (1.0 if camera is None else camera.depth_unit)
+    if camera is None or not z.any():
         return None
     row, column = np.nonzero(z)
     values = z[row, column]
-    x = (4 * column - lens.cx) / lens.fx * values
-    y = (4 * row - lens.cy) / lens.fy * values
+    x = (4 * column - camera.cx) / camera.fx * values
+    y = (4 * row - camera.cy) / camera.fy * values
     return [float(x.mean()), float(y.mean()), float(values.mean())]

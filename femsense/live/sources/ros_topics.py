@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
-
-import numpy as np
 
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres
@@ -77,19 +76,7 @@ class TopicFrames:
     def _find_camera(self) -> None:
         info = self._infos.get(self.depth.rpartition("/")[0])
         if self.camera is None and info is not None:
-            lens = lens_of(info, self.depth)
-            self.camera = Camera(
-                "",
-                lens.width,
-                lens.height,
-                lens.fx,
-                lens.fy,
-                lens.cx,
-                lens.cy,
-                np.asarray(lens.distortion),
-                self._unit_m,
-                lens.model,
-            )
+            self.camera = replace(lens_of(info, self.depth), depth_unit=self._unit_m)
 
 
 def _depth_image(message: Any, topic: str) -> Image:

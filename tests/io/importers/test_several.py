@@ -16,23 +16,24 @@ from femsense.app import cli
 from femsense.app.import_command import import_into
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Frame, Images, Lens, Options, Source
+from femsense.io.importers.frames import Frame, Images, Options, Source, camera_of_numbers
 from femsense.io.importers.guess import open_sources
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
+from femsense.model.camera import Camera
 
-LENS = Lens(8, 6, 5.0, 5.0, 3.5, 2.5)
+LENS = camera_of_numbers(8, 6, (5.0, 5.0), (3.5, 2.5))
 TIMES = 10.0 + 0.1 * np.arange(6)
 
 
-def camera(times: np.ndarray, level: int, *, lens: Lens = LENS, **more: object) -> Source:
+def camera(times: np.ndarray, level: int, *, lens: Camera = LENS, **more: object) -> Source:
     def frames() -> Iterator[Frame]:
         for k, t in enumerate(times.tolist()):
             picture: Callable[[], Images] = lambda k=k: Images(np.full((6, 8), level + k, dtype=np.uint16))  # noqa: E731
             yield Frame(t, picture=picture, markers={"tip": (0.0, 0.1 * level, 1.0)}, **more)
 
-    return Source("test", Path("x"), frames, lens=lens, actuation="tension")
+    return Source("test", Path("x"), frames, camera=lens, actuation="tension")
 
 
 def levels(folder: Path, name: str) -> dict[int, int]:

@@ -12,11 +12,11 @@ import pytest
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.files import folder_hash
-from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.frames import Frame, Images, Source, camera_of_numbers
 from femsense.io.importers.writer import RECORD, write_recording
 from femsense.io.recording_folder import load_recording
 
-LENS = Lens(8, 6, 5.0, 5.0, 3.5, 2.5)
+LENS = camera_of_numbers(8, 6, (5.0, 5.0), (3.5, 2.5))
 
 
 def image(number: int) -> np.ndarray:
@@ -36,7 +36,7 @@ def frames(count: int, *, stop: int | None = None) -> Iterator[Frame]:
 
 
 def source(count: int, *, stop: int | None = None) -> Source:
-    return Source("test", Path("camera"), lambda: frames(count, stop=stop), lens=LENS, actuation="tension")
+    return Source("test", Path("camera"), lambda: frames(count, stop=stop), camera=LENS, actuation="tension")
 
 
 def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_picture_that_is_broken_costs_itself_only(tmp_path: Path) -> None:
         Frame(0.1, picture=broken),
         Frame(0.2, picture=lambda: Images(image(2))),
     ]
-    made = Source("test", Path("x"), lambda: iter(items), lens=LENS)
+    made = Source("test", Path("x"), lambda: iter(items), camera=LENS)
     with pytest.warns(UserWarning, match="a frame keeps no picture"):
         found = write_recording(made, tmp_path / "out", identity={})
     recording = load_recording(tmp_path / "out")
@@ -108,14 +108,14 @@ def test_swapped_labels_are_named(tmp_path: Path) -> None:
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     def peak(count: int) -> int:
-        big = Lens(320, 240, 300.0, 300.0, 159.5, 119.5)
+        big = camera_of_numbers(320, 240, (300.0, 300.0), (159.5, 119.5))
 
         def items() -> Iterator[Frame]:
             for k in range(count):
                 yield Frame(0.1 * k, picture=lambda: Images(np.full((240, 320), 700, dtype=np.uint16)))
 
         tracemalloc.start()
-        write_recording(Source("test", Path("x"), items, lens=big), tmp_path / f"out{count}", identity={})
+        write_recording(Source("test", Path("x"), items, camera=big), tmp_path / f"out{count}", identity={})
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return most

@@ -6,6 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,10 @@ import numpy as np
 from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud, viewpoint_doubt
 from femsense.io.clouds.images import decoded_image, png_header, read_png
-from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Options, Source, unit_of
+from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Options, Source, camera_of_numbers, unit_of
 from femsense.io.importers.images.array_clouds import read_array_cloud
 from femsense.io.importers.images.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
+from femsense.model.camera import Camera
 from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
 
@@ -27,7 +29,7 @@ TUM_UNIT = 1 / 5000
 REDWOOD_UNIT = 1 / 1000
 WIDEST = 20.0
 """Scenes of cameras are not wider [m]."""
-DEFAULT_LENS = Lens(640, 480, 525.0, 525.0, 319.5, 239.5)
+DEFAULT_LENS = camera_of_numbers(640, 480, (525.0, 525.0), (319.5, 239.5))
 """The lens that the TUM benchmark gives for all its sequences, and Redwood for its own."""
 PAIRS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Lists of pairs as `associate.py` of TUM RGB-D prints them: time file time file, depth first or second."""
@@ -60,7 +62,9 @@ def open_tum(folder: Path, options: Options) -> Source:
     lost = sum(c is None for _, _, c in pairs) if color else 0
     found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": lens_line(lens)}
     frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs], lens)
-    return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=unit, count=len(pairs), notes=notes)
+    return Source(
+        "tum", folder, frames, found=_given(found), camera=replace(lens, depth_unit=unit), count=len(pairs), notes=notes
+    )
 
 
 def open_redwood(folder: Path, options: Options) -> Source:
@@ -92,8 +96,7 @@ def open_redwood(folder: Path, options: Options) -> Source:
         folder,
         partial(_image_frames, items, lens),
         found=_given(found),
-        lens=lens,
-        depth_unit_m=unit,
+        camera=replace(lens, depth_unit=unit),
         count=len(items),
         notes=notes,
     )
@@ -125,12 +128,12 @@ def read_points(file: Path) -> PointCloud:
 # Images
 
 
-def _image_frames(items: Sequence[tuple[float, Path, Path | None]], lens: Lens) -> Iterator[Frame]:
+def _image_frames(items: Sequence[tuple[float, Path, Path | None]], lens: Camera) -> Iterator[Frame]:
     for time, depth, color in items:
         yield Frame(time, picture=partial(_images, depth, color, lens))
 
 
-def _images(depth: Path, color: Path | None, lens: Lens) -> Images:
+def _images(depth: Path, color: Path | None, lens: Camera) -> Images:
     image = _depth_image(depth)
     if image.shape != (lens.height, lens.width):
         raise InputError(
@@ -206,7 +209,7 @@ def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) 
     return result
 
 
-def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, list[str]]:
+def _folder_lens(folder: Path, width: int, height: int) -> tuple[Camera, list[str]]:
     """Return the lens of a folder's images, and where it is from. Raises InputError."""
     file = next((folder / name for name in FILES if (folder / name).is_file()), None)
     if file is not None:

@@ -20,9 +20,10 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import decoded_image
-from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Lens, Options, Source, need
+from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Options, Source, camera_of_numbers, need
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import pixel_rays, registered_color
+from femsense.model.camera import Camera
 
 DEPTH_MODES = {
     (320, 288): ((512, 512), (96, 90)),
@@ -45,8 +46,8 @@ class Tracks:
     little_endian: bool
     """Of the depth images; only files of early SDKs are."""
     color: int | None
-    lens: Lens
-    color_lens: Lens | None
+    lens: Camera
+    color_lens: Camera | None
     T_color_depth: FloatArray
     """Shape (4, 4), translation [m]."""
     near_s: float
@@ -72,12 +73,12 @@ def open_kinect(path: Path, options: Options) -> Source:
         path,
         partial(_frames, path, tracks),
         found={key: value for key, value in found.items() if value is not None},
-        lens=lens,
+        camera=lens,
         count=tracks.count,
     )
 
 
-def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Lens:
+def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Camera:
     """Return the lens of one camera of calibration.json for images of a size [px].
 
     The file has it for the whole sensor, as shares of its width and height from the corner of the first pixel.
@@ -105,7 +106,7 @@ def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Lens:
     fx, fy = focal * whole
     cx, cy = middle * whole - corner - 0.5
     k1, k2, k3, k4, k5, k6, _, _, p2, p1 = given[4:14]
-    return Lens(width, height, float(fx), float(fy), float(cx), float(cy), np.array([k1, k2, p1, p2, k3, k4, k5, k6]))
+    return camera_of_numbers(width, height, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
 # What stands in the file
@@ -243,7 +244,7 @@ def _images(path: Path, tracks: Tracks, rays: FloatArray, data: bytes, color: tu
     return Images(depth, registered_color(depth, rays, 0.001, pixels, tracks.color_lens, tracks.T_color_depth))
 
 
-def _color(data: bytes, kind: str, lens: Lens, path: Path) -> ColorImage:
+def _color(data: bytes, kind: str, lens: Camera, path: Path) -> ColorImage:
     """Return a colour image with red first: JPEG, or one of the raw formats of the camera. Raises InputError."""
     import cv2
 

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
-from femsense.io.importers.frames import ColorImage, DepthImage, Lens
+from femsense.io.importers.frames import ColorImage, DepthImage, is_kept_as_image
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import straight_rays
 
 OUTSIDE = -9.0
@@ -15,13 +16,13 @@ STEPS = 50
 """Fixed-point steps of the inverse; at the distortions of depth cameras ten reach single precision."""
 
 
-def pixel_rays(lens: Lens) -> FloatArray:
+def pixel_rays(lens: Camera) -> FloatArray:
     """Return the straight ray (x, y, 1) of every pixel as x, y, shape (H, W, 2)."""
     column, row = np.meshgrid(np.arange(lens.width, dtype=np.float64), np.arange(lens.height, dtype=np.float64))
     bent = np.stack([(column - lens.cx) / lens.fx, (row - lens.cy) / lens.fy], axis=-1)
-    if not lens.storable:
+    if not is_kept_as_image(lens):
         return _sdk_straight(bent, lens)
-    return straight_rays(bent.reshape(-1, 2), lens.distortion, lens.model).reshape(bent.shape)
+    return straight_rays(bent.reshape(-1, 2), lens.distortion, lens.distortion_model).reshape(bent.shape)
 
 
 def depth_points(depth: DepthImage, rays: FloatArray, depth_unit_m: float) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
@@ -36,7 +37,7 @@ def registered_color(
     rays: FloatArray,
     depth_unit_m: float,
     color: ColorImage,
-    color_lens: Lens,
+    color_lens: Camera,
     T_color_depth: npt.ArrayLike,
 ) -> ColorImage:
     """Return for each depth pixel the colour of the place that it sees, shape (H, W, 3); black where there is none.
@@ -65,7 +66,7 @@ def registered_color(
     return np.asarray(found, dtype=np.uint8)
 
 
-def _bent(x: FloatArray, y: FloatArray, lens: Lens) -> tuple[FloatArray, FloatArray]:
+def _bent(x: FloatArray, y: FloatArray, lens: Camera) -> tuple[FloatArray, FloatArray]:
     """Return distorted rays (x, y, 1) as x and y, of the shape of the arguments.
 
     Brown's polynomial, OpenCV's rational one with k4 … k6, or the variant of the RealSense SDK, whose tangential terms are taken at the
@@ -75,18 +76,18 @@ def _bent(x: FloatArray, y: FloatArray, lens: Lens) -> tuple[FloatArray, FloatAr
         return x, y
     k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([lens.distortion, np.zeros(8)])[:8]
     r2 = x * x + y * y
-    if lens.model == "kannala_brandt":
+    if lens.distortion_model == "kannala_brandt":
         r = np.sqrt(r2)
         t2 = np.arctan(r) ** 2
         scale = np.arctan(r) * (1 + t2 * (k1 + t2 * (k2 + t2 * (p1 + t2 * p2)))) / np.where(r > 0, r, 1.0)
         return np.where(r > 0, x * scale, x), np.where(r > 0, y * scale, y)
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     u, v = x * radial, y * radial
-    a, b = (x, y) if lens.storable else (u, v)
+    a, b = (x, y) if is_kept_as_image(lens) else (u, v)
     return u + 2 * p1 * a * b + p2 * (r2 + 2 * a * a), v + 2 * p2 * a * b + p1 * (r2 + 2 * b * b)
 
 
-def _sdk_straight(bent: FloatArray, lens: Lens) -> FloatArray:
+def _sdk_straight(bent: FloatArray, lens: Camera) -> FloatArray:
     """Return the rays (H, W, 2) that the RealSense SDK's variant distorts into these."""
     straight = bent
     for _ in range(STEPS):

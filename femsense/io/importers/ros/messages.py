@@ -15,7 +15,8 @@ from femsense.core.errors import InputError
 from femsense.core.pose import make_pose
 from femsense.io.clouds.cloud_files import cloud_of_fields
 from femsense.io.clouds.images import decoded_image
-from femsense.io.importers.frames import Lens
+from femsense.io.importers.frames import BROWN, camera_of_numbers
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
 Pixels = npt.NDArray[Any]
@@ -142,7 +143,7 @@ def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(swapped)
 
 
-def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Lens:
+def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Camera:
     """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for the images that its region and binning leave.
 
     Images as they come have the matrix K and the distortion D; rectified ones have the matrix P and no distortion.
@@ -161,13 +162,13 @@ def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) 
     if model is None and np.any(D != 0.0):
         raise InputError("an unknown distortion model", where=where, found=name, expected=", ".join(sorted(set(MODELS) - {""})))
     if not np.any(D != 0.0):
-        model, D = "brown_conrady", np.zeros(5)
-    fx, fy, cx, cy = (float(K[i]) for i in (0, 4, 2, 5))
-    width, height, roi = int(message.width), int(message.height), message.roi
+        model, D = BROWN, np.zeros(5)
+    size, middle, roi = (int(message.width), int(message.height)), np.array([K[2], K[5]]), message.roi
     if roi.width and roi.height:
-        width, height, cx, cy = int(roi.width), int(roi.height), cx - roi.x_offset, cy - roi.y_offset
-    across, down = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
-    return Lens(width // across, height // down, fx / across, fy / down, cx / across, cy / down, D, model or "brown_conrady")
+        size, middle = (int(roi.width), int(roi.height)), middle - [roi.x_offset, roi.y_offset]
+    binning = np.maximum([message.binning_x, message.binning_y], 1)
+    width, height = np.floor_divide(size, binning).tolist()
+    return camera_of_numbers(width, height, np.array([K[0], K[4]]) / binning, middle / binning, D, model or BROWN)
 
 
 def cloud_of(message: Any, where: str | Path | None) -> PointCloud:

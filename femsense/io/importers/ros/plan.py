@@ -11,7 +11,6 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Options, unit_of
-from femsense.io.importers.images.pictures import FINE_UNIT
 from femsense.io.importers.ros.bag import Bag, Message
 from femsense.io.importers.ros.messages import header_of, markers_of, sdk_values, stamp_of
 from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
@@ -43,7 +42,6 @@ class Plan:
 
     choice: Choice
     clock: str
-    unit: float
     actuation: str | None
     columns: dict[str, dict[str, Taken]]
     """Topic → name of a value → what it becomes."""
@@ -85,12 +83,10 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     used = [s for s in choice.markers if s.topic.name in poses]
     choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
     renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
-    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else options.depth_unit or choice.depth_unit_m
     scale = None if options.unit is None else unit_of(options, None, bag.path, 0.0)
     return Plan(
         choice,
         clock,
-        unit,
         actuation,
         columns,
         points,

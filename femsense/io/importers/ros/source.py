@@ -15,7 +15,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
+from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, is_kept_as_image, upright
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.images.pictures import depth_of_metres
@@ -79,7 +79,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in chosen_streams(choice)],
         "not_taken": [s.topic.name for s in streams if s.kind is not Kind.OTHER and s not in chosen_streams(choice)] or None,
         "marker_topics": [s.topic.name for s in choice.markers] or None,
-        "depth_unit_m": plan.unit if choice.lens else None,
+        "depth_unit_m": choice.lens and choice.lens.depth_unit,
         "lens": None if choice.lens is None else lens_line(choice.lens),
         "camera_frame": choice.primary.frame or None,
     }
@@ -88,8 +88,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         bag.path,
         partial(_frames, bag.path, plan),
         found={key: value for key, value in found.items() if value is not None},
-        lens=choice.lens,
-        depth_unit_m=plan.unit,
+        camera=choice.lens,
         actuation=plan.actuation,
         count=choice.primary.topic.count,
         notes=plan.notes,
@@ -263,10 +262,10 @@ def _images(bag: Bag, plan: Plan, message: Message, color: Message | None, rays:
         seen = red_first(seen, kind)
         T = choice.T_color_depth
         same = np.array_equal(T, np.eye(4)) and seen.shape[:2] == depth.shape
-        pixels = seen if same else registered_color(depth, rays, plan.unit, seen, choice.color_lens, T)
-    if lens.storable:
+        pixels = seen if same else registered_color(depth, rays, lens.depth_unit, seen, choice.color_lens, T)
+    if is_kept_as_image(lens):
         return Images(depth, pixels)
-    points, mask = depth_points(depth, rays, plan.unit)
+    points, mask = depth_points(depth, rays, lens.depth_unit)
     return PointCloud(points, None if pixels is None else pixels[mask] / 255.0)
 
 

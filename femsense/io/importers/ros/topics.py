@@ -14,10 +14,12 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.pose import make_pose
 from femsense.core.text import did_you_mean
-from femsense.io.importers.frames import Lens, Options
+from femsense.io.importers.frames import Options
 from femsense.io.importers.images.intrinsics import check_lens
+from femsense.io.importers.images.pictures import FINE_UNIT
 from femsense.io.importers.ros.bag import Bag, Topic
 from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, sdk_values, stamp_of
+from femsense.model.camera import Camera
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "PointCloud2"
@@ -60,15 +62,15 @@ class Choice:
 
     primary: Stream
     """Its messages are the frames."""
-    color: Stream | None
     markers: tuple[Stream, ...]
     inputs: tuple[Stream, ...]
     loads: tuple[Stream, ...]
-    lens: Lens | None
-    color_lens: Lens | None
-    T_color_depth: FloatArray | None
+    color: Stream | None = None
+    lens: Camera | None = None
+    """Of the depth images, with their unit."""
+    color_lens: Camera | None = None
+    T_color_depth: FloatArray | None = None
     """Shape (4, 4), translation [m]; None where it is not known."""
-    depth_unit_m: float
     notes: tuple[str, ...] = ()
 
 
@@ -102,9 +104,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             expected="depth images, PointCloud2, markers or inputs",
             hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
         )
-    choice = Choice(
-        primary, None, tuple(of[Kind.MARKERS]), tuple(of[Kind.INPUTS]), tuple(of[Kind.LOADS]), None, None, None, 0.001
-    )
+    choice = Choice(primary, tuple(of[Kind.MARKERS]), tuple(of[Kind.INPUTS]), tuple(of[Kind.LOADS]))
     if depth is None:
         return choice
     lens = _lens(bag, depth)
@@ -115,7 +115,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             found="no CameraInfo",
             expected="its CameraInfo topic",
         )
-    choice = replace(choice, lens=lens, depth_unit_m=_depth_unit(bag, depth))
+    choice = replace(choice, lens=replace(lens, depth_unit=_depth_unit(bag, depth, options)))
     others = [s.topic.name for s in of[Kind.CLOUD]]
     notes = (f"clouds that are there too, and not taken: {', '.join(others)}",) if others else ()
     return _with_color(bag, replace(choice, notes=notes), of[Kind.COLOR])
@@ -263,7 +263,7 @@ def _nearest(name: str, topics: Sequence[Topic]) -> Topic | None:
     return best if best is not None and (_shared(name, best.name) >= 2 or len(topics) == 1) else None
 
 
-def _lens(bag: Bag, stream: Stream) -> Lens | None:
+def _lens(bag: Bag, stream: Stream) -> Camera | None:
     infos = [t for t in bag.topics if t.type.endswith("/CameraInfo") and t.count]
     topic = _nearest(stream.topic.name, infos)
     info = None if topic is None else bag.first([topic.name])
@@ -275,7 +275,7 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
     lens = lens_of(info, f"{bag.path}, topic {topic.name}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
     check_lens(lens, f"{bag.path}, topic {topic.name}")
     model = _sdk_model(bag, stream.topic.name)
-    return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
+    return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, distortion_model=model)
 
 
 def _sdk_model(bag: Bag, name: str) -> str | None:
@@ -284,10 +284,14 @@ def _sdk_model(bag: Bag, name: str) -> str | None:
     return MODELS.get(parts["model"].strip().lower()) if "model" in parts else None
 
 
-def _depth_unit(bag: Bag, stream: Stream) -> float:
-    """Return metres in one unit: the option of the sensor in a RealSense recording; else the millimetre that ROS prescribes."""
-    sensor, options = "/".join(stream.topic.name.split("/")[:3]), ("option/Depth_Units/value", "option/Depth Units/value")
-    option = bag.first([t.name for t in bag.topics if t.name.startswith(sensor) and t.name.endswith(options)])
+def _depth_unit(bag: Bag, stream: Stream, options: Options) -> float:
+    """Return metres in one unit: FINE_UNIT for floating point, as a person says, the option of a RealSense sensor, or the millimetre of REP 118."""
+    if stream.encoding.startswith("32FC1"):
+        return FINE_UNIT
+    if options.depth_unit is not None:
+        return options.depth_unit
+    sensor, ends = "/".join(stream.topic.name.split("/")[:3]), ("option/Depth_Units/value", "option/Depth Units/value")
+    option = bag.first([t.name for t in bag.topics if t.name.startswith(sensor) and t.name.endswith(ends)])
     return 0.001 if option is None else float(option.data)
 
 
