@@ -18,7 +18,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.frames import HEAD, Format, Options, Source
 from femsense.io.importers.motion_capture import Row, capture_source, tracks_of
 
 BLOCK = 512
@@ -87,7 +87,6 @@ def open_c3d(path: Path, options: Options) -> Source:
     notes += [f"results of a model, which are no places, are left out: {', '.join(left_out)}"] if left_out else []
     tracks = tracks_of(header.labels)
     return capture_source(
-        "c3d",
         path,
         [tracks[k] for k in kept],
         partial(_rows, path, header, whole, kept),
@@ -327,3 +326,10 @@ def _text(value: Any) -> str | None:
 
 def _up(parameters: Parameters) -> str | None:
     return _text(parameters.get(("POINT", "Y_SCREEN")))
+
+
+def _is_c3d(path: Path, head: bytes) -> bool:
+    return path.is_file() and (path.suffix.lower() == ".c3d" or (len(head) == HEAD and head[0] == 2 and head[1] == 0x50))
+
+
+C3D = Format("c3d", open_c3d, _is_c3d, ("--clock", "--rate"), list_c3d, (".c3d",))

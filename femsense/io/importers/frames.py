@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ SMALLEST, LARGEST = 2e-3, 100.0
 """Scenes of motion capture are between these sizes [m]: ten times less than a finger's markers span, ten times a large hall."""
 FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
+HEAD = 512
+"""Bytes at the beginning of a file by which formats are recognised."""
 UNITS = ("m", "cm", "mm", "in", "ft")
 """Units of length that `--unit` takes, in any spelling that `core.units` knows."""
 BROWN = "brown_conrady"
@@ -62,17 +64,17 @@ class Frame:
 class Source:
     """What was found in a file or a folder."""
 
-    format: str
-    """A name of `formats.FORMATS`."""
     path: Path
     frames: Callable[[], Iterator[Frame]]
     """Starts from the first frame at each call; a live source may go on for ever."""
     found: Mapping[str, Any] = field(default_factory=dict)
-    """What was found beyond the frames, for the report."""
+    """What was found beyond the frames, for the report; None where it is not known."""
     camera: Camera | None = None
     """Where pictures are depth images."""
     actuation: str | None = None
     """"tension" or "displacement"; None where the source does not say."""
+    actuation_by_unit: bool = False
+    """Whether units of the file give the actuation, so that another one is an error."""
     count: int | None = None
     """Frames that are expected, where it is known."""
     notes: Sequence[str] = ()
@@ -85,6 +87,8 @@ class Source:
     """See `Options.free`."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Name that `--map` may take → what it may become; see `mapping.check_names`."""
+    format: str = ""
+    """A name of `formats.FORMATS`, given by `Format.opened`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -117,6 +121,36 @@ class Options:
     """From and to [s] after the first frame: nothing touches the robot meanwhile."""
     log_names: Sequence[str] = ()
     """Columns of a log of actuation beside it, for messages."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Format:
+    """One format: each importer's module declares its own, and `formats` lists them."""
+
+    name: str
+    """As `--format` takes it."""
+    open: Callable[[Path, Options], Source]
+    recognises: Callable[[Path, bytes], bool]
+    """Called with a path and the first HEAD bytes of a file, none of a folder."""
+    unused: tuple[str, ...]
+    """Options that have no effect on it."""
+    list: Callable[[Path], dict[str, Any]] | None = None
+    """Returns the contents without reading frames; None: those of `open`."""
+    endings: tuple[str, ...] = ()
+    """Of files that nothing else has."""
+    topics: Callable[[Path], Iterable[str]] | None = None
+    """Names that `--topic` takes, where several captures share the option."""
+    columns: Callable[[Path], Iterable[str]] | None = None
+    """Names that `--map` takes, where a log of actuation or another capture shares the option."""
+    whole_depths: bool = False
+    """Whether its depth images count a unit that may be another: `--depth-unit`."""
+    transforms: bool = False
+    """Whether it holds frames of coordinates: `--base`."""
+
+    def opened(self, path: Path, options: Options) -> Source:
+        """Return a source of this format. Raises InputError."""
+        source = self.open(path, options)
+        return source if source.format else replace(source, format=self.name)
 
 
 def camera_of_numbers(

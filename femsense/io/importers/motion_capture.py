@@ -58,7 +58,6 @@ def tracks_of(labels: Sequence[str]) -> list[Track]:
 
 
 def capture_source(
-    form: str,
     path: Path,
     tracks: Sequence[Track],
     rows: Callable[[], Iterator[Row]],
@@ -70,11 +69,12 @@ def capture_source(
     names: Mapping[str, str] | None = None,
     count: int | None = None,
     actuation: str | None = None,
+    actuation_by_unit: bool = False,
 ) -> Source:
     """Return a capture of markers as a source.
 
     Arguments:
-        form, path, count, actuation: as of `Source`.
+        path, count, actuation, actuation_by_unit: as of `Source`.
         tracks: the markers that can be taken; two of the same name get numbers.
         rows: starts from the first row at each call.
         options: tracks to take, their names, unit and vertical axis.
@@ -104,11 +104,17 @@ def capture_source(
             yield Frame(row.time, markers=named, unlabelled=[place for name, place in seen if not name], inputs=row.inputs)
 
     what = {"unit": options.unit or unit, "up": options.up or "as in the file", **found}
-    what = {key: value for key, value in what.items() if value is not None}
     known = dict.fromkeys([*(t.name for t in tracks if t.name), *(t.label for t in tracks if t.name)], MARKER)
     remarks = [*_notes_of_nameless(renamed), *notes]
     return Source(
-        form, path, frames, found=what, count=count, notes=remarks, names=known if names is None else names, actuation=actuation
+        path,
+        frames,
+        found=what,
+        actuation=actuation,
+        actuation_by_unit=actuation_by_unit,
+        count=count,
+        notes=remarks,
+        names=known if names is None else names,
     )
 
 

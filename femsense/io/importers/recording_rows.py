@@ -125,7 +125,7 @@ def _known_inputs(
 def actuation_of(source: Source, columns: list[str], said: str | None) -> str:
     kind = said or source.actuation
     cables = [name for name in columns if name.startswith("cable_")]
-    if cables and source.format == "csv" and source.actuation not in (None, kind):
+    if cables and source.actuation_by_unit and source.actuation not in (None, kind):
         raise another_kind(source.path, str(said), str(source.actuation))
     if kind is None and cables:
         raise InputError(

@@ -55,13 +55,13 @@ def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Sourc
     notes += [f"{name}: {count} frames without one of {main} near in time are left out" for name, count in alone.items() if count]
     kinds = dict.fromkeys(source.actuation for source in sources.values() if source.actuation)
     return Source(
-        "several",
         path,
         partial(_frames, dict(sources), match, main),
         actuation=next(iter(kinds), None),
         count=len(match.times),
         notes=notes,
         views=dict(sources),
+        format="several",
         names={name: kind for source in sources.values() for name, kind in source.names.items()},
     )
 

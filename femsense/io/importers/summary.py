@@ -70,7 +70,11 @@ def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:
             markers[name] += bool(seen.markers or seen.unlabelled)
     return [
         {"camera": name, "format": one.format, "pictures": pictures[name], "frames_with_markers": markers[name]}
-        | {key: one.found[key] for key in ("clock", "lens", "depth_unit_m", "camera_frame", "unit") if key in one.found}
+        | {
+            key: one.found[key]
+            for key in ("clock", "lens", "depth_unit_m", "camera_frame", "unit")
+            if one.found.get(key) is not None
+        }
         for name, one in source.views.items()
     ]
 

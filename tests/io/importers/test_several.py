@@ -33,7 +33,7 @@ def camera(times: np.ndarray, level: int, *, lens: Camera = LENS, **more: object
             picture: Callable[[], Images] = lambda k=k: Images(np.full((6, 8), level + k, dtype=np.uint16))  # noqa: E731
             yield Frame(t, picture=picture, markers={"tip": (0.0, 0.1 * level, 1.0)}, **more)
 
-    return Source("test", Path("x"), frames, camera=lens, actuation="tension")
+    return Source(Path("x"), frames, camera=lens, actuation="tension")
 
 
 def levels(folder: Path, name: str) -> dict[int, int]:
@@ -58,9 +58,7 @@ def test_each_frame_takes_the_nearest_of_the_other_cameras(tmp_path: Path) -> No
 
 
 def test_frames_follow_the_camera_with_pictures_and_others_may_be_faster(tmp_path: Path) -> None:
-    capture = Source(
-        "test", Path("x"), lambda: (Frame(t, markers={"tip": (t, 0.0, 0.0)}) for t in np.arange(9.0, 11.0, 0.01).tolist())
-    )
+    capture = Source(Path("x"), lambda: (Frame(t, markers={"tip": (t, 0.0, 0.0)}) for t in np.arange(9.0, 11.0, 0.01).tolist()))
     source = joined({"mocap": capture, "cam": camera(TIMES, 100)}, tmp_path, Options())
     write_recording(source, tmp_path / "r", identity={})
     recording = load_recording(tmp_path / "r")

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import decoded_image
-from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Options, Source, camera_of_numbers, need
+from femsense.io.importers.frames import ColorImage, DepthImage, Format, Frame, Images, Options, Source, camera_of_numbers, need
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import pixel_rays, registered_color
 from femsense.model.camera import Camera
@@ -69,10 +69,9 @@ def open_kinect(path: Path, options: Options) -> Source:
         "serial_number": tracks.serial,
     }
     return Source(
-        "kinect",
         path,
         partial(_frames, path, tracks),
-        found={key: value for key, value in found.items() if value is not None},
+        found=found,
         camera=lens,
         count=tracks.count,
     )
@@ -265,3 +264,12 @@ def _color(data: bytes, kind: str, lens: Camera, path: Path) -> ColorImage:
     shape, code = raw[kind]
     image: npt.NDArray[np.uint8] = np.frombuffer(data, dtype=np.uint8).reshape(shape)
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+
+
+KINECT = Format(
+    "kinect",
+    open_kinect,
+    lambda path, head: head.startswith(b"\x1aE\xdf\xa3"),
+    ("--clock", "--rate", "--up", "--unit", "--topic"),
+    endings=(".mkv",),
+)

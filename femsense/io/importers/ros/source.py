@@ -15,11 +15,21 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, is_kept_as_image, upright
+from femsense.io.importers.frames import (
+    DepthImage,
+    Format,
+    Frame,
+    Images,
+    Options,
+    Source,
+    check_reach,
+    is_kept_as_image,
+    upright,
+)
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.images.pictures import depth_of_metres
-from femsense.io.importers.ros.bag import Bag, Message, open_bag
+from femsense.io.importers.ros.bag import BEGINNINGS, ENDINGS, Bag, Message, open_bag
 from femsense.io.importers.ros.messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
 from femsense.io.importers.ros.plan import (
     LAG_S,
@@ -36,6 +46,9 @@ from femsense.io.importers.ros.topics import Kind, Stream, cameras_of, choose, r
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.input_samples import NEAR_S, Samples, samples_of
 from femsense.pointcloud.cloud import PointCloud
+
+SDK = "realsense"
+"""Format of a bag that the RealSense SDK wrote."""
 
 
 def open_ros(path: Path, options: Options) -> Source:
@@ -64,7 +77,7 @@ def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], option
     for name, topic in zip(camera_names(list(cameras)), cameras):
         left = [s for s in streams if s.topic.name not in taken]
         sources[name] = _source(bag, left, replace(options, topics=(topic, *(t for t in others if t not in taken))))
-        taken |= set(sources[name].found.get("marker_topics", ()))
+        taken |= set(sources[name].found["marker_topics"] or ())
     return sources
 
 
@@ -84,16 +97,16 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
         "camera_frame": choice.primary.frame or None,
     }
     return Source(
-        "realsense" if is_sdk(choice.primary.topic.name) else "ros",
         bag.path,
         partial(_frames, bag.path, plan),
-        found={key: value for key, value in found.items() if value is not None},
+        found=found,
         camera=choice.lens,
         actuation=plan.actuation,
         count=choice.primary.topic.count,
         notes=plan.notes,
         T_robot_camera=robot_pose(bag, choice.primary, options.base),
         names=plan.names,
+        format=SDK if is_sdk(choice.primary.topic.name) else "",
     )
 
 
@@ -318,3 +331,13 @@ def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:
     given = named_values(decoded, message.type)
     scaled = ((one.target, given.get((name, one.field), np.nan)) for name, one in columns.items())
     return np.array([target.factor * value + target.offset for target, value in scaled])
+
+
+def _is_bag(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or any(item.suffix in (".db3", ".mcap") for item in path.iterdir())
+    return path.suffix.lower() in ENDINGS or head.startswith(tuple(begin for begin, _ in BEGINNINGS))
+
+
+ROS = Format("ros", open_ros, _is_bag, ("--rate",), list_ros, ENDINGS, topics_of, whole_depths=True, transforms=True)
+REALSENSE = replace(ROS, name=SDK, recognises=lambda path, head: False, unused=("--rate", "--up", "--unit"), endings=())

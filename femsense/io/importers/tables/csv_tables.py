@@ -20,6 +20,7 @@ from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit, unit_named
 from femsense.io.text_numbers import TIMES_READ, Notation, notation_of, number_in
 
+ENDINGS = (".csv", ".txt", ".tsv", ".trc")
 TIMES = (
     "time",
     "t",
@@ -50,6 +51,11 @@ EMPTY = ("", "na", "n/a", "null", "none")
 MARKS = "\t;,"
 LOOKED_AT = 20
 """So many first lines tell what stands between the cells."""
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file has the ending of a table of text, gzipped or not."""
+    return path.is_file() and path.name.lower().removesuffix(".gz").endswith(ENDINGS)
 
 
 @contextmanager

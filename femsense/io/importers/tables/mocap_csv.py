@@ -16,9 +16,9 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.frames import Format, Options, Source
 from femsense.io.importers.motion_capture import Row, Track, capture_source, tracks_of
-from femsense.io.importers.tables.csv_tables import is_cut_off, rows_of
+from femsense.io.importers.tables.csv_tables import is_cut_off, is_text, rows_of
 
 HEAD = 20
 """The headers are in the first lines."""
@@ -95,7 +95,6 @@ def open_mocap_csv(path: Path, options: Options) -> Source:
     if export.time is None and rate is None:
         raise InputError("no times", where=path, found="frame numbers without a rate", expected="--rate HZ")
     return capture_source(
-        export.program.value,
         path,
         [track for track, _ in export.markers],
         partial(_rows, path, export, rate or 1.0),
@@ -272,3 +271,20 @@ def _cell(row: list[str], j: int) -> float:
         return float(row[j])
     except (ValueError, IndexError):
         return np.nan
+
+
+def _is_export(program: Program, path: Path, head: bytes) -> bool:
+    return (is_text(path) or head.startswith(b"Format Version,")) and program_of(path) is program
+
+
+EXPORTS = tuple(
+    Format(
+        program.value,
+        open_mocap_csv,
+        partial(_is_export, program),
+        unused=("--clock",),
+        list=list_mocap_csv,
+        endings=(".trc",) if program is Program.TRC else (),
+    )
+    for program in Program
+)

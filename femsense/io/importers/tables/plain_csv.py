@@ -14,10 +14,10 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit
-from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.frames import Format, Options, Source
 from femsense.io.importers.motion_capture import Row, Track, capture_source
 from femsense.io.importers.tables.clock import seconds_of
-from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_time, layout_of, number_rows, time_column
+from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_text, is_time, layout_of, number_rows, time_column
 from femsense.io.importers.tables.input_samples import Samples, samples_of
 from femsense.io.importers.tables.mapping import (
     Column,
@@ -93,7 +93,6 @@ def open_plain_csv(path: Path, options: Options) -> Source:
             yield Row(time, np.array([row[j] for j in places]).reshape(-1, 3), drive)
 
     return capture_source(
-        "csv",
         path,
         [Track("" if raw else name, name) for name, _ in triples],
         rows,
@@ -103,6 +102,7 @@ def open_plain_csv(path: Path, options: Options) -> Source:
         notes=notes + notation_notes(path) + unit_notes(inputs, names, options.columns),
         names=mappable(names),
         actuation=actuation,
+        actuation_by_unit=True,
     )
 
 
@@ -285,3 +285,14 @@ def _raw_triples(path: Path, names: Sequence[str]) -> list[tuple[str, tuple[int,
             expected="counter, time [s], then x, y, z of each marker; or --map 3=marker.x (columns count from 1)",
         )
     return [(str(k), (2 + 3 * k, 3 + 3 * k, 4 + 3 * k)) for k in range((len(names) - 2) // 3)]
+
+
+CSV = Format(
+    "csv",
+    open_plain_csv,
+    lambda path, head: is_text(path),
+    ("--clock", "--topic"),
+    list_plain_csv,
+    (".gz",),
+    columns=lambda path: header_of(path)[0],
+)
