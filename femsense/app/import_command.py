@@ -14,11 +14,11 @@ from femsense.core.text import plain_name
 from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.formats import FORMATS, format_of
-from femsense.io.importers.frames import UNITS, Options
+from femsense.io.importers.frames import UNITS, Clock, Options
 from femsense.io.importers.guess import open_sources, split_name
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import header_of
-from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
+from femsense.io.importers.tables.mapping import Becomes, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]
@@ -171,7 +171,7 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 def _in_vain(name: str, options: Options) -> tuple[str, ...]:
     """Return what is said of options that have no effect on a format."""
     said = {
-        "--clock": options.clock != "auto",
+        "--clock": options.clock != Clock.AUTO,
         "--rate": options.rate is not None,
         "--up": options.up is not None,
         "--unit": options.unit is not None,
@@ -193,7 +193,7 @@ def _check_options(options: Options, inputs: str | None, zero: str | None) -> No
     for name, value, allowed in (
         ("--unit", options.unit, tuple(UNITS)),
         ("--up", options.up, ("x", "y", "z")),
-        ("--clock", options.clock, ("auto", "header", "record")),
+        ("--clock", options.clock, (Clock.AUTO, Clock.HEADER, Clock.RECORD)),
         ("--inputs", inputs, ("tension", "displacement")),
         ("--zero", zero, ("absolute", "unknown")),
     ):
@@ -217,7 +217,9 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
     known = [(file, format_of(file)) for file in files if file.is_file()]
     shared = {name for file, one in known if one is not None and one.columns for name in mappable(list(one.columns(file)))}
     columns = {
-        old: new for old, new in options.columns.items() if old not in of_log or (old in shared and kind_of_target(new) != INPUT)
+        old: new
+        for old, new in options.columns.items()
+        if old not in of_log or (old in shared and kind_of_target(new) is not Becomes.INPUT)
     }
     return replace(options, columns=columns, log_names=tuple(of_log))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.units import length_unit
+from femsense.io.importers.tables.mapping import Becomes
 from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
@@ -85,10 +87,22 @@ class Source:
     """Camera → its own source, where several look; see `several.joined`."""
     free: Sequence[tuple[float, float]] = ()
     """See `Options.free`."""
-    names: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, Sequence[Becomes]] = field(default_factory=dict)
     """Name that `--map` may take → what it may become; see `mapping.check_names`."""
     format: str = ""
     """A name of `formats.FORMATS`, given by `Format.opened`."""
+
+
+class Clock(StrEnum):
+    """Which time stamps of a bag are used."""
+
+    AUTO = "auto"
+    """Those of headers where these are a clock, else those of recording."""
+    HEADER = "header"
+    RECORD = "record"
+    """Of the moment at which a message was written."""
+    METADATA = "metadata"
+    """Of the device, as the RealSense SDK keeps them next to images."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,8 +121,8 @@ class Options:
     """Metres in one unit of whole-numbered depth images, where the source says another or none."""
     up: str | None = None
     """The source's vertical axis: "x", "y" or "z"; turned to z."""
-    clock: str = "auto"
-    """"header", "record" or "auto"."""
+    clock: str = Clock.AUTO
+    """A value of Clock but "metadata", which is found."""
     rate: float | None = None
     """Frames a second where a source has no times."""
     base: str | None = None

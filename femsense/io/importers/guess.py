@@ -14,7 +14,7 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.foreign import export_hint
 from femsense.io.importers.formats import FORMATS, contents_of, format_of
-from femsense.io.importers.frames import Format, Options, Source
+from femsense.io.importers.frames import Clock, Format, Options, Source
 from femsense.io.importers.images.folders import PAIRS, is_tum
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.mapping import check_names, check_taken, check_targets, resolved
@@ -131,9 +131,9 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
     try:
         source = joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
     except InputError:
-        if said.clock != "auto":
+        if said.clock != Clock.AUTO:
             raise
-        by_record = replace(said, clock="record")
+        by_record = replace(said, clock=Clock.RECORD)
         sources = {name: _one_of(file, by_record) for name, file in zip(names, files)}
         by_time: Source | None = None
         with contextlib.suppress(InputError):

@@ -13,7 +13,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Options, Source, check_size, unit_of, upright
-from femsense.io.importers.tables.mapping import MARKER
+from femsense.io.importers.tables.mapping import Becomes
 
 NAMELESS = "*"
 """Labels of tracks that nobody named begin so (Vicon Nexus)."""
@@ -66,7 +66,7 @@ def capture_source(
     unit: str | None,
     found: Mapping[str, Any],
     notes: Sequence[str],
-    names: Mapping[str, str] | None = None,
+    names: Mapping[str, Sequence[Becomes]] | None = None,
     count: int | None = None,
     actuation: str | None = None,
     actuation_by_unit: bool = False,
@@ -104,7 +104,7 @@ def capture_source(
             yield Frame(row.time, markers=named, unlabelled=[place for name, place in seen if not name], inputs=row.inputs)
 
     what = {"unit": options.unit or unit, "up": options.up or "as in the file", **found}
-    known = dict.fromkeys([*(t.name for t in tracks if t.name), *(t.label for t in tracks if t.name)], MARKER)
+    known = dict.fromkeys([*(t.name for t in tracks if t.name), *(t.label for t in tracks if t.name)], (Becomes.MARKER,))
     remarks = [*_notes_of_nameless(renamed), *notes]
     return Source(
         path,

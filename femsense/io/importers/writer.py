@@ -20,7 +20,7 @@ from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, wri
 from femsense.io.folder_lock import only_writer
 from femsense.io.importers.frames import Frame, Images, Source
 from femsense.io.importers.images.pictures import write_color, write_depth
-from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
+from femsense.io.importers.journal import JOURNAL, Entry, Journal, Picture, Seen
 from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
 from femsense.io.importers.tables.actuation import ActuationLog
 from femsense.io.recording_folder import load_recording
@@ -245,7 +245,7 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
 
 def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int) -> Seen:
     """Write what one camera gives in a frame; its name, if there are several, is that of its folders."""
-    kind, center = "", None
+    kind, center = Picture.NONE, None
     if frame.picture is not None:
         try:
             kind, center = _write_picture(source, frame.picture(), part, Path(view) / f"{number:06d}")
@@ -253,7 +253,7 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
             if number == 0:
                 raise
             warnings.warn(f"a frame keeps no picture: {' '.join(str(problem).split())}", stacklevel=2)
-            kind = "broken"
+            kind = Picture.BROKEN
     markers = {name: np.asarray(place, dtype=float).tolist() for name, place in frame.markers.items()}
     strangers = np.asarray(frame.unlabelled, dtype=float).reshape(-1, 3)
     if markers:
@@ -263,16 +263,16 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
     return Seen(markers, strangers.tolist(), kind, center)
 
 
-def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[str, list[float] | None]:
+def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[Picture, list[float] | None]:
     if isinstance(picture, PointCloud):
         file = part / "clouds" / f"{name}.ply"
         file.parent.mkdir(parents=True, exist_ok=True)
         write_cloud(file, picture)
-        return "cloud", picture.points.mean(axis=0).tolist() if len(picture) else None
+        return Picture.CLOUD, picture.points.mean(axis=0).tolist() if len(picture) else None
     write_depth(part / "depth" / f"{name}.png", picture.depth)
     if picture.color is not None:
         write_color(part / "color" / f"{name}.png", picture.color)
-    return "depth", _center(picture, source.camera)
+    return Picture.DEPTH, _center(picture, source.camera)
 
 
 def _center(picture: Images, camera: Camera | None) -> list[float] | None:

@@ -10,12 +10,12 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options, unit_of
+from femsense.io.importers.frames import Clock, Options, unit_of
 from femsense.io.importers.ros.bag import Bag, Message
 from femsense.io.importers.ros.messages import header_of, markers_of, sdk_values, stamp_of
 from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
 from femsense.io.importers.several import camera_names
-from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
+from femsense.io.importers.tables.mapping import Becomes, Target, kind_of_target, parse_target
 
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""
@@ -41,7 +41,7 @@ class Plan:
     """How the messages of a bag become frames."""
 
     choice: Choice
-    clock: str
+    clock: Clock
     actuation: str | None
     columns: dict[str, dict[str, Taken]]
     """Topic → name of a value → what it becomes."""
@@ -55,11 +55,11 @@ class Plan:
     """Name of a marker, or topic of one without a name → its name in the recording."""
     scale: float | None
     """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
-    names: dict[str, str]
+    names: dict[str, tuple[Becomes, ...]]
     """Name that `--map` may take → what it may become."""
 
 
-def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
+def plan_of(bag: Bag, choice: Choice, options: Options, clock: Clock) -> Plan:
     """Return what is read from a bag, and how: streams, columns, clock."""
     notes = list(choice.notes)
     names = _mappable(bag, choice, options)
@@ -136,20 +136,23 @@ def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
     return notes
 
 
-def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
+def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, tuple[Becomes, ...]]:
     """Return the names that `--map` may take; those of markers are sought in the messages where one is not known otherwise."""
-    names = {stream.topic.name: LOAD for stream in choice.loads} | {stream.topic.name: MARKER for stream in choice.markers}
+    names: dict[str, tuple[Becomes, ...]] = dict.fromkeys((s.topic.name for s in choice.loads), (Becomes.LOAD,))
+    names |= dict.fromkeys((s.topic.name for s in choice.markers), (Becomes.MARKER,))
     for stream in choice.inputs if options.columns else ():
         for name, fld in _largest_values(bag, stream):
             whole = (stream.topic.name,) if _is_pressure(stream) else ()
-            names |= dict.fromkeys((name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
+            names |= dict.fromkeys(
+                (name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), (Becomes.INPUT,)
+            )
     for stream in choice.markers:
         for message in bag.messages([stream.topic.name]):
             if set(options.columns) <= set(names):
                 break
             with contextlib.suppress(InputError):
                 found = markers_of(bag.decode(message), stream.topic.type)
-                names |= {label: MARKER for label, _ in found if label and label not in names}
+                names |= {label: (Becomes.MARKER,) for label, _ in found if label and label not in names}
     return names
 
 
@@ -181,7 +184,7 @@ def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict
                 fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
                 columns[name] = Taken(fld, parse_target(options.columns[key]))
     if not columns and not any(key in options.columns for key in names):
-        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) == INPUT}
+        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) is Becomes.INPUT}
         prefix = "chamber_" if _is_pressure(stream) else "cable_"
         for name in names:
             usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
@@ -232,17 +235,17 @@ def _marker_poses(bag: Bag, choice: Choice, notes: list[str]) -> dict[str, Float
     return poses
 
 
-def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
+def clock_of(bag: Bag, choice: Choice, options: Options) -> Clock:
     """Return whose time stamps are used.
 
-    "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
-    like the time of recording (those of the SDK may count from elsewhere); else "record".
+    METADATA where the RealSense SDK keeps the device's time there; HEADER where the stamps of all streams with a header go on like
+    the time of recording (those of the SDK may count from elsewhere); else RECORD.
     """
-    if options.clock in ("header", "record"):
-        return options.clock
+    if options.clock != Clock.AUTO:
+        return Clock(options.clock)
     sdk = is_sdk(choice.primary.topic.name)
-    if sdk and _metadata(bag, choice, "metadata"):
-        return "metadata"
+    if sdk and _metadata(bag, choice, Clock.METADATA):
+        return Clock.METADATA
     for stream in chosen_streams(choice):
         shifts, last = [], -np.inf
         for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
@@ -254,17 +257,17 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
                 continue
             time, _ = stamp_of(decoded)
             if time <= 0.0 or time < last:
-                return "record"
+                return Clock.RECORD
             last = time
             shifts.append(message.record - time)
         if shifts and not sdk and (np.ptp(shifts) > LAG_S or abs(float(np.median(shifts))) > LAG_S):
-            return "record"
-    return "header"
+            return Clock.RECORD
+    return Clock.HEADER
 
 
-def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
+def _metadata(bag: Bag, choice: Choice, clock: Clock) -> dict[str, str]:
     """Return topic of metadata → topic of images where the first of them holds a time of the device."""
-    if clock != "metadata":
+    if clock is not Clock.METADATA:
         return {}
     names = {t.name: t.type for t in bag.topics}
     pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
@@ -279,9 +282,11 @@ def device_time(decoded: Any) -> float | None:
     return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
 
 
-def header_time(decoded: Any, message: Message) -> float:
-    """Return the time in the header of a message [s]; that of its record where it has none."""
-    time, _ = stamp_of(decoded)
+def time_of(bag: Bag, plan: Plan, message: Message, decoded: Any = None) -> float:
+    """Return the time of a message [s] on the chosen clock: of its header, where it has one, else of its recording."""
+    if plan.clock is not Clock.HEADER:
+        return message.record
+    time, _ = stamp_of(bag.decode(message) if decoded is None else decoded)
     return time if time > 0.0 else message.record
 
 

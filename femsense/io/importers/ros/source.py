@@ -16,6 +16,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import (
+    Clock,
     DepthImage,
     Format,
     Frame,
@@ -37,10 +38,10 @@ from femsense.io.importers.ros.plan import (
     chosen_streams,
     clock_of,
     device_time,
-    header_time,
     is_sdk,
     named_values,
     plan_of,
+    time_of,
 )
 from femsense.io.importers.ros.topics import Kind, Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
@@ -64,7 +65,7 @@ def open_ros(path: Path, options: Options) -> Source:
             return _source(bag, streams, options)
         sources = _sources(bag, streams, cameras, options)
         if len({source.found["clock"] for source in sources.values()}) > 1:
-            sources = _sources(bag, streams, cameras, replace(options, clock="record"))
+            sources = _sources(bag, streams, cameras, replace(options, clock=Clock.RECORD))
     return joined(sources, path, options)
 
 
@@ -199,8 +200,7 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
             except InputError as problem:
                 broken.append(" ".join(str(problem).split()))
                 continue
-            time = message.record if plan.clock != "header" else header_time(decoded, message)
-            rows.extend([time, *_values(plan, message, decoded)])
+            rows.extend([time_of(bag, plan, message, decoded), *_values(plan, message, decoded)])
     if broken:
         warnings.warn(f"{len(broken)} messages of {topic} are left out: {broken[0]}", stacklevel=2)
     table = np.array(rows).reshape(-1, 1 + (3 if topic in plan.load_points else len(plan.columns[topic])))
@@ -215,16 +215,12 @@ def _take(
         tracks[plan.metadata[message.topic]].stamp(message.record, device_time(bag.decode(message)))
         return
     if message.topic == primary:
-        needed = None if lazy and plan.clock != "header" else bag.decode(message)
-        time = message.record if needed is None or plan.clock != "header" else header_time(needed, message)
-        waiting.append((time, message, None if lazy else needed))
+        decoded = None if lazy else bag.decode(message)
+        waiting.append((time_of(bag, plan, message, decoded), message, decoded))
         return
-    if plan.choice.color is not None and message.topic == plan.choice.color.topic.name:
-        time = message.record if plan.clock != "header" else header_time(bag.decode(message), message)
-        tracks[message.topic].add(time, message)
-        return
-    decoded = bag.decode(message)
-    tracks[message.topic].add(message.record if plan.clock != "header" else header_time(decoded, message), decoded)
+    is_color = plan.choice.color is not None and message.topic == plan.choice.color.topic.name
+    decoded = None if is_color else bag.decode(message)
+    tracks[message.topic].add(time_of(bag, plan, message, decoded), message if is_color else decoded)
 
 
 def _frame(

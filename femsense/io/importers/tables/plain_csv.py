@@ -20,6 +20,7 @@ from femsense.io.importers.tables.clock import seconds_of
 from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_text, is_time, layout_of, number_rows, time_column
 from femsense.io.importers.tables.input_samples import Samples, samples_of
 from femsense.io.importers.tables.mapping import (
+    Becomes,
     Column,
     cable_kind,
     check_names,
@@ -170,7 +171,7 @@ def _times(path: Path, names: list[str], headed: bool, options: Options) -> tupl
 def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
     """Return the column that is mapped to the time, and its unit where one is said; None where none is mapped. Raises InputError."""
     for old, new in columns.items():
-        if kind_of_target(new) == "time" and old in names:
+        if kind_of_target(new) is Becomes.TIME and old in names:
             target = parse_target(new)
             said = Unit("", Quantity.TIME, target.factor) if target.scaled else unit_beside(old, "time")
             return list(names).index(old), said
