@@ -138,6 +138,20 @@ def nodes_within(nodes: FloatArray, low: FloatArray, high: FloatArray) -> BoolAr
     return np.asarray(((nodes >= low - slack_low) & (nodes <= high + slack_high)).all(axis=1))
 
 
+def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> list[FloatArray]:
+    """Return boxes [m], each of shape (2, 3), that hold the nodes `held` and no other: one where that works, else one a node.
+
+    Arguments:
+        nodes: shape (n, 3) [m].
+        held: their indices.
+        slack: the boxes reach this far beyond them [m].
+    """
+    low, high = nodes[held].min(axis=0) - slack, nodes[held].max(axis=0) + slack
+    if nodes_within(nodes, low, high).sum() == len(held):
+        return [np.array([low, high])]
+    return [np.array([point - slack, point + slack]) for point in nodes[held]]
+
+
 def mesh_diagonal(nodes: FloatArray) -> float:
     """Return the diagonal of the bounding box [m]."""
     return float(np.linalg.norm(np.ptp(nodes, axis=0)))
