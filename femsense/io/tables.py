@@ -22,6 +22,7 @@ from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
 from femsense.core.text import did_you_mean, key_path, plain_name, short
 from femsense.core.units import PER_METRE, length_unit
+from femsense.io.text_numbers import plain_number
 
 
 def _usual_unit(value: object) -> object:
@@ -323,31 +324,27 @@ class Table:
 
     def _column(self, column: str, empty_is_nan: bool) -> FloatArray:
         cells = self.text(column)
-        if empty_is_nan:
-            filled = [cell or "nan" for cell in cells]
-            allowed = np.array([not cell for cell in cells], dtype=bool)
-        else:
-            filled, allowed = list(cells), np.zeros(len(cells), dtype=bool)
-        try:
-            values = np.array([float(cell) for cell in filled], dtype=np.float64)
-        except ValueError:
-            raise self._not_a_number(column, filled) from None
-        bad = np.flatnonzero(~np.isfinite(values) & ~allowed)
-        if len(bad):
+        numbers = [np.nan if empty_is_nan and not cell else plain_number(cell) for cell in cells]
+        bad = next((row for row, number in enumerate(numbers) if number is None), None)
+        if bad is not None:
+            raise InputError(
+                "not a number",
+                where=self.place(bad, column),
+                found=cells[bad] or "an empty cell",
+                expected="a number",
+                hint="decimal points, not commas" if "," in cells[bad] else None,
+            )
+        values = np.array(numbers, dtype=np.float64)
+        odd = next((row for row in np.flatnonzero(~np.isfinite(values)).tolist() if cells[row] or not empty_is_nan), None)
+        if odd is not None:
             raise InputError(
                 "not a finite number",
-                where=self.place(bad[0], column),
-                found=cells[bad[0]],
+                where=self.place(odd, column),
+                found=cells[odd],
                 expected="a finite number",
                 hint="leave the row out where nothing was measured",
             )
         return values
-
-    def _not_a_number(self, column: str, cells: Sequence[str]) -> InputError:
-        row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        found = cells[row] or "an empty cell"
-        hint = "decimal points, not commas" if "," in found else None
-        return InputError("not a number", where=self.place(row, column), found=found, expected="a number", hint=hint)
 
 
 def read_csv(path: Path, *, required: Sequence[str], optional: Sequence[str] = (), prefixes: Sequence[str] = ()) -> Table:
@@ -406,11 +403,3 @@ def _check_header(
     missing = [column for column in required if column not in columns]
     if missing:
         raise InputError("columns are missing", where=where, found=", ".join(columns), expected=", ".join(missing))
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -18,6 +18,7 @@ from femsense.io.clouds.images import decoded_image, png_header, read_png
 from femsense.io.importers.frames import FARTHEST, DepthImage, Format, Frame, Images, Options, Source, camera_of_numbers, unit_of
 from femsense.io.importers.images.array_clouds import read_array_cloud
 from femsense.io.importers.images.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
+from femsense.io.importers.tables.input_samples import nearest_in_time
 from femsense.model.camera import Camera
 from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
@@ -200,13 +201,9 @@ def _list(path: Path, column: int = 0) -> list[tuple[float, str]]:
 
 def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) -> list[tuple[float, str, str | None]]:
     """Return each depth image with the colour image nearest in time, at most NEAR_S away."""
-    times = np.array([t for t, _ in color])
-    result: list[tuple[float, str, str | None]] = []
-    for time, file in depth:
-        k = int(np.abs(times - time).argmin()) if len(times) else -1
-        near = k >= 0 and abs(times[k] - time) <= NEAR_S
-        result.append((time, file, color[k][1] if near else None))
-    return result
+    ordered = sorted(color)
+    nearest = nearest_in_time(np.array([t for t, _ in depth]), np.array([t for t, _ in ordered]), NEAR_S)
+    return [(time, file, ordered[k][1] if k >= 0 else None) for (time, file), k in zip(depth, nearest.tolist())]
 
 
 def _folder_lens(folder: Path, width: int, height: int) -> tuple[Camera, list[str]]:

@@ -19,6 +19,7 @@ from femsense.core.text import plain_name
 from femsense.io.importers.frames import Format, Options, Source
 from femsense.io.importers.motion_capture import Row, Track, capture_source, tracks_of
 from femsense.io.importers.tables.csv_tables import is_cut_off, is_text, rows_of
+from femsense.io.text_numbers import plain_number
 
 HEAD = 20
 """The headers are in the first lines."""
@@ -181,7 +182,7 @@ def _trc(head: list[list[str]], path: Path) -> Export:
     names = [(j, plain_name(cell)) for j, cell in enumerate(head[3]) if j > 1 and cell.strip()]
     found = tuple((Track(name, name), (j, j + 1, j + 2)) for j, name in names)
     rate, frames, count = _rate(said.get("DataRate", "")), _whole(said.get("NumFrames", "")), _whole(said.get("NumMarkers", ""))
-    first = next((i for i, row in enumerate(head) if i > 3 and row and _is_number(row[0])), 5)
+    first = next((i for i, row in enumerate(head) if i > 3 and row and plain_number(row[0]) is not None), 5)
     return Export(Program.TRC, found, said.get("Units"), 1, rate, first, frames, count)
 
 
@@ -200,7 +201,7 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
             hint="export the 3D data as TSV, with the header",
         )
     names = [plain_name(name) for name in said["MARKER_NAMES"] if name]
-    first = next((i for i, row in enumerate(head) if row and _is_number(row[0])), len(head))
+    first = next((i for i, row in enumerate(head) if row and plain_number(row[0]) is not None), len(head))
     titles = [cell.strip().lower() for cell in head[first - 1]]
     shift = len([title for title in titles if title in ("frame", "time")]) if titles[:1] == ["frame"] else 0
     time = titles.index("time") if shift and "time" in titles else None
@@ -208,10 +209,6 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
     value = {key: _whole(row[0]) if row else None for key, row in said.items()}
     rate = _rate(said.get("FREQUENCY", [""])[0])
     return Export(Program.QUALISYS, found, "mm", time, rate, first, value.get("NO_OF_FRAMES"), value.get("NO_OF_MARKERS"))
-
-
-def _is_number(cell: str) -> bool:
-    return bool(np.isfinite(_cell([cell], 0)))
 
 
 def _whole(cell: str) -> int | None:
@@ -267,10 +264,8 @@ def _at(row: list[str], j: int) -> str:
 
 def _cell(row: list[str], j: int) -> float:
     """Return a number; NaN where the cell is empty or no number (a gap)."""
-    try:
-        return float(row[j])
-    except (ValueError, IndexError):
-        return np.nan
+    number = plain_number(_at(row, j))
+    return np.nan if number is None else number
 
 
 def _is_export(program: Program, path: Path, head: bytes) -> bool:
