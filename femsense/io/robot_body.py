@@ -45,7 +45,7 @@ FAR_MARKER = 1.0
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
 INSIDE = 2
-"""A node counts as inside a box up to so many units in the last place of the bound (which is where rounding of units ends)."""
+"""A node counts as inside a box up to this number of units in the last place of the bound, the rounding error of a change of units."""
 
 
 def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robot:

@@ -122,7 +122,7 @@ def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Ro
 def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write robot.toml and a copy of the mesh file, so that the folder loads back to the same robot.
 
-    A robot that was loaded is written as it was declared; what was changed in Python since then must be said by `effects`. Its correction goes along.
+    A robot that was loaded is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
 
     Arguments:
         robot: the robot.

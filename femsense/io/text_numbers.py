@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from itertools import product
 
 BLANKS = " \u00a0\u202f\u2009'’"
-"""What stands between thousands where neither a comma nor a point does."""
+"""Marks between thousands other than comma and point."""
 GROUPED = re.compile(
     rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?"
 )
@@ -38,7 +38,7 @@ TIMES_READ = (
 
 @dataclass(frozen=True, slots=True)
 class Notation:
-    """How a table writes its numbers."""
+    """Notation of the numbers of a table."""
 
     decimal: str = "."
     """"." or ","."""

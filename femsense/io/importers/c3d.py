@@ -23,7 +23,7 @@ from femsense.io.importers.motion_capture import Row, capture_source, tracks_of
 
 BLOCK = 512
 MOST = 65535
-"""The header cannot count farther; some writers stop there without the longer count of TRIAL."""
+"""Largest count of the header; some writers stop there without the longer count of TRIAL."""
 INTEL, DEC, MIPS = 84, 85, 86
 """The processors whose numbers a file holds: little-endian, VAX, big-endian."""
 
@@ -33,7 +33,7 @@ OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Header:
-    """What a C3D file says of itself."""
+    """Header and parameters of a C3D file."""
 
     points: int
     analog: int
@@ -49,11 +49,11 @@ class Header:
     labels: tuple[str, ...]
     unit: str | None
     up: str | None
-    """The vertical axis as the file says it, such as "+Y"."""
+    """The vertical axis as the file has it, such as "+Y"."""
     outputs: frozenset[str] = frozenset()
     """Labels that are no places (angles, forces …)."""
     disagreements: tuple[str, ...] = ()
-    """Where header and parameters say different things."""
+    """Contradictions of header and parameters."""
 
 
 def open_c3d(path: Path, options: Options) -> Source:
@@ -99,7 +99,7 @@ def open_c3d(path: Path, options: Options) -> Source:
 
 
 def list_c3d(path: Path) -> dict[str, Any]:
-    """Return what a C3D file says that it holds. Raises InputError."""
+    """Return the contents that a C3D file declares. Raises InputError."""
     header = read_c3d_header(path)
     source = open_c3d(path, Options(unit=None if header.unit else "mm"))
     points = [name for name in header.labels if name not in header.outputs]

@@ -1,4 +1,4 @@
-"""What an importer hands on: a source that says what it holds, and its frames one after the other."""
+"""The types of an importer: a source with its frames, the options of a user, and the declaration of a format."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ColorImage = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Images:
-    """What a depth camera gives in one frame."""
+    """Images of a depth camera in one frame."""
 
     depth: DepthImage
     """Units of the camera's `depth_unit`, 0 where there is none, shape (H, W)."""
@@ -64,13 +64,13 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
-    """What was found in a file or a folder."""
+    """Contents of a file or a folder, read frame by frame."""
 
     path: Path
     frames: Callable[[], Iterator[Frame]]
     """Starts from the first frame at each call; a live source may go on for ever."""
     found: Mapping[str, Any] = field(default_factory=dict)
-    """What was found beyond the frames, for the report; None where it is not known."""
+    """Properties for the report, beyond the frames; None where one is not known."""
     camera: Camera | None = None
     """Where pictures are depth images."""
     actuation: str | None = None
@@ -80,7 +80,7 @@ class Source:
     count: int | None = None
     """Frames that are expected, where it is known."""
     notes: Sequence[str] = ()
-    """What a person should know before trusting it."""
+    """Assumptions and losses that the user should know."""
     T_robot_camera: FloatArray | None = None
     """Shape (4, 4), translation [m], where the source says it."""
     views: Mapping[str, Source] = field(default_factory=dict)
@@ -107,7 +107,7 @@ class Clock(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Options:
-    """What a person says about a source; empty where nothing was said."""
+    """Options of the user about a source; the defaults leave all to the file."""
 
     format: str | None = None
     topics: Sequence[str] = ()
@@ -130,11 +130,11 @@ class Options:
     shifts: Mapping[str, float] = field(default_factory=dict)
     """Camera → seconds to add to its times, where clocks differ."""
     every: int = 1
-    """Of so many frames one is taken."""
+    """Every n-th frame is taken."""
     free: Sequence[tuple[float, float]] = ()
     """From and to [s] after the first frame: nothing touches the robot meanwhile."""
     log_names: Sequence[str] = ()
-    """Columns of a log of actuation beside it, for messages."""
+    """Columns of a separate log of actuation, for messages."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -186,23 +186,23 @@ def camera_of_numbers(
 def is_kept_as_image(camera: Camera) -> bool:
     """Whether a depth image of a camera is kept as an image.
 
-    What the RealSense SDK calls inverse is not the inverse of OpenCV's polynomial (20 mm apart at 1 m with its usual coefficients):
+    The "inverse" model of the RealSense SDK is not the inverse of OpenCV's polynomial (20 mm apart at 1 m with its usual coefficients):
     such images become clouds, which nobody can misread.
     """
     return not np.any(camera.distortion != 0.0) or camera.distortion_model != "inverse_brown_conrady"
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:
-    """Return metres in one unit of length: what a person said, else what the file says.
+    """Return metres in one unit of length: of the option, else of the file.
 
     Arguments:
-        options: what was said.
+        options: of the user.
         declared: the unit that the file names; None where it names none.
         where: the file, for the message.
         extent: size of what was recorded in the file's unit, for the message.
 
     Raises:
-        InputError: nobody says the unit.
+        InputError: neither gives the unit.
     """
     said = options.unit or declared
     unit = length_unit(said) if said is not None else None
@@ -225,7 +225,7 @@ def check_size(extent: float, where: str | Path | None) -> None:
 
 
 def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:
-    """Refuse what is taken for metres, but is mostly farther away than a depth camera sees.
+    """Refuse distances in metres most of which exceed the range of a depth camera.
 
     Arguments:
         distances: of the points from the camera, shape (n,).

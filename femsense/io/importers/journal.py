@@ -19,7 +19,7 @@ JOURNAL = ".import-journal"
 
 
 class Picture(StrEnum):
-    """What became of a camera's picture in a frame."""
+    """Kind of picture of a camera in a frame, as it was written."""
 
     NONE = ""
     DEPTH = "depth"
@@ -29,7 +29,7 @@ class Picture(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """What one camera gave in a frame."""
+    """Data of one camera in a frame."""
 
     markers: Mapping[str, list[float]]
     unlabelled: list[list[float]]
@@ -62,7 +62,7 @@ class Journal:
     """Appends entries, and reads them one after the other."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """folder: the unfinished recording. identity: what the import is made from; another one begins anew."""
+        """folder: the unfinished recording. identity: the sources and options of the import; another identity starts from the first frame."""
         self.file = folder / JOURNAL
         self.head = json.dumps(plain(identity), sort_keys=True)
         self.done = self._whole_entries()

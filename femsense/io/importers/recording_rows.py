@@ -28,7 +28,7 @@ EXACT = 1e-6
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Wanted:
-    """What a person says of the inputs."""
+    """Options of the user about the inputs."""
 
     actuation: str | None = None
     """"tension" or "displacement", where the source does not say."""

@@ -1,4 +1,4 @@
-"""What was found in a source, counted over its frames: rate, gaps, lost and swapped markers, span."""
+"""Statistics of an imported source over its frames: rate, gaps, lost and swapped markers, span."""
 
 from __future__ import annotations
 

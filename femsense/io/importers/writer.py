@@ -1,4 +1,4 @@
-"""Frames → a recording folder, written beside and renamed at the end; memory is that of one frame, whatever the length."""
+"""Frames → a recording folder, written under a temporary name and renamed at the end; memory is that of one frame."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
-"""What a recording was made from; lies in its folder."""
+"""Record of the sources and options of an import, in the recording's folder."""
 TABLES = ("recording.toml", "frames.csv", "markers.csv", "loads.csv")
 OWN_FILES = re.compile(
     "|".join(map(re.escape, (*TABLES, RECORD))) + r"|(clouds|depth|color)/([^/]+/)?\d{6,}\.(ply|png)",
@@ -165,7 +165,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
 
 
 def _give_name(part: Path, final: Path, replace: bool) -> None:
-    """Rename the finished folder. Raises InputError where something stands there that nobody said to replace."""
+    """Rename the finished folder. Raises InputError where something stands there that is not to be replaced."""
     if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
         raise InputError("something stands there already", where=final, expected="a new place for the recording")
     if not final.exists():

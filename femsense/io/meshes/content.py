@@ -1,4 +1,4 @@
-"""What a mesh file holds, whatever its format."""
+"""Content of a mesh file of any format."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def distinct_cells(cells: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def gathered(values: npt.NDArray[np.generic], kept: IntArray, owner: IntArray) -> npt.NDArray[np.generic]:
-    """Return the values of the kept cells with those of their copies beside them, shape (k, p);
+    """Return the values of the kept cells next to those of their copies, shape (k, p);
     a cell without copies repeats its own."""
     table = values.reshape(len(values), -1)
     if len(kept) == len(owner):

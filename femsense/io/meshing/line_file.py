@@ -182,7 +182,7 @@ def channels_of(table: LineTable, line: LineBody, path: Path) -> tuple[Channel, 
 
 
 def cavity_of(chamber: ChamberTable) -> Cavity:
-    """Return the cavity of a chamber; a round one beside the axis becomes a sector of a ring of the same area,
+    """Return the cavity of a chamber; a round one next to the axis becomes a sector of a ring of the same area,
     as thick as it is wide."""
     inner, outer, half = 0.0, (chamber.radius_mm or 0.0), 0.0
     if chamber.inner_mm is not None and chamber.outer_mm is not None and chamber.span_deg is not None:

@@ -36,7 +36,7 @@ EDGE_FRACTION = 0.05
 FILL_SECONDS = 300.0
 """fTetWild is stopped early after this time."""
 ENVELOPE = 1e-3
-"""How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
+"""Largest distance of a mesh from its surface, over the diagonal of its bounding box."""
 
 
 class Unfinished(InputError):

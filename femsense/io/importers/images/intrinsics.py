@@ -65,7 +65,7 @@ NAMES = {
     "k5": ("k5",),
     "k6": ("k6",),
 }
-"""What numbers of a lens are called, in small letters."""
+"""Names of the numbers of a lens, in small letters."""
 PAIRS = {"focal_length": ("fx", "fy"), "focal": ("fx", "fy"), "principal_point": ("cx", "cy"), "center": ("cx", "cy")}
 """Names of two numbers."""
 BY_MODEL = {"pinhole": 4, "simple_pinhole": 3, "opencv": 8, "radtan": 8}
@@ -89,7 +89,7 @@ CENTRED, SQUARE = 0.2, 0.15
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Found:
-    """What a file says of a lens."""
+    """Numbers of a lens that were found in a file."""
 
     numbers: Mapping[str, float]
     """Of fx, fy, cx, cy, width, height, k1 …"""

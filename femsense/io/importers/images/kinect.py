@@ -39,7 +39,7 @@ PLACES = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraL
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tracks:
-    """What stands in a file."""
+    """Tracks and calibration of a recording."""
 
     depth: int
     """Number of the stream."""

@@ -12,7 +12,7 @@ from femsense.core.errors import InputError
 from femsense.io.importers.frames import ColorImage, DepthImage
 
 NO_DEPTH = 65535
-"""What some cameras write where they see nothing; becomes 0."""
+"""Value of some cameras for a pixel without depth; becomes 0."""
 FINE_UNIT = 1e-4
 """Metres in one unit of a depth image that came in floating point: reaches 6.55 m, rounds by 0.03 mm rms."""
 

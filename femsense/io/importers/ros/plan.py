@@ -1,4 +1,4 @@
-"""What is settled before the frames of a bag are read: columns, clock, loads, where markers stand."""
+"""Decisions before the frames of a bag are read: columns, clock, loads, poses of markers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from femsense.io.importers.tables.mapping import Becomes, Target, kind_of_target
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""
 PEEKED = 50
-"""So many first messages of a topic say whether its header stamps are a clock."""
+"""Number of first messages that decide whether the header stamps of a topic are a clock."""
 
 SCANNED = 5000
-"""So many first messages of motors say which of their fields is used."""
+"""Number of first messages of motors that decide which of their fields is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Taken:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
-    """How the messages of a bag become frames."""
+    """Mapping of the messages of a bag to frames."""
 
     choice: Choice
     clock: Clock
@@ -54,7 +54,7 @@ class Plan:
     marker_names: dict[str, str]
     """Name of a marker, or topic of one without a name → its name in the recording."""
     scale: float | None
-    """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
+    """Metres in one unit of clouds, markers and depth in floating point; None where no option gives it: metres."""
     names: dict[str, tuple[Becomes, ...]]
     """Name that `--map` may take → what it may become."""
 
@@ -123,7 +123,7 @@ PRESSURES = "pressures are taken as pascals above the surroundings; FluidPressur
 
 
 def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
-    """Return what is assumed of inputs whose unit nobody said."""
+    """Return the assumptions about inputs whose unit is not declared."""
     notes = []
     for topic, values in columns.items():
         for field in FIELDS:

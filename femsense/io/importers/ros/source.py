@@ -129,7 +129,7 @@ def topics_of(path: Path) -> set[str]:
 
 @dataclass(eq=False, slots=True)
 class _Track:
-    """What a secondary stream said lately."""
+    """Recent messages of a secondary stream."""
 
     times: deque[float] = field(default_factory=deque)
     values: deque[Any] = field(default_factory=deque)

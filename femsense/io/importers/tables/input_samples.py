@@ -11,9 +11,9 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 
 NEAR_S = 0.05
-"""What was sampled at most this far from a frame belongs to it [s]."""
+"""A sample belongs to a frame at most this far from it [s]."""
 STEPS = 3.0
-"""Two samples that are farther apart than so many usual steps have a hole between: two lost in a row are bridged."""
+"""Two samples farther apart than this times the usual step enclose a hole: two lost in a row are bridged."""
 
 
 def nearest_in_time(times: FloatArray, other: FloatArray, within: float) -> IntArray:

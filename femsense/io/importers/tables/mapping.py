@@ -1,4 +1,4 @@
-"""`--map NAME=TARGET`: what a name in a source becomes in the recording, and what a unit beside a name says."""
+"""`--map NAME=TARGET`: the target of a name in the recording, and the unit next to a name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from femsense.io.importers.tables.csv_tables import column_unit
 
 
 class Becomes(StrEnum):
-    """What a name may become in the recording; the values are how its target is written."""
+    """Kind of target of a name in the recording; the values show how it is written."""
 
     INPUT = "cable_NAME or chamber_NAME"
     MARKER = "marker.NAME"
@@ -30,7 +30,7 @@ class Becomes(StrEnum):
 
 
 COLUMN = (Becomes.INPUT, Becomes.TIME, Becomes.AXIS)
-"""What a column of a table may become."""
+"""Kinds of target of a column of a table."""
 TARGETS = (
     "cable_NAME, chamber_NAME, time (a factor or a unit may follow: *0.001, *kPa, *1-101325), NAME.x, marker.NAME or load@X,Y,Z"
 )
@@ -39,12 +39,12 @@ IN_BRACKETS = re.compile(r".+?[\[(]\s*([^\[\]]+?)\s*[\])]\s*")
 NUMBER = r"\d*\.?\d+(?:[eE][-+]?\d+)?"
 SCALE = re.compile(rf"([-+]?{NUMBER}\.?)([-+]{NUMBER})?")
 QUANTITIES = {"time": (Quantity.TIME,), "chamber": (Quantity.PRESSURE,), "cable": (Quantity.FORCE, Quantity.LENGTH)}
-"""What a target holds, by how it begins."""
+"""First word of a target → quantities of its values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What a name becomes: value = factor × what stands there + offset."""
+    """Target of a name: value = factor × value in the file + offset."""
 
     name: str
     factor: float = 1.0
@@ -52,7 +52,7 @@ class Target:
     unit: Unit | None = None
     """Where one was named."""
     scaled: bool = False
-    """Whether a factor or a unit was said."""
+    """Whether the target has a factor or a unit."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ HEAD = 20
 
 
 class Program(StrEnum):
-    """Who writes an export; the names of its formats."""
+    """Program that wrote an export; the values are names of formats."""
 
     OPTITRACK = "optitrack"
     VICON = "vicon"
@@ -51,7 +51,7 @@ Axes = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Export:
-    """What the header of an export says."""
+    """Header of an export."""
 
     program: Program
     markers: tuple[tuple[Track, Axes], ...]
@@ -77,7 +77,7 @@ def program_of(path: Path) -> Program | None:
 
 
 def list_mocap_csv(path: Path) -> dict[str, Any]:
-    """Return what the header of an export says. Raises InputError."""
+    """Return the header of an export. Raises InputError."""
     export = read_export(path)
     return {
         "markers": [track.name or "(unnamed)" for track, _ in export.markers],
@@ -88,7 +88,7 @@ def list_mocap_csv(path: Path) -> dict[str, Any]:
 
 
 def open_mocap_csv(path: Path, options: Options) -> Source:
-    """Return an export as a source. Raises InputError: a header that says nothing, no markers, a unit that nobody says."""
+    """Return an export as a source. Raises InputError: an empty header, no markers, a unit that is not known."""
     export = read_export(path)
     if not export.markers:
         raise InputError("no markers", where=path, found="none", expected="positions of markers or bodies")
@@ -120,7 +120,7 @@ def _notes(export: Export, options: Options, step: float | None) -> list[str]:
 
 
 def read_export(path: Path) -> Export:
-    """Return what the header of an export says. Raises InputError."""
+    """Return the header of an export. Raises InputError."""
     head = list(islice(rows_of(path), HEAD))
     readers = {Program.OPTITRACK: _optitrack, Program.TRC: _trc, Program.QUALISYS: _qualisys}
     reader = readers.get(program_of(path) or Program.VICON)

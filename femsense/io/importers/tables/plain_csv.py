@@ -63,7 +63,7 @@ def open_plain_csv(path: Path, options: Options) -> Source:
     as cable_… and chamber_…. A file of bare numbers (counter, time, x, y, z, x, y, z …) holds markers without names.
 
     Raises:
-        InputError: nothing to take, or a unit that nobody says.
+        InputError: nothing to take, or a unit that is not known.
     """
     names, headed = header_of(path)
     options = replace(options, columns=resolved(options.columns, names))
@@ -121,7 +121,7 @@ def notation_notes(path: Path) -> list[str]:
 
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
-    """Return what was assumed of the units of inputs: absolute pressures that were made gauge pressures, and units that nobody said."""
+    """Return the assumptions about units of inputs: absolute pressures that became gauge pressures, and units that are not declared."""
     absolute = [
         column.name for column in inputs if column.offset and not parse_target(columns.get(names[column.index], "")).scaled
     ]
@@ -169,7 +169,7 @@ def _times(path: Path, names: list[str], headed: bool, options: Options) -> tupl
 
 
 def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
-    """Return the column that is mapped to the time, and its unit where one is said; None where none is mapped. Raises InputError."""
+    """Return the column that is mapped to the time, and its unit where one is declared; None where none is mapped. Raises InputError."""
     for old, new in columns.items():
         if kind_of_target(new) is Becomes.TIME and old in names:
             target = parse_target(new)
