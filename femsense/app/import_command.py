@@ -15,10 +15,10 @@ from femsense.core.units import length_unit
 from femsense.io.files import check_no_pipe, check_target, followed
 from femsense.io.importers.formats import FORMATS, format_of
 from femsense.io.importers.guess import open_sources, split_name
-from femsense.io.importers.options import UNITS, InputOptions, Options
+from femsense.io.importers.options import UNITS, Clock, InputOptions, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import header_of
-from femsense.io.importers.tables.mapping import INPUT, kind_of_target, mappable
+from femsense.io.importers.tables.mapping import Becomes, kind_of_target, mappable
 from femsense.io.importers.writer import OWN_FILES, RECORD, check_unchanged, write_recording
 
 Progress = Callable[..., None]
@@ -126,7 +126,7 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
 def _in_vain(name: str, options: Options) -> tuple[str, ...]:
     """Return notes on options that have no effect on a format."""
     said = {
-        "--clock": options.clock != "auto",
+        "--clock": options.clock != Clock.AUTO,
         "--rate": options.rate is not None,
         "--up": options.up is not None,
         "--unit": options.unit is not None,
@@ -163,7 +163,9 @@ def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Op
     known = [(file, format_of(file)) for file in files if file.is_file()]
     shared = {name for file, one in known if one is not None and one.columns for name in mappable(list(one.columns(file)))}
     columns = {
-        old: new for old, new in options.columns.items() if old not in of_log or (old in shared and kind_of_target(new) != INPUT)
+        old: new
+        for old, new in options.columns.items()
+        if old not in of_log or (old in shared and kind_of_target(new) is not Becomes.INPUT)
     }
     return replace(options, columns=columns, log_names=tuple(of_log))
 

@@ -20,6 +20,7 @@ from femsense.io.files import write_beside
 from femsense.io.meshes.content import distinct_cells, gathered
 from femsense.io.meshes.reading import read_content, reason
 from femsense.io.meshing.surface import check_finite, merged, repaired
+from femsense.io.meshing.surface_queries import sides
 from femsense.io.meshing.tetrahedra import compact, kept_tets, tets_of_surface
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
@@ -298,8 +299,7 @@ def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple
     Raises InputError where it is open or in parts.
     """
     points, triangles = merged(points, triangles)
-    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    count = np.unique(edges, axis=0, return_counts=True)[1]
+    count = sides(triangles)[2]
     if (count != 2).any():
         raise InputError(
             "the surface is not closed",

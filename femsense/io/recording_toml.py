@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,11 +12,9 @@ from pydantic import Field, StringConstraints, model_validator
 
 from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
-from femsense.core.pose import check_pose
-from femsense.core.text import key_path
 from femsense.core.units import PER_METRE
 from femsense.io.mesh_files import read_surface
-from femsense.io.tables import LengthUnit, Schema, beside, schema_problems
+from femsense.io.tables import LengthUnit, Matrix, Schema, at_key, beside, doubles, pose_problems, schema_problems
 from femsense.model.camera import Camera, CameraNoise
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
@@ -25,7 +24,6 @@ LENS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 # The tables of recording.toml
 
-Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 POSE = "4 rows of 4 numbers: maps camera coordinates to robot coordinates, translation in metres"
 Pixels = Annotated[int, Field(gt=0)]
 
@@ -143,60 +141,40 @@ class RecordingTable(Schema):
 def recording_problems(document: dict[str, Any], path: Path) -> list[InputError]:
     """Return everything that is wrong with the tables of a recording.toml."""
     problems = schema_problems(RecordingTable, document, path)
-    return problems or table_problems(RecordingTable.model_validate(document), path)
+    return problems or list(table_problems(RecordingTable.model_validate(document), path))
 
 
-def table_problems(table: RecordingTable, path: Path) -> list[InputError]:
-    """Return what single keys cannot show: one camera and several, a pose given twice, a pose that is no rotation."""
-    problems: list[InputError] = []
-    if table.camera is not None and table.cameras is not None:
-        problems.append(
-            InputError(
-                "both [camera] and [cameras.NAME]", where=path, expected="[camera] for one camera, [cameras.NAME] for several"
-            )
+def table_problems(table: RecordingTable, path: Path) -> Iterator[InputError]:
+    """Yield the problems that single keys do not show: one camera and several, a pose given twice, a pose that is no rotation."""
+    one, several = table.camera, table.cameras or {}
+    if one is not None and several:
+        yield InputError(
+            "both [camera] and [cameras.NAME]", where=path, expected="[camera] for one camera, [cameras.NAME] for several"
         )
-    if table.T_robot_camera is not None and table.cameras is not None:
-        problems.append(
-            InputError(
-                "one pose for several cameras", where=f"{path}: T_robot_camera", expected="T_robot_camera in each [cameras.NAME]"
-            )
+    if table.T_robot_camera is not None and several:
+        yield InputError(
+            "one pose for several cameras", where=at_key(path, "T_robot_camera"), expected="T_robot_camera in each [cameras.NAME]"
         )
-    if table.T_robot_camera is not None and table.camera is not None and table.camera.T_robot_camera is not None:
-        problems.append(
-            InputError("the pose stands twice", where=f"{path}: camera.T_robot_camera", expected="T_robot_camera above [camera]")
+    if table.T_robot_camera is not None and one is not None and one.T_robot_camera is not None:
+        yield InputError(
+            "the pose stands twice", where=at_key(path, "camera", "T_robot_camera"), expected="T_robot_camera above [camera]"
         )
-    for name in table.cameras or {}:
+    for name in several:
         if not re.fullmatch(r'[^/\\,;"\s.][^/\\,;"\s]*', name):
-            problems.append(
-                InputError(
-                    "not a name for a camera, which is also the name of its folder",
-                    where=f"{path}: cameras",
-                    found=repr(name),
-                    expected="a name without blanks, slashes, commas and a point at its start",
-                )
+            yield InputError(
+                "not a name for a camera, which is also the name of its folder",
+                where=at_key(path, "cameras"),
+                found=repr(name),
+                expected="a name without blanks, slashes, commas and a point at its start",
             )
-    names = [tool.name for tool in table.tools]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            problems.append(
-                InputError("a name stands twice", where=f"{path}: tools[{i}].name", found=repr(name), expected="each name once")
-            )
-    for location, pose in _declared_poses(table):
-        try:
-            check_pose(pose, f"{path}: {key_path(location)}")
-        except InputError as problem:
-            problems.append(problem)
-    return problems
+    yield from doubles([tool.name for tool in table.tools], "name", path, "tools", "name")
+    yield from pose_problems(table.T_robot_camera, at_key(path, "T_robot_camera"))
+    yield from pose_problems(one and one.T_robot_camera, at_key(path, "camera", "T_robot_camera"))
+    for name, camera in several.items():
+        yield from pose_problems(camera.T_robot_camera, at_key(path, "cameras", name, "T_robot_camera"))
 
 
 # Parts of a recording
-
-
-def _declared_poses(table: RecordingTable) -> list[tuple[tuple[str, ...], Any]]:
-    poses: list[tuple[tuple[str, ...], Any]] = [(("T_robot_camera",), table.T_robot_camera)]
-    poses += [(("camera", "T_robot_camera"), table.camera.T_robot_camera)] if table.camera else []
-    poses += [(("cameras", name, "T_robot_camera"), camera.T_robot_camera) for name, camera in (table.cameras or {}).items()]
-    return [(location, pose) for location, pose in poses if pose is not None]
 
 
 def views_of(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[Camera | None, ...], tuple[Any, ...]]:
@@ -211,7 +189,7 @@ def views_of(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[
     if camera is None:
         raise InputError(
             "the camera lacks its lens",
-            where=f"{path}: camera",
+            where=at_key(path, "camera"),
             found="no width, height, fx, fy, cx, cy",
             expected=", ".join(LENS_KEYS),
         )
@@ -230,7 +208,7 @@ def _camera(name: str, table: CameraTable) -> Camera | None:
 
 def tools_of(table: RecordingTable, path: Path) -> tuple[Tool, ...]:
     """Return the tools, their meshes read. Raises InputError where a mesh is missing, broken or open."""
-    return tuple(_tool(tool, f"{path}: tools[{i}].mesh", path) for i, tool in enumerate(table.tools))
+    return tuple(_tool(tool, at_key(path, "tools", i, "mesh"), path) for i, tool in enumerate(table.tools))
 
 
 def _tool(table: ToolTable, where: str, path: Path) -> Tool:
@@ -254,7 +232,7 @@ def recording_document(recording: Recording) -> dict[str, Any]:
     document |= {key: value for key, value in optional.items() if value is not None}
     if recording.tools:
         document["tools"] = [_tool_document(tool) for tool in recording.tools]
-    tables = [_camera_document(camera) for camera in recording.cameras]
+    tables = [camera_document(camera) for camera in recording.cameras]
     poses = [None if pose is None else pose.tolist() for pose in recording.T_robot_camera]
     if recording.camera_names == ("",):
         if poses[0] is not None:
@@ -267,7 +245,8 @@ def recording_document(recording: Recording) -> dict[str, Any]:
     return document
 
 
-def _camera_document(camera: Camera | None) -> dict[str, Any]:
+def camera_document(camera: Camera | None) -> dict[str, Any]:
+    """Return the table of a camera; empty without one."""
     if camera is None:
         return {}
     table: dict[str, Any] = {key: getattr(camera, key) for key in LENS_KEYS}

@@ -17,9 +17,7 @@ from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
 from femsense.io.mesh_files import tet_values
-from femsense.io.tables import Schema
-
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+from femsense.io.tables import Schema, Vector
 
 
 class RegionTable(Schema):

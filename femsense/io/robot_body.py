@@ -29,10 +29,9 @@ from femsense.io.robot_tables import (
     MarkerTable,
     MeshTable,
     RobotTable,
-    at_key,
     plain_dictionary,
 )
-from femsense.io.tables import beside
+from femsense.io.tables import at_key, beside
 from femsense.model.body_doubts import doubts_of_body
 from femsense.model.plausibility import warn_of
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
@@ -46,7 +45,7 @@ FAR_MARKER = 1.0
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
 INSIDE = 2
-"""A node counts as inside a box up to so many units in the last place of the bound (which is where rounding of units ends)."""
+"""A node counts as inside a box up to this number of units in the last place of the bound, the rounding error of a change of units."""
 
 
 def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robot:
@@ -137,6 +136,20 @@ def nodes_within(nodes: FloatArray, low: FloatArray, high: FloatArray) -> BoolAr
     """Return which nodes (n, 3) are inside a box, its boundary included, shape (n,)."""
     slack_low, slack_high = INSIDE * np.spacing(np.abs(low)), INSIDE * np.spacing(np.abs(high))
     return np.asarray(((nodes >= low - slack_low) & (nodes <= high + slack_high)).all(axis=1))
+
+
+def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> list[FloatArray]:
+    """Return boxes [m], each of shape (2, 3), that hold the nodes `held` and no other: one where that works, else one a node.
+
+    Arguments:
+        nodes: shape (n, 3) [m].
+        held: their indices.
+        slack: the boxes reach this far beyond them [m].
+    """
+    low, high = nodes[held].min(axis=0) - slack, nodes[held].max(axis=0) + slack
+    if nodes_within(nodes, low, high).sum() == len(held):
+        return [np.array([low, high])]
+    return [np.array([point - slack, point + slack]) for point in nodes[held]]
 
 
 def mesh_diagonal(nodes: FloatArray) -> float:

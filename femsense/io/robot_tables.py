@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,18 +10,15 @@ import numpy as np
 from pydantic import Field, StringConstraints, model_validator
 
 from femsense.core.errors import InputError
-from femsense.core.pose import check_pose
-from femsense.core.text import did_you_mean, key_path, short
+from femsense.core.text import did_you_mean, short
 from femsense.io.materials import POISSON_RATIO, silicone
 from femsense.io.regions import RegionTable
-from femsense.io.tables import LengthUnit, Schema, schema_problems
+from femsense.io.tables import LengthUnit, Matrix, Schema, Vector, at_key, doubles, pose_problems, schema_problems
 from femsense.model.effects import EFFECT_NAMES
 
 FORMAT = "femsense-robot-1"
 Share = Annotated[float, Field(ge=0, le=1)]
 Colour = Annotated[list[Share], Field(min_length=3, max_length=3)]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 Name = Annotated[str, StringConstraints(pattern=r'^[^\s,;"]([^,;"\r\n\t]*[^\s,;"])?$')]
 NAME = "a name without commas, semicolons and quotes"
 POINT = "three numbers in metres [x, y, z]"
@@ -139,50 +136,30 @@ class RobotTable(Schema):
 def robot_problems(document: dict[str, Any], path: Path) -> list[InputError]:
     """Return everything that is wrong with the tables of a robot.toml, before the mesh is read."""
     problems = schema_problems(RobotTable, document, path)
-    return problems or table_problems(RobotTable.model_validate(document), path)
+    return problems or list(table_problems(RobotTable.model_validate(document), path))
 
 
-def table_problems(table: RobotTable, path: Path) -> list[InputError]:
-    """Return what single keys cannot show: double names, limits the wrong way round, no rotation, unknown effects."""
-    problems: list[InputError] = []
-    named: list[tuple[str, Sequence[CableTable | ChamberTable | MarkerTable]]]
-    named = [("cables", table.cables), ("chambers", table.chambers), ("markers", table.markers)]
-    for kind, items in named:
-        problems += _double_names(kind, [item.name for item in items], path)
+def table_problems(table: RobotTable, path: Path) -> Iterator[InputError]:
+    """Yield the problems that single keys do not show: double names, reversed limits, no rotation, unknown effects."""
+    yield from doubles([cable.name for cable in table.cables], "name", path, "cables", "name")
+    yield from doubles([chamber.name for chamber in table.chambers], "name", path, "chambers", "name")
+    yield from doubles([marker.name for marker in table.markers], "name", path, "markers", "name")
     for i, box in enumerate(table.fixed):
         low, high = np.asarray(box.box_m)
         if (low > high).any():
-            problems.append(
-                InputError(
-                    "the corners of the box are not in order",
-                    where=at_key(path, "fixed", i, "box_m"),
-                    found=box.box_m,
-                    expected="[smallest x, y, z], then [largest x, y, z]",
-                )
+            yield InputError(
+                "the corners of the box are not in order",
+                where=at_key(path, "fixed", i, "box_m"),
+                found=box.box_m,
+                expected="[smallest x, y, z], then [largest x, y, z]",
             )
-    tags = [marker.aruco_id for marker in table.markers]
-    for i, tag in enumerate(tags):
-        if tag is not None and tag in tags[:i]:
-            problems.append(
-                InputError(
-                    "a tag stands twice",
-                    where=at_key(path, "markers", i, "aruco_id"),
-                    found=tag,
-                    expected="each tag once",
-                    hint=f"markers[{tags.index(tag)}] has it too",
-                )
-            )
+    yield from doubles([marker.aruco_id for marker in table.markers], "tag", path, "markers", "aruco_id")
     for i, cable in enumerate(table.cables):
-        problems += _cable_problems(cable, i, path)
+        yield from _cable_problems(cable, i, path)
     for i, entry in enumerate(table.effects):
-        problems += _effect_problems(entry, i, path)
-    problems += _dictionary_problems(table.appearance.aruco_dictionary, path)
-    if table.mesh.T_robot_mesh is not None:
-        try:
-            check_pose(table.mesh.T_robot_mesh, at_key(path, "mesh", "T_robot_mesh"))
-        except InputError as problem:
-            problems.append(problem)
-    return problems
+        yield from _effect_problems(entry, i, path)
+    yield from _dictionary_problems(table.appearance.aruco_dictionary, path)
+    yield from pose_problems(table.mesh.T_robot_mesh, at_key(path, "mesh", "T_robot_mesh"))
 
 
 DICTIONARIES = (
@@ -203,72 +180,38 @@ def plain_dictionary(name: str) -> str:
     return next((known for known in DICTIONARIES if known.upper() == bare), name)
 
 
-def _dictionary_problems(name: str, path: Path) -> list[InputError]:
-    if plain_dictionary(name) in DICTIONARIES:
-        return []
-    where = at_key(path, "appearance", "aruco_dictionary")
-    hint = did_you_mean(name, DICTIONARIES)
-    return [InputError("unknown dictionary of tags", where=where, found=repr(name), expected=" | ".join(DICTIONARIES), hint=hint)]
+def _dictionary_problems(name: str, path: Path) -> Iterator[InputError]:
+    if plain_dictionary(name) not in DICTIONARIES:
+        yield InputError(
+            "unknown dictionary of tags",
+            where=at_key(path, "appearance", "aruco_dictionary"),
+            found=repr(name),
+            expected=" | ".join(DICTIONARIES),
+            hint=did_you_mean(name, DICTIONARIES),
+        )
 
 
-def _double_names(kind: str, names: Sequence[str], path: Path) -> list[InputError]:
-    problems = []
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            hint = f"{kind}[{names.index(name)}] has it too"
-            problems.append(
-                InputError(
-                    "a name stands twice",
-                    where=at_key(path, kind, i, "name"),
-                    found=repr(name),
-                    expected="each name once",
-                    hint=hint,
-                )
-            )
-    return problems
-
-
-def _cable_problems(cable: CableTable, i: int, path: Path) -> list[InputError]:
-    problems = []
+def _cable_problems(cable: CableTable, i: int, path: Path) -> Iterator[InputError]:
     if not cable.min_tension_n <= cable.max_tension_n:
-        problems.append(
-            InputError(
-                "the least tension is above the largest",
-                where=at_key(path, "cables", i, "min_tension_n"),
-                found=f"min {cable.min_tension_n} N, max {cable.max_tension_n} N",
-                expected="min_tension_n ≤ max_tension_n",
-            )
+        yield InputError(
+            "the least tension is above the largest",
+            where=at_key(path, "cables", i, "min_tension_n"),
+            found=f"min {cable.min_tension_n} N, max {cable.max_tension_n} N",
+            expected="min_tension_n ≤ max_tension_n",
         )
     if cable.exit_direction is not None and not np.any(cable.exit_direction):
-        problems.append(
-            InputError(
-                "has no length",
-                where=at_key(path, "cables", i, "exit_direction"),
-                found=cable.exit_direction,
-                expected="a direction [x, y, z] that is not zero",
-            )
+        yield InputError(
+            "has no length",
+            where=at_key(path, "cables", i, "exit_direction"),
+            found=cable.exit_direction,
+            expected="a direction [x, y, z] that is not zero",
         )
-    return problems
 
 
-def _effect_problems(entry: Mapping[str, Any], i: int, path: Path) -> list[InputError]:
-    where = at_key(path, "effects", i, "name")
-    expected = " | ".join(EFFECT_NAMES)
+def _effect_problems(entry: Mapping[str, Any], i: int, path: Path) -> Iterator[InputError]:
+    where, expected = at_key(path, "effects", i, "name"), " | ".join(EFFECT_NAMES)
     if "name" not in entry:
-        return [InputError("a required key is missing", where=where, found="nothing", expected=expected)]
-    if entry["name"] not in EFFECT_NAMES and "file" not in entry:
-        return [
-            InputError(
-                "unknown effect",
-                where=where,
-                found=short(entry["name"]),
-                expected=expected,
-                hint=did_you_mean(str(entry["name"]), EFFECT_NAMES),
-            )
-        ]
-    return []
-
-
-def at_key(path: Path, *location: int | str) -> str:
-    """Return the place of a key in a file, for messages."""
-    return f"{path}: {key_path(location)}"
+        yield InputError("a required key is missing", where=where, found="nothing", expected=expected)
+    elif entry["name"] not in EFFECT_NAMES and "file" not in entry:
+        hint = did_you_mean(str(entry["name"]), EFFECT_NAMES)
+        yield InputError("unknown effect", where=where, found=short(entry["name"]), expected=expected, hint=hint)

@@ -15,15 +15,14 @@ import numpy as np
 import femsense
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
-from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 from femsense.fem.mesh import TetMesh
 from femsense.io.correction_file import read_correction, write_correction
 from femsense.io.files import plain, write_beside, write_toml
 from femsense.io.mesh_files import mesh_companions, write_mesh
-from femsense.io.robot_body import build_robot, nodes_within
-from femsense.io.robot_tables import FORMAT, RobotTable, at_key, robot_problems, table_problems
-from femsense.io.tables import beside, read_toml, validated
+from femsense.io.robot_body import boxes_around, build_robot
+from femsense.io.robot_tables import FORMAT, RobotTable, robot_problems, table_problems
+from femsense.io.tables import at_key, beside, read_toml, validated
 from femsense.model.robot import MarkerLook, Robot, plain_actuation
 
 # Loading
@@ -123,7 +122,7 @@ def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Ro
 def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write robot.toml and a copy of the mesh file, so that the folder loads back to the same robot.
 
-    A robot that was loaded is written as it was declared; what was changed in Python since then must be said by `effects`. Its correction goes along.
+    A robot that was loaded is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
 
     Arguments:
         robot: the robot.
@@ -182,7 +181,9 @@ def _declared(robot: Robot) -> dict[str, Any]:
     }
     if body.gravity.any():
         document["gravity"] = {"vector_m_s2": body.gravity.tolist()}
-    document["fixed"] = [{"box_m": box} for box in _clamp_boxes(body)]
+    if not len(body.clamped):
+        raise InputError("the body has no clamp", where="robot", expected="clamped nodes")
+    document["fixed"] = [{"box_m": box.tolist()} for box in boxes_around(body.mesh.nodes, body.clamped)]
     document["cables"] = [_cable_document(cable, body.mesh) for cable in body.cables]
     document["chambers"] = [{"name": c.name, "seed_m": c.seed.tolist(), "max_pressure_pa": c.max_pressure} for c in body.chambers]
     looks = {look.name: look for look in robot.marker_looks}
@@ -233,19 +234,6 @@ def _check_plain(robot: Robot) -> None:
             expected="the plain model",
             hint="save the plain robot and pass effects=[…]",
         )
-
-
-def _clamp_boxes(body: BodyModel) -> list[list[list[float]]]:
-    """Return boxes that hold the clamped nodes and no other: one where that works, else one a node."""
-    nodes = body.mesh.nodes
-    clamped = nodes[body.clamped]
-    if not len(clamped):
-        raise InputError("the body has no clamp", where="robot", expected="clamped nodes")
-    low, high = clamped.min(axis=0), clamped.max(axis=0)
-    hits = nodes_within(nodes, low, high)
-    if hits.sum() == len(clamped):
-        return [[low.tolist(), high.tolist()]]
-    return [[point.tolist(), point.tolist()] for point in clamped]
 
 
 def _cable_document(cable: Cable, mesh: TetMesh) -> dict[str, Any]:

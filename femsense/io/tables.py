@@ -9,18 +9,20 @@ import tomllib
 import types
 import typing
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
+from femsense.core.pose import check_pose
 from femsense.core.text import did_you_mean, key_path, plain_name, short
 from femsense.core.units import PER_METRE, length_unit
+from femsense.io.text_numbers import plain_number
 
 
 def _usual_unit(value: object) -> object:
@@ -33,6 +35,10 @@ LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
 """A unit of lengths in files, in any spelling."""
 
 
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
+
+
 class Schema(BaseModel):
     """Base of the tables of a TOML file: unknown keys, wrong types and numbers that are not finite are refused."""
 
@@ -40,6 +46,38 @@ class Schema(BaseModel):
 
 
 T = TypeVar("T")
+
+
+def at_key(path: Path, *location: int | str) -> str:
+    """Return the place of a key in a file, for messages."""
+    return f"{path}: {key_path(location)}"
+
+
+def doubles(values: Sequence[object], what: str, path: Path, kind: str, key: str) -> Iterator[InputError]:
+    """Yield a problem for each value that a table before has too; None is no value.
+
+    Arguments:
+        values: of one key of each of the tables `kind` of the file at `path`.
+        what: the name of the value in messages.
+    """
+    for i, value in enumerate(values):
+        if value is not None and value in values[:i]:
+            yield InputError(
+                f"a {what} stands twice",
+                where=at_key(path, kind, i, key),
+                found=repr(value),
+                expected=f"each {what} once",
+                hint=f"{kind}[{values.index(value)}] has it too",
+            )
+
+
+def pose_problems(pose: Any, where: str) -> Iterator[InputError]:
+    """Yield the problem of a matrix that is no pose; none of None."""
+    try:
+        if pose is not None:
+            check_pose(pose, where)
+    except InputError as problem:
+        yield problem
 
 
 # TOML
@@ -165,7 +203,7 @@ def schema_problems(schema: type[Any], document: Any, path: Path) -> list[InputE
 def _problem(schema: type[Any], item: Any, path: Path) -> InputError:
     """Translate one finding of pydantic."""
     location = tuple(item["loc"])
-    where = f"{path}: {key_path(location)}" if location else str(path)
+    where = at_key(path, *location) if location else str(path)
     kind = item["type"]
     if kind == "extra_forbidden":
         known = list(_keys_at(schema, location[:-1]))
@@ -286,31 +324,27 @@ class Table:
 
     def _column(self, column: str, empty_is_nan: bool) -> FloatArray:
         cells = self.text(column)
-        if empty_is_nan:
-            filled = [cell or "nan" for cell in cells]
-            allowed = np.array([not cell for cell in cells], dtype=bool)
-        else:
-            filled, allowed = list(cells), np.zeros(len(cells), dtype=bool)
-        try:
-            values = np.array([float(cell) for cell in filled], dtype=np.float64)
-        except ValueError:
-            raise self._not_a_number(column, filled) from None
-        bad = np.flatnonzero(~np.isfinite(values) & ~allowed)
-        if len(bad):
+        numbers = [np.nan if empty_is_nan and not cell else plain_number(cell) for cell in cells]
+        bad = next((row for row, number in enumerate(numbers) if number is None), None)
+        if bad is not None:
+            raise InputError(
+                "not a number",
+                where=self.place(bad, column),
+                found=cells[bad] or "an empty cell",
+                expected="a number",
+                hint="decimal points, not commas" if "," in cells[bad] else None,
+            )
+        values = np.array(numbers, dtype=np.float64)
+        odd = next((row for row in np.flatnonzero(~np.isfinite(values)).tolist() if cells[row] or not empty_is_nan), None)
+        if odd is not None:
             raise InputError(
                 "not a finite number",
-                where=self.place(bad[0], column),
-                found=cells[bad[0]],
+                where=self.place(odd, column),
+                found=cells[odd],
                 expected="a finite number",
                 hint="leave the row out where nothing was measured",
             )
         return values
-
-    def _not_a_number(self, column: str, cells: Sequence[str]) -> InputError:
-        row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        found = cells[row] or "an empty cell"
-        hint = "decimal points, not commas" if "," in found else None
-        return InputError("not a number", where=self.place(row, column), found=found, expected="a number", hint=hint)
 
 
 def read_csv(path: Path, *, required: Sequence[str], optional: Sequence[str] = (), prefixes: Sequence[str] = ()) -> Table:
@@ -369,11 +403,3 @@ def _check_header(
     missing = [column for column in required if column not in columns]
     if missing:
         raise InputError("columns are missing", where=where, found=", ".join(columns), expected=", ".join(missing))
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from itertools import product
 
 BLANKS = " \u00a0\u202f\u2009'’"
-"""What stands between thousands where neither a comma nor a point does."""
+"""Marks between thousands other than comma and point."""
 GROUPED = re.compile(
     rf"([-+]?\d{{1,3}})((?P<mark>[.,{BLANKS}])\d{{3}}(?:(?P=mark)\d{{3}})*)(?P<rest>[.,]\d+)?(?P<power>[eE][-+]?\d+)?"
 )
@@ -38,7 +38,7 @@ TIMES_READ = (
 
 @dataclass(frozen=True, slots=True)
 class Notation:
-    """How a table writes its numbers."""
+    """Notation of the numbers of a table."""
 
     decimal: str = "."
     """"." or ","."""
@@ -95,14 +95,22 @@ def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
     return Notation(default, grouped, votes[","] > 0 or (default == "," and any("," in cell for cell in cells)))
 
 
-def number_in(cell: str) -> float | None:
-    """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
-    the seconds since midnight; None for all else."""
+def plain_number(cell: str) -> float | None:
+    """Return the number that Python reads in a cell; None where it is none."""
     try:
         return float(cell)
     except ValueError:
-        fortran = FORTRAN.match(cell)
-        return float(f"{fortran[1]}e{fortran[2]}") if fortran and fortran[1].strip(" +-.") else moment_in(cell)
+        return None
+
+
+def number_in(cell: str) -> float | None:
+    """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
+    the seconds since midnight; None for all else."""
+    number = plain_number(cell)
+    if number is not None:
+        return number
+    fortran = FORTRAN.match(cell)
+    return float(f"{fortran[1]}e{fortran[2]}") if fortran and fortran[1].strip(" +-.") else moment_in(cell)
 
 
 def moment_in(cell: str) -> float | None:
@@ -126,11 +134,6 @@ def moment_in(cell: str) -> float | None:
             return None
         moment = found
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
-def is_time_of_day(cell: str) -> bool:
-    """Whether a cell holds a time without a date."""
-    return CLOCK.fullmatch(cell.strip()) is not None
 
 
 def _time_of_day(hours: str | None, minutes: str, seconds: str, half: str | None) -> float | None:

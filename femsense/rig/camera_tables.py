@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from femsense.io.robot_tables import Matrix, Share, Vector
-from femsense.io.tables import Schema
+from femsense.io.robot_tables import Share
+from femsense.io.tables import Matrix, Schema, Vector
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

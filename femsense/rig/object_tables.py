@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from femsense.io.robot_tables import Share, Vector
-from femsense.io.tables import Schema
+from femsense.io.robot_tables import Share
+from femsense.io.tables import Schema, Vector
 
 COLOR = "three numbers from 0 to 1: [red, green, blue]"
 PLACE = "three numbers in metres [x, y, z], on the surface at rest, robot frame"

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, key_path
-from femsense.io.robot_tables import Share, Vector
-from femsense.io.tables import Schema, read_toml, validated
+from femsense.io.robot_tables import Share
+from femsense.io.tables import Schema, Vector, read_toml, validated
 from femsense.rig.camera_tables import NoiseTable, ViewTable
 from femsense.rig.object_tables import COLOR, PLACE, Color, ContactTable, NotNegative, ObjectTable, Positive
 from femsense.rig.sensors import SensorTable

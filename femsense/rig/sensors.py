@@ -20,8 +20,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, embed_points
 from femsense.io.files import write_csv
-from femsense.io.robot_tables import Vector
-from femsense.io.tables import Schema
+from femsense.io.tables import Schema, Vector
 
 COLOURS = ("red", "green", "blue")
 DIGITS = 9

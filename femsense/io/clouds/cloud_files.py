@@ -10,7 +10,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.pcd import pcd_viewpoint, read_pcd_fields
-from femsense.io.clouds.ply import ply_viewpoint, read_ply_vertices
+from femsense.io.clouds.ply import ply_viewpoint, read_ply_vertices, write_ply
 from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.pointcloud.cloud import PointCloud
 
@@ -34,7 +34,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     _check_suffix(file, CLOUD_ENDINGS)
     readers = {".pcd": read_pcd_fields, ".ply": read_ply_vertices, ".xyz": read_xyz_columns}
     fields = readers[file.suffix.lower()](file)
-    return _cloud_of_fields(fields, file)
+    return cloud_of_fields(fields, file)
 
 
 def viewpoint_doubt(path: str | Path) -> str | None:
@@ -56,7 +56,7 @@ def viewpoint_doubt(path: str | Path) -> str | None:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write a cloud as binary PLY or PCD (PCD keeps single precision, colours become bytes).
+    """Write a cloud as binary PLY or PCD; colours become bytes, PCD keeps single precision.
 
     Raises:
         InputError: another suffix, or a place that cannot be written.
@@ -65,6 +65,9 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
     _check_suffix(file, _WRITTEN)
     if not file.parent.is_dir():
         raise InputError("no such folder", where=file.parent, expected="a folder that exists")
+    if file.suffix.lower() == ".ply":
+        write_ply(file, cloud)
+        return
     import open3d as o3d
 
     data = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.copy()))
@@ -86,28 +89,37 @@ def _check_suffix(file: Path, known: tuple[str, ...]) -> None:
         )
 
 
-def _cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> PointCloud:
+def cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], where: str | Path | None) -> PointCloud:
+    """Return the cloud of columns of shape (n,) by their names; points that are not finite are left out.
+
+    Arguments:
+        fields: x, y, z; colours as rgb or rgba packed in one number, or red, green, blue.
+        where: the file, for messages.
+
+    Raises:
+        InputError: no x, y or z, or colours that are not understood.
+    """
     missing = [name for name in "xyz" if name not in fields]
     if missing:
-        raise InputError("fields are missing", where=file, found=", ".join(fields), expected="x, y, z")
+        raise InputError("fields are missing", where=where, found=", ".join(fields), expected="x, y, z")
     points = np.stack([fields[name].astype(np.float64) for name in "xyz"], axis=1)
     finite = np.isfinite(points).all(axis=1)
-    colors = _field_colors({name.lower(): column for name, column in fields.items()}, file)
+    colors = _field_colors({name.lower(): column for name, column in fields.items()}, where)
     return PointCloud(points[finite], None if colors is None else colors[finite])
 
 
-def _field_colors(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> FloatArray | None:
+def _field_colors(fields: dict[str, npt.NDArray[np.generic]], where: str | Path | None) -> FloatArray | None:
     """Return colours (n, 3) in 0 … 1: packed in one number, three of one field, or three columns. Raises InputError."""
     packed = fields.get("rgba", fields.get("rgb"))
     if packed is not None:
-        return _unpacked(packed) if packed.ndim == 1 else _scaled(packed[:, :3], file)
+        return _unpacked(packed) if packed.ndim == 1 else _scaled(packed[:, :3], where)
     for names in _COLOR_NAMES:
         if all(name in fields for name in names):
-            return _scaled(np.stack([fields[name] for name in names], axis=1), file)
+            return _scaled(np.stack([fields[name] for name in names], axis=1), where)
     return None
 
 
-def _scaled(columns: npt.NDArray[np.generic], file: Path) -> FloatArray:
+def _scaled(columns: npt.NDArray[np.generic], where: str | Path | None) -> FloatArray:
     """Return colours in 0 … 1, by the type of whole numbers, or by the largest value: up to 1, 255 or 65535."""
     colors = columns.astype(np.float64)
     if not colors.size:
@@ -120,7 +132,7 @@ def _scaled(columns: npt.NDArray[np.generic], file: Path) -> FloatArray:
     limit = next((limit for limit in limits if high <= limit), None)
     if low < 0 or limit is None:
         raise InputError(
-            "colours that are not understood", where=file, found=f"{low:g} … {high:g}", expected="0 … 1, 0 … 255 or 0 … 65535"
+            "colours that are not understood", where=where, found=f"{low:g} … {high:g}", expected="0 … 1, 0 … 255 or 0 … 65535"
         )
     return np.nan_to_num(colors) / limit
 

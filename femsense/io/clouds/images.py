@@ -13,43 +13,51 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.model.camera import Camera
 
+PNG, JPEG, JPEG_END = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd9"
+"""Marks of the formats; a JPEG may have zeros behind its end."""
+
 
 def read_png(path: Path) -> npt.NDArray[Any]:
-    """Return a PNG image as it is: shape (H, W), or (H, W, 3) in the order blue, green, red.
-
-    Raises InputError where it is broken.
-    """
-    import cv2
-
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError("cannot be read", where=path, found=error.strerror) from None
-    _check_png(data, path)
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError("not readable as an image", where=path, found=f"{len(data)} bytes", expected="a PNG image")
-    return np.asarray(image)
+    """Return an image file as it is: shape (H, W), or (H, W, 3) in the order blue, green, red. Raises InputError."""
+    return _decoded(_bytes_of(path), path)
 
 
 def read_color(path: Path) -> FloatArray:
-    """Return a colour image in 0 … 1, shape (H, W, 3), red first; grey becomes three equal ones. Raises InputError."""
-    image = read_png(path) if path.suffix.lower() == ".png" else _read_jpeg(path)
+    """Return a colour image in 0 … 1, shape (H, W, 3), red first; grey becomes three equal channels. Raises InputError."""
+    image = decoded_image(_bytes_of(path), path)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("not a colour image", where=path, found=str(image.dtype), expected="8 or 16 bits a channel")
-    top = 255.0 if image.dtype == np.uint8 else 65535.0
-    rgb = np.stack([image] * 3, axis=2) if image.ndim == 2 else image[:, :, 2::-1]
-    return np.asarray(rgb / top, dtype=np.float64)
+    rgb = np.stack([image] * 3, axis=2) if image.ndim == 2 else image
+    return np.asarray(rgb / np.iinfo(image.dtype).max, dtype=np.float64)
 
 
-def _read_jpeg(path: Path) -> npt.NDArray[Any]:
+def decoded_image(data: bytes, where: str | Path | None) -> npt.NDArray[Any]:
+    """Return a PNG or JPEG as it is: (H, W) or (H, W, 3) with red first. Raises InputError where it is broken."""
+    image = _decoded(data, where)
+    return image if image.ndim == 2 else image[:, :, 2::-1]
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("cannot be read", where=path, found=error.strerror) from None
+
+
+def _decoded(data: bytes, where: str | Path | None) -> npt.NDArray[Any]:
     import cv2
 
-    data = path.read_bytes()
-    whole = data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+    if data.startswith(PNG):
+        _check_png(data, where)
+    cut = data.startswith(JPEG) and JPEG_END not in data[-64:]
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data and not cut else None
     if image is None:
-        raise InputError("a broken image", where=path, found=f"{len(data)} bytes", expected="a whole JPEG image")
+        raise InputError(
+            "a broken image",
+            where=where,
+            found=f"{len(data)} bytes that begin {data[:8]!r}",
+            expected="a whole PNG or JPEG image",
+        )
     return np.asarray(image)
 
 
@@ -57,7 +65,7 @@ def png_header(path: Path) -> tuple[int, int, int, int] | None:
     """Return (width, height, bits a channel, colour type) of a PNG image; None where the file is none."""
     with path.open("rb") as stream:
         head = stream.read(26)
-    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+    if len(head) < 26 or not head.startswith(PNG) or head[12:16] != b"IHDR":
         return None
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"), head[24], head[25]
 
@@ -74,10 +82,10 @@ def check_image_size(width: int, height: int, camera: Camera, file: Path) -> Non
         )
 
 
-def _check_png(data: bytes, path: Path) -> None:
+def _check_png(data: bytes, where: str | Path | None) -> None:
     """Refuse a PNG that is cut off or damaged: decoders return such images half filled."""
-    position = 8
-    while data[:8] == b"\x89PNG\r\n\x1a\n" and position + 12 <= len(data):
+    position = len(PNG)
+    while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
         end = position + 12 + length
         body, mark = data[position + 4 : end - 4], data[end - 4 : end]
@@ -88,7 +96,7 @@ def _check_png(data: bytes, path: Path) -> None:
         position = end
     raise InputError(
         "a broken image",
-        where=path,
+        where=where,
         found=f"damaged or cut off at byte {position} of {len(data)}",
         expected="a whole PNG image",
         hint="leave the file out: the frame then has no cloud",

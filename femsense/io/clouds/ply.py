@@ -17,6 +17,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.pose import make_pose
+from femsense.pointcloud.cloud import PointCloud
 
 Column = npt.NDArray[np.generic]
 
@@ -74,34 +75,42 @@ def read_ply_vertices(path: str | Path) -> dict[str, Column]:
         raise InputError(
             "lists in or before the vertices", where=file, found="property list", expected="vertices of plain numbers first"
         )
-    vertex = elements[index]
     _warn_of_more(storage, elements, body, file)
-    if storage == "ascii":
-        return _read_ascii(body, sum(element.count for element in elements[:index]), vertex, file)
-    order = _ORDERS[storage]
-    return _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in elements[:index]), vertex, order, file)
+    return _columns(storage, elements, index, body, file)
 
 
 def ply_viewpoint(path: str | Path) -> FloatArray | None:
-    """Return where an element `camera`, as PCL writes it, says that the sensor stood: T_cloud_sensor, shape (4, 4), in the file's unit;
-    None where there is none or it is the origin. Raises InputError."""
+    """Return where an element `camera`, as PCL writes it, places the sensor: T_cloud_sensor, shape (4, 4), in the file's unit.
+
+    None where there is none or it is the origin. Raises InputError.
+    """
     file = Path(path)
     storage, elements, body = _parse(file.read_bytes(), file)
     index = next((i for i, element in enumerate(elements) if element.name == "camera" and element.count), None)
     if index is None or not all(element.regular for element in elements[: index + 1]):
         return None
-    camera, before = elements[index], elements[:index]
-    if storage == "ascii":
-        row = _read_ascii(body, sum(element.count for element in before), camera, file)
-    else:
-        order = _ORDERS[storage]
-        row = _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in before), camera, order, file)
+    row = _columns(storage, elements, index, body, file)
     keys = [f"{axis}_axis{part}" for part in "xyz" for axis in "xyz"]
     if not {"view_px", "view_py", "view_pz", *keys} <= set(row):
         return None
     R = np.array([float(row[key][0]) for key in keys]).reshape(3, 3)
     T = make_pose(R, [float(row[f"view_p{axis}"][0]) for axis in "xyz"])
     return None if np.allclose(T, np.eye(4), atol=1e-9) else T
+
+
+def write_ply(path: Path, cloud: PointCloud) -> None:
+    """Write a cloud as binary PLY: single precision where that loses nothing, colours as bytes."""
+    short = bool(np.array_equal(cloud.points.astype(np.float32).astype(np.float64), cloud.points))
+    columns = {axis: ("float" if short else "double", cloud.points[:, i]) for i, axis in enumerate("xyz")}
+    if cloud.colors is not None:
+        columns |= {name: ("uchar", np.rint(255.0 * cloud.colors[:, i])) for i, name in enumerate(("red", "green", "blue"))}
+    vertex = _Element("vertex", len(cloud), tuple((name, kind) for name, (kind, _) in columns.items()))
+    rows = np.empty(len(cloud), dtype=vertex.row_type("<"))
+    for name, (_, values) in columns.items():
+        rows[name] = values
+    properties = [f"property {kind} {name}" for name, kind in vertex.properties]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header", ""]
+    path.write_bytes("\n".join(head).encode("ascii") + rows.tobytes())
 
 
 def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
@@ -156,14 +165,18 @@ def _short(file: Path, found: str, expected: str) -> InputError:
     return InputError("a broken or shortened PLY file", where=file, found=found, expected=expected)
 
 
-def _read_binary(body: bytes, start: int, vertex: _Element, order: str, file: Path) -> dict[str, Column]:
-    kind = vertex.row_type(order)
-    size = vertex.count * kind.itemsize
-    if len(body) < start + size:
+def _columns(storage: str, elements: list[_Element], index: int, body: bytes, file: Path) -> dict[str, Column]:
+    """Return the columns of an element without lists, which only such elements precede. Raises InputError."""
+    before, element = elements[:index], elements[index]
+    if storage == "ascii":
+        return _read_ascii(body, sum(other.count for other in before), element, file)
+    order = _ORDERS[storage]
+    kind, start = element.row_type(order), sum(other.count * other.row_type(order).itemsize for other in before)
+    if len(body) < start + element.count * kind.itemsize:
         whole = max(len(body) - start, 0) // max(kind.itemsize, 1)
-        raise _short(file, f"{whole} whole vertices", f"{vertex.count} vertices, as the header says")
-    rows = np.frombuffer(body, dtype=kind, count=vertex.count, offset=start)
-    return {name: np.ascontiguousarray(rows[name]) for name, _ in vertex.properties}
+        raise _short(file, f"{whole} whole vertices", f"{element.count} vertices, as the header says")
+    rows = np.frombuffer(body, dtype=kind, count=element.count, offset=start)
+    return {name: np.ascontiguousarray(rows[name]) for name, _ in element.properties}
 
 
 def _read_ascii(body: bytes, skip: int, vertex: _Element, file: Path) -> dict[str, Column]:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.io.text_numbers import plain_number
 
 SKIPPED = ("#", "//")
 DECIMAL_COMMA = re.compile(r"(?:[-+]?\d+,\d+(?:[eE][-+]?\d+)?|[-+]?\d+)")
@@ -33,9 +34,9 @@ def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
     told = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith(SKIPPED)]
     comma = "." if _has_decimal_commas(told[-1][1] if told else "") else " "
     rows = [(i, line.replace(",", comma).replace(";", " ").split()) for i, line in told]
-    if rows and (len(rows[0][1]) == 1 or not _is_number(rows[0][1][0])):
+    if rows and (len(rows[0][1]) == 1 or plain_number(rows[0][1][0]) is None):
         first, rows = rows[0][1], rows[1:]
-        if len(first) == 1 and _is_number(first[0]) and float(first[0]) != len(rows):
+        if len(first) == 1 and plain_number(first[0]) not in (None, len(rows)):
             raise InputError("a broken or shortened file", where=file, found=f"{len(rows)} points", expected=f"{first[0]} points")
     if not rows:
         return {name: np.zeros(0) for name in "xyz"}
@@ -55,7 +56,7 @@ def _has_decimal_commas(line: str) -> bool:
 
 def _table(rows: list[tuple[int, list[str]]], file: Path) -> FloatArray:
     width = len(rows[0][1])
-    bad = next(((i, row) for i, row in rows if len(row) != width or len(row) < 3 or not all(map(_is_number, row))), None)
+    bad = next(((i, row) for i, row in rows if len(row) != width or len(row) < 3 or None in map(plain_number, row)), None)
     if bad is not None:
         raise InputError(
             "not a line of a point",
@@ -69,11 +70,3 @@ def _table(rows: list[tuple[int, list[str]]], file: Path) -> FloatArray:
 def _is_color(values: FloatArray) -> bool:
     directions = np.abs(np.linalg.norm(values, axis=1) - 1.0) < 1e-2
     return bool((values >= 0).all() and not directions.all())
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -1,6 +1,7 @@
 """C3D files of motion capture (https://www.c3d.org): points over time, in the unit that the file names.
 
-Read here, one frame after the other: the readers that exist load the whole file.
+Read here, one frame after the other: `ezc3d` 1.7.2 loads the whole file, refuses numbers of big-endian machines and ends at frame
+65 535; `c3d` 0.6.0 reads no frame of a longer file.
 """
 
 from __future__ import annotations
@@ -13,30 +14,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Frame, Source, check_size, unit_of, upright
+from femsense.io.importers.frames import HEAD, Format, Source
+from femsense.io.importers.motion_capture import Row, capture_source, tracks_of
 from femsense.io.importers.options import Options
-from femsense.io.importers.tables.mapping import MARKER
 
 BLOCK = 512
 MOST = 65535
-"""The header cannot count farther; some writers stop there without the longer count of TRIAL."""
+"""Largest count of the header; some writers stop there without the longer count of TRIAL."""
 INTEL, DEC, MIPS = 84, 85, 86
 """The processors whose numbers a file holds: little-endian, VAX, big-endian."""
 
-NAMELESS = "*"
-"""Labels of tracks that nobody named begin so (Vicon Nexus)."""
 OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")
 """Parameters of POINT that name tracks which are no places: results of a model of the body."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Header:
-    """What a C3D file says of itself."""
+    """Header and parameters of a C3D file."""
 
     points: int
     analog: int
@@ -52,15 +50,15 @@ class Header:
     labels: tuple[str, ...]
     unit: str | None
     up: str | None
-    """The vertical axis as the file says it, such as "+Y"."""
+    """The vertical axis as the file has it, such as "+Y"."""
     outputs: frozenset[str] = frozenset()
     """Labels that are no places (angles, forces …)."""
     disagreements: tuple[str, ...] = ()
-    """Where header and parameters say different things."""
+    """Contradictions of header and parameters."""
 
 
 def open_c3d(path: Path, options: Options) -> Source:
-    """Return a C3D file as a source; points without a place (residual −1) are left out.
+    """Return a C3D file as a source.
 
     Raises:
         InputError: no C3D file, no points, shorter than it says and without a whole frame, a unit that nobody says.
@@ -78,38 +76,31 @@ def open_c3d(path: Path, options: Options) -> Source:
             found=f"{path.stat().st_size} bytes",
             expected=f"{header.frames} frames",
         )
-    chosen = _chosen_labels(header, options, path)
-    if not chosen:
+    kept = [k for k, label in enumerate(header.labels) if label not in header.outputs or label in options.topics]
+    if not kept:
         raise InputError(
             "no markers", where=path, found=f"results of a model only: {', '.join(header.labels)}", expected="tracks of markers"
         )
-    extent = _extent(path, header, whole, [k for k, _ in chosen])
-    scale = unit_of(options, header.unit, path, extent)
-    if header.points > 1:
-        check_size(scale * extent, path)
     notes = [f"the file is cut off: {whole} of {header.frames} frames"] if whole < header.frames else []
     notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
     notes += header.disagreements
     left_out = [name for name in header.labels if name in header.outputs]
     notes += [f"results of a model, which are no places, are left out: {', '.join(left_out)}"] if left_out else []
-    return Source(
-        "c3d",
+    tracks = tracks_of(header.labels)
+    return capture_source(
         path,
-        partial(_frames, path, header, whole, chosen, scale, options.up),
-        found={
-            "unit": header.unit or options.unit,
-            "up_in_file": header.up,
-            "up": options.up or "as in the file",
-            "frames_declared": header.frames,
-        },
+        [tracks[k] for k in kept],
+        partial(_rows, path, header, whole, kept),
+        options,
+        unit=header.unit,
+        found={"up_in_file": header.up, "frames_declared": header.frames},
         count=whole,
         notes=notes,
-        names=dict.fromkeys([*_without_subjects(header.labels), *header.labels], MARKER),
     )
 
 
 def list_c3d(path: Path) -> dict[str, Any]:
-    """Return what a C3D file says that it holds. Raises InputError."""
+    """Return the contents that a C3D file declares. Raises InputError."""
     header = read_c3d_header(path)
     source = open_c3d(path, Options(unit=None if header.unit else "mm"))
     points = [name for name in header.labels if name not in header.outputs]
@@ -195,19 +186,12 @@ def _texts(parameters: Parameters, name: str) -> list[str]:
     return found
 
 
-def _frames(
-    path: Path, header: Header, whole: int, chosen: list[tuple[int, str]], scale: float, up: str | None
-) -> Iterator[Frame]:
+def _rows(path: Path, header: Header, whole: int, kept: Sequence[int]) -> Iterator[Row]:
     size = _frame_size(header)
     with path.open("rb") as stream:
         stream.seek(header.data_at)
         for number in range(whole):
-            places, missing = _points(stream.read(size), header)
-            kept = {name: k for k, name in chosen if not missing[k]}
-            seen = dict(zip(kept, upright(scale * places[list(kept.values())], up)))
-            named = {name: place for name, place in seen.items() if not name.startswith(NAMELESS)}
-            unnamed = [place for name, place in seen.items() if name.startswith(NAMELESS)]
-            yield Frame(number / header.rate, markers=named, unlabelled=unnamed)
+            yield Row(number / header.rate, _points(stream.read(size), header)[kept], {})
 
 
 def _whole_frames(path: Path, header: Header) -> int:
@@ -227,55 +211,14 @@ def _frame_size(header: Header) -> int:
     return (4 * header.points + header.analog) * (4 if header.scale < 0 else 2)
 
 
-def _points(data: bytes, header: Header) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return the places in the file's unit (points, 3) and which are missing."""
+def _points(data: bytes, header: Header) -> FloatArray:
+    """Return the places in the file's unit, shape (points, 3); NaN where a point is missing (residual −1)."""
     values = _Numbers(header.processor)
     if header.scale < 0:
         table = values.reals(data[: 16 * header.points]).reshape(-1, 4)
-        places, residual = table[:, :3], table[:, 3]
-    else:
-        words = np.frombuffer(data[: 8 * header.points], dtype=values.i2).reshape(-1, 4)
-        places, residual = words[:, :3] * header.scale, words[:, 3].astype(np.float64)
-    missing = (residual < 0) | ~np.isfinite(places).all(axis=1) | (places == 0.0).all(axis=1)
-    return places.astype(np.float64), missing
-
-
-def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[int, str]]:
-    """Return the columns to take and their names; the same label twice gets a number.
-
-    The subject before a label (Finger:tip) goes, as in exports of CSV, but where another one has a marker of the same name.
-    """
-    short = _without_subjects(header.labels)
-    for wanted in options.topics:
-        if wanted not in (*header.labels, *short):
-            raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
-    both = (
-        (k, pair)
-        for k, pair in enumerate(zip(header.labels, short))
-        if pair[0] not in header.outputs or pair[0] in options.topics
-    )
-    taken = [(k, pair) for k, pair in both if not options.topics or any(name in options.topics for name in pair)]
-    wanted_names = options.columns
-    renamed = [(k, wanted_names.get(a, wanted_names.get(b, b)).removeprefix("marker.")) for k, (a, b) in taken]
-    seen: dict[str, int] = {}
-    result = []
-    for k, name in renamed:
-        seen[name] = seen.get(name, 0) + 1
-        result.append((k, name if seen[name] == 1 else f"{name}_{seen[name]}"))
-    return result
-
-
-def _without_subjects(labels: Sequence[str]) -> list[str]:
-    bare = [label.rpartition(":")[2] for label in labels]
-    return [name if name and bare.count(name) == 1 else label for label, name in zip(labels, bare)]
-
-
-def _extent(path: Path, header: Header, whole: int, chosen: Sequence[int]) -> float:
-    with path.open("rb") as stream:
-        stream.seek(header.data_at)
-        seen = [_points(stream.read(_frame_size(header)), header) for _ in range(min(whole, 10))]
-    values = np.concatenate([places[chosen][~missing[chosen]] for places, missing in seen])
-    return float(np.ptp(values, axis=0).max()) if len(values) else 0.0
+        return np.where(table[:, 3:] < 0, np.nan, table[:, :3])
+    words = np.frombuffer(data[: 8 * header.points], dtype=values.i2).reshape(-1, 4)
+    return np.where(words[:, 3:] < 0, np.nan, words[:, :3] * header.scale)
 
 
 # Parameters
@@ -384,3 +327,10 @@ def _text(value: Any) -> str | None:
 
 def _up(parameters: Parameters) -> str | None:
     return _text(parameters.get(("POINT", "Y_SCREEN")))
+
+
+def _is_c3d(path: Path, head: bytes) -> bool:
+    return path.is_file() and (path.suffix.lower() == ".c3d" or (len(head) == HEAD and head[0] == 2 and head[1] == 0x50))
+
+
+C3D = Format("c3d", open_c3d, _is_c3d, ("--clock", "--rate"), list_c3d, (".c3d",))

@@ -1,68 +1,41 @@
-"""What an importer hands on: a source that says what it holds, and its frames one after the other."""
+"""The types of an importer: a source with its frames, the options of a user, and the declaration of a format."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.units import length_unit
 from femsense.io.importers.options import UNITS, Options
+from femsense.io.importers.tables.mapping import Becomes
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
 SMALLEST, LARGEST = 2e-3, 100.0
 """Scenes of motion capture are between these sizes [m]: ten times less than a finger's markers span, ten times a large hall."""
 FARTHEST = 15.0
 """Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
-MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
+HEAD = 512
+"""Bytes at the beginning of a file by which formats are recognised."""
+BROWN = "brown_conrady"
 DepthImage = npt.NDArray[np.uint16]
 ColorImage = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lens:
-    """A camera's lens; the centre of the first pixel is (0, 0)."""
-
-    width: int
-    """[px]."""
-    height: int
-    """[px]."""
-    fx: float
-    """[px]."""
-    fy: float
-    """[px]."""
-    cx: float
-    """[px]."""
-    cy: float
-    """[px]."""
-    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
-    """OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; kannala_brandt: k1 … k4. Shape (n,)."""
-    model: str = "brown_conrady"
-    """One of MODELS."""
-
-    @property
-    def storable(self) -> bool:
-        """Whether a depth image of this lens is kept as an image.
-
-        What the RealSense SDK calls inverse is not what OpenCV's polynomial taken backwards gives (20 mm at 1 m with its usual
-        coefficients): such images become clouds, which nobody can misread.
-        """
-        return not np.any(self.distortion != 0.0) or self.model != "inverse_brown_conrady"
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Images:
-    """What a depth camera gives in one frame."""
+    """Images of a depth camera in one frame."""
 
     depth: DepthImage
-    """Units of the source's `depth_unit_m`, 0 where there is none, shape (H, W)."""
+    """Units of the camera's `depth_unit`, 0 where there is none, shape (H, W)."""
     color: ColorImage | None = None
     """Red, green, blue, registered to the depth image, shape (H, W, 3)."""
 
@@ -89,45 +62,101 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
-    """What was found in a file or a folder."""
+    """Contents of a file or a folder, read frame by frame."""
 
-    format: str
-    """A name of `formats.FORMATS`."""
     path: Path
     frames: Callable[[], Iterator[Frame]]
     """Starts from the first frame at each call; a live source may go on for ever."""
     found: Mapping[str, Any] = field(default_factory=dict)
-    """What was found beyond the frames, for the report."""
-    lens: Lens | None = None
+    """Properties for the report, beyond the frames; None where one is not known."""
+    camera: Camera | None = None
     """Where pictures are depth images."""
-    depth_unit_m: float = 0.001
     actuation: str | None = None
     """"tension" or "displacement"; None where the source does not say."""
+    actuation_by_unit: bool = False
+    """Whether units of the file give the actuation, so that another one is an error."""
     count: int | None = None
     """Frames that are expected, where it is known."""
     notes: Sequence[str] = ()
-    """What a person should know before trusting it."""
+    """Assumptions and losses that the user should know."""
     T_robot_camera: FloatArray | None = None
     """Shape (4, 4), translation [m], where the source says it."""
     views: Mapping[str, Source] = field(default_factory=dict)
     """Camera → its own source, where several look; see `several.joined`."""
     free: Sequence[tuple[float, float]] = ()
     """See `Options.free`."""
-    names: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, Sequence[Becomes]] = field(default_factory=dict)
     """Name that `--map` may take → what it may become; see `mapping.check_names`."""
+    format: str = ""
+    """A name of `formats.FORMATS`, given by `Format.opened`."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Format:
+    """One format: each importer's module declares its own, and `formats` lists them."""
+
+    name: str
+    """As `--format` takes it."""
+    open: Callable[[Path, Options], Source]
+    recognises: Callable[[Path, bytes], bool]
+    """Called with a path and the first HEAD bytes of a file, none of a folder."""
+    unused: tuple[str, ...]
+    """Options that have no effect on it."""
+    list: Callable[[Path], dict[str, Any]] | None = None
+    """Returns the contents without reading frames; None: those of `open`."""
+    endings: tuple[str, ...] = ()
+    """Of files that nothing else has."""
+    topics: Callable[[Path], Iterable[str]] | None = None
+    """Names that `--topic` takes, where several captures share the option."""
+    columns: Callable[[Path], Iterable[str]] | None = None
+    """Names that `--map` takes, where a log of actuation or another capture shares the option."""
+    whole_depths: bool = False
+    """Whether its depth images count a unit that may be another: `--depth-unit`."""
+    transforms: bool = False
+    """Whether it holds frames of coordinates: `--base`."""
+
+    def opened(self, path: Path, options: Options) -> Source:
+        """Return a source of this format. Raises InputError."""
+        source = self.open(path, options)
+        return source if source.format else replace(source, format=self.name)
+
+
+def camera_of_numbers(
+    width: int, height: int, focal: npt.ArrayLike, middle: npt.ArrayLike, distortion: npt.ArrayLike = (), model: str = BROWN
+) -> Camera:
+    """Return a camera whose depth images count millimetres, unless it is replaced.
+
+    Arguments:
+        width, height: of its images [px].
+        focal, middle: focal lengths and principal point along x and y [px].
+        distortion: OpenCV's order, any length; more than eight numbers are cut off.
+        model: the name of a model of `Camera`.
+    """
+    numbers = np.concatenate([np.asarray(distortion, dtype=np.float64).ravel(), np.zeros(8)])[:8]
+    (fx, fy), (cx, cy) = np.asarray([focal, middle], dtype=np.float64).tolist()
+    return Camera("", width, height, fx, fy, cx, cy, freeze(numbers if numbers[5:].any() else numbers[:5]), 1e-3, model)
+
+
+def is_kept_as_image(camera: Camera) -> bool:
+    """Whether a depth image of a camera is kept as an image.
+
+    The "inverse" model of the RealSense SDK is not the inverse of OpenCV's polynomial (20 mm apart at 1 m with its usual coefficients):
+    such images become clouds, which nobody can misread.
+    """
+    return not np.any(camera.distortion != 0.0) or camera.distortion_model != "inverse_brown_conrady"
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:
-    """Return metres in one unit of length: what a person said, else what the file says.
+    """Return metres in one unit of length: of the option, else of the file.
 
     Arguments:
-        options: what was said.
+        options: of the user.
         declared: the unit that the file names; None where it names none.
         where: the file, for the message.
         extent: size of what was recorded in the file's unit, for the message.
 
     Raises:
-        InputError: nobody says the unit.
+        InputError: neither gives the unit.
     """
     said = options.unit or declared
     unit = length_unit(said) if said is not None else None
@@ -150,7 +179,7 @@ def check_size(extent: float, where: str | Path | None) -> None:
 
 
 def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:
-    """Refuse what is taken for metres, but is mostly farther away than a depth camera sees.
+    """Refuse distances in metres most of which exceed the range of a depth camera.
 
     Arguments:
         distances: of the points from the camera, shape (n,).

@@ -13,9 +13,9 @@ from typing import Any
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.foreign import export_hint
-from femsense.io.importers.formats import FORMATS, Format, contents_of, format_of
-from femsense.io.importers.frames import Source
-from femsense.io.importers.images.folders import PAIRS, folder_kind
+from femsense.io.importers.formats import FORMATS, contents_of, format_of
+from femsense.io.importers.frames import Format, Source
+from femsense.io.importers.images.folders import PAIRS, is_tum
 from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.mapping import check_names, check_taken, check_targets, resolved
@@ -48,7 +48,7 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
 def _opened(path: str | Path, said: Options) -> Source:
     """Return a source; whether it has the names of `--map` is not looked at."""
     source = Path(path).expanduser()
-    if source.name in ("depth.txt", *PAIRS) and folder_kind(source.parent) == "tum":
+    if source.name in ("depth.txt", *PAIRS) and is_tum(source.parent):
         source = source.parent
     if not source.exists():
         names = [item.name for item in source.parent.iterdir()] if source.parent.is_dir() else []
@@ -63,7 +63,7 @@ def _opened(path: str | Path, said: Options) -> Source:
             found=one.name,
             expected=", ".join(name for name, other in FORMATS.items() if other.whole_depths),
         )
-    return one.open(source, said)
+    return one.opened(source, said)
 
 
 def _format(source: Path, said: Options) -> Format:
@@ -132,9 +132,9 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
     try:
         source = joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
     except InputError:
-        if said.clock is not Clock.auto:
+        if said.clock != Clock.AUTO:
             raise
-        by_record = replace(said, clock=Clock.record)
+        by_record = replace(said, clock=Clock.RECORD)
         sources = {name: _one_of(file, by_record) for name, file in zip(names, files)}
         by_time: Source | None = None
         with contextlib.suppress(InputError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -17,14 +18,22 @@ JOURNAL = ".import-journal"
 """Name of the file in the unfinished folder; its first line says what the import is made from."""
 
 
+class Picture(StrEnum):
+    """Kind of picture of a camera in a frame, as it was written."""
+
+    NONE = ""
+    DEPTH = "depth"
+    CLOUD = "cloud"
+    BROKEN = "broken"
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """What one camera gave in a frame."""
+    """Data of one camera in a frame."""
 
     markers: Mapping[str, list[float]]
     unlabelled: list[list[float]]
-    picture: str
-    """ "depth", "cloud", "broken" or ""."""
+    picture: Picture
     center: list[float] | None
     """Mean of the points that were seen [m]; None where none were."""
 
@@ -53,7 +62,7 @@ class Journal:
     """Appends entries, and reads them one after the other."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """folder: the unfinished recording. identity: what the import is made from; another one begins anew."""
+        """folder: the unfinished recording. identity: the sources and options of the import; another identity starts from the first frame."""
         self.file = folder / JOURNAL
         self.head = json.dumps(plain(identity), sort_keys=True)
         self.done = self._whole_entries()
@@ -94,7 +103,7 @@ class Journal:
                 if number in self.left_out:
                     continue
                 time, inputs, loads, seen = json.loads(line)
-                yield Entry(time, inputs, loads, {name: Seen(*one) for name, one in seen.items()}, number)
+                yield Entry(time, inputs, loads, {name: _seen(*one) for name, one in seen.items()}, number)
 
     def times(self) -> FloatArray:
         """Return the times of all frames [s], shape (F,)."""
@@ -114,3 +123,7 @@ class Journal:
                 count, end = count + 1, end + len(line)
             stream.truncate(end)
         return count
+
+
+def _seen(markers: dict[str, list[float]], unlabelled: list[list[float]], picture: str, center: list[float] | None) -> Seen:
+    return Seen(markers, unlabelled, Picture(picture), center)

@@ -24,11 +24,13 @@ class Axis(StrEnum):
 
 
 class Clock(StrEnum):
-    """Which time stamps of a bag count."""
+    """Which time stamps of a bag are used."""
 
-    auto = "auto"
-    header = "header"
-    record = "record"
+    AUTO = "auto"
+    """Those of headers where these are a clock, else those of recording."""
+    HEADER = "header"
+    RECORD = "record"
+    """Of the moment at which a message was written."""
 
 
 class Inputs(StrEnum):
@@ -112,7 +114,7 @@ class Options:
     unit: Annotated[str | None, Flag("--unit", "m|cm|mm|in|ft", "Of lengths.")] = None
     """One of UNITS."""
     up: Annotated[Axis | None, Flag("--up", None, "The vertical axis; it is turned to z.")] = None
-    clock: Annotated[Clock, Flag("--clock", None, "Which time stamps of a bag.")] = Clock.auto
+    clock: Annotated[Clock, Flag("--clock", None, "Which time stamps of a bag.")] = Clock.AUTO
     rate: Annotated[float | None, Flag("--rate", "HZ", "Where the source has no times.")] = None
     """Frames a second."""
     base: Annotated[str | None, Flag("--base", "FRAME", "Frame of a bag's transforms that is the robot's.")] = None

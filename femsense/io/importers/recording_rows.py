@@ -20,7 +20,7 @@ from femsense.io.importers.summary import summary
 from femsense.io.importers.tables.actuation import ActuationLog, align
 from femsense.io.importers.tables.input_samples import spans
 from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
-from femsense.io.recording_toml import FORMAT
+from femsense.io.recording_toml import FORMAT, camera_document
 
 EXACT = 1e-6
 """Times are as exact as this [s]."""
@@ -28,7 +28,7 @@ EXACT = 1e-6
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Wanted:
-    """What a person says of the inputs."""
+    """Options of the user about the inputs."""
 
     actuation: str | None = None
     """"tension" or "displacement", where the source does not say."""
@@ -125,7 +125,7 @@ def _known_inputs(
 def actuation_of(source: Source, columns: list[str], said: str | None) -> str:
     kind = said or source.actuation
     cables = [name for name in columns if name.startswith("cable_")]
-    if cables and source.format == "csv" and source.actuation not in (None, kind):
+    if cables and source.actuation_by_unit and source.actuation not in (None, kind):
         raise another_kind(source.path, str(said), str(source.actuation))
     if kind is None and cables:
         raise InputError(
@@ -147,25 +147,18 @@ def another_kind(path: Path, said: str, by_unit: str) -> InputError:
 def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:
     document: dict[str, Any] = {"format": FORMAT, "actuation": actuation, "actuation_zero": zero}
     if source.views:
-        return document | {"cameras": {n: _lens(s, part / "depth" / n) | _pose(s) for n, s in source.views.items()}}
-    lens = _lens(source, part / "depth")
-    return document | _pose(source) | ({"camera": lens} if lens else {})
+        return document | {"cameras": {n: _camera(s, part / "depth" / n) | _pose(s) for n, s in source.views.items()}}
+    camera = _camera(source, part / "depth")
+    return document | _pose(source) | ({"camera": camera} if camera else {})
 
 
 def _pose(source: Source) -> dict[str, Any]:
     return {} if source.T_robot_camera is None else {"T_robot_camera": source.T_robot_camera.tolist()}
 
 
-def _lens(source: Source, images: Path) -> dict[str, Any]:
-    """Return the table of a camera's lens; empty where it has no depth images."""
-    lens = source.lens
-    if lens is None or not images.is_dir():
-        return {}
-    table = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    count = 5 if not np.any(lens.distortion[5:] != 0.0) else 8
-    distortion = np.concatenate([lens.distortion, np.zeros(8)])[:count].tolist()
-    model = {"distortion_model": lens.model} if lens.model != "brown_conrady" else {}
-    return {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}
+def _camera(source: Source, images: Path) -> dict[str, Any]:
+    """Return the table of a camera; empty where it has no depth images."""
+    return camera_document(source.camera) if images.is_dir() else {}
 
 
 def _frame_rows(

@@ -15,6 +15,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Source
 from femsense.io.importers.options import Options
+from femsense.io.importers.tables.input_samples import nearest_in_time
 
 OVERLAP = 0.5
 """Clocks are one where the times that two sources share are this share of the shorter one."""
@@ -50,19 +51,20 @@ def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Sourc
     times = {name: _times(source) + options.shifts.get(name, 0.0) for name, source in sources.items()}
     main = next((name for name, source in sources.items() if _has_pictures(source)), next(iter(sources)))
     _require_one_clock(times, main, path)
-    match = Match(times[main], {name: _nearest(times[main], times[name]) for name in sources})
+    step = float(np.median(np.diff(times[main]))) if len(times[main]) > 1 else np.inf
+    match = Match(times[main], {name: nearest_in_time(times[main], times[name], 0.5 * step) for name in sources})
     alone = {name: int(len(times[name]) - len(np.unique(i[i >= 0]))) for name, i in match.of.items()}
     notes = [f"{name}: {note}" for name, source in sources.items() for note in source.notes]
     notes += [f"{name}: {count} frames without one of {main} near in time are left out" for name, count in alone.items() if count]
     kinds = dict.fromkeys(source.actuation for source in sources.values() if source.actuation)
     return Source(
-        "several",
         path,
         partial(_frames, dict(sources), match, main),
         actuation=next(iter(kinds), None),
         count=len(match.times),
         notes=notes,
         views=dict(sources),
+        format="several",
         names={name: kind for source in sources.values() for name, kind in source.names.items()},
     )
 
@@ -96,19 +98,6 @@ def _times(source: Source) -> FloatArray:
 def _has_pictures(source: Source) -> bool:
     first = next(source.frames(), None)
     return first is not None and first.picture is not None
-
-
-def _nearest(times: FloatArray, other: FloatArray) -> IntArray:
-    """Return for each time the index of the nearest other one, −1 beyond half a step."""
-    if not len(other):
-        return np.full(len(times), -1, dtype=np.int64)
-    step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
-    right = np.clip(np.searchsorted(other, times), 1, max(len(other) - 1, 1))
-    near = np.where(
-        np.abs(times - other[right - 1]) <= np.abs(times - other[np.minimum(right, len(other) - 1)]), right - 1, right
-    )
-    near = np.minimum(near, len(other) - 1)
-    return np.where(np.abs(times - other[near]) <= 0.5 * step, near, -1)
 
 
 def _require_one_clock(times: Mapping[str, FloatArray], main: str, path: Path) -> None:

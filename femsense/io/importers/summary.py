@@ -1,16 +1,18 @@
-"""What was found in a source, counted over its frames: rate, gaps, lost and swapped markers, span."""
+"""Statistics of an imported source over its frames: rate, gaps, lost and swapped markers, span."""
 
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from femsense.io.importers.frames import Source
-from femsense.io.importers.journal import Journal
+from femsense.io.importers.journal import Journal, Picture
 
+SHOWN = (Picture.DEPTH, Picture.CLOUD)
 GAP = 1.5
 """A step in time longer than this times the usual one lacks frames."""
 JUMP = 5.0
@@ -45,18 +47,16 @@ def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict
 
 
 def _pictures(journal: Journal) -> dict[str, int | None]:
-    kinds = {"depth": 0, "cloud": 0, "broken": 0, "": 0}
-    empty = 0
+    kinds, empty = Counter[Picture](), 0
     for entry in journal.entries():
-        for seen in entry.seen.values():
-            kinds[seen.picture] += 1
-            empty += seen.picture in ("depth", "cloud") and seen.center is None
+        kinds.update(one.picture for one in entry.seen.values())
+        empty += sum(one.picture in SHOWN and one.center is None for one in entry.seen.values())
     if empty:
-        warnings.warn(f"{empty} of {kinds['depth'] + kinds['cloud']} pictures show nothing", stacklevel=3)
+        warnings.warn(f"{empty} of {kinds[Picture.DEPTH] + kinds[Picture.CLOUD]} pictures show nothing", stacklevel=3)
     return {
-        "depth_images": kinds["depth"],
-        "clouds": kinds["cloud"],
-        "broken_pictures": kinds["broken"],
+        "depth_images": kinds[Picture.DEPTH],
+        "clouds": kinds[Picture.CLOUD],
+        "broken_pictures": kinds[Picture.BROKEN],
         "empty_pictures": empty or None,
     }
 
@@ -66,11 +66,15 @@ def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:
     pictures, markers = dict.fromkeys(source.views, 0), dict.fromkeys(source.views, 0)
     for entry in journal.entries():
         for name, seen in entry.seen.items() if source.views else ():
-            pictures[name] += seen.picture in ("depth", "cloud")
+            pictures[name] += seen.picture in SHOWN
             markers[name] += bool(seen.markers or seen.unlabelled)
     return [
         {"camera": name, "format": one.format, "pictures": pictures[name], "frames_with_markers": markers[name]}
-        | {key: one.found[key] for key in ("clock", "lens", "depth_unit_m", "camera_frame", "unit") if key in one.found}
+        | {
+            key: one.found[key]
+            for key in ("clock", "lens", "depth_unit_m", "camera_frame", "unit")
+            if one.found.get(key) is not None
+        }
         for name, one in source.views.items()
     ]
 

@@ -1,4 +1,4 @@
-"""Frames → a recording folder, written beside and renamed at the end; memory is that of one frame, whatever the length."""
+"""Frames → a recording folder, written under a temporary name and renamed at the end; memory is that of one frame."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError, InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
+from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
 from femsense.io.folder_lock import only_writer
-from femsense.io.importers.frames import Frame, Images, Lens, Source
-from femsense.io.importers.images.pictures import write_cloud_file, write_color, write_depth
-from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
+from femsense.io.importers.frames import Frame, Images, Source
+from femsense.io.importers.images.pictures import write_color, write_depth
+from femsense.io.importers.journal import JOURNAL, Entry, Journal, Picture, Seen
 from femsense.io.importers.recording_rows import Wanted, actuation_of, another_kind, write_tables
 from femsense.io.importers.tables.actuation import ActuationLog
 from femsense.io.recording_folder import load_recording
+from femsense.model.camera import Camera
 from femsense.model.plausibility import doubts_of_recording, warn_of
 from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
-"""What a recording was made from; lies in its folder."""
+"""Record of the sources and options of an import, in the recording's folder."""
 TABLES = ("recording.toml", "frames.csv", "markers.csv", "loads.csv")
 OWN_FILES = re.compile(
     "|".join(map(re.escape, (*TABLES, RECORD))) + r"|(clouds|depth|color)/([^/]+/)?\d{6,}\.(ply|png)",
@@ -163,7 +165,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
 
 
 def _give_name(part: Path, final: Path, replace: bool) -> None:
-    """Rename the finished folder. Raises InputError where something stands there that nobody said to replace."""
+    """Rename the finished folder. Raises InputError where something stands there that is not to be replaced."""
     if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
         raise InputError("something stands there already", where=final, expected="a new place for the recording")
     if not final.exists():
@@ -243,7 +245,7 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
 
 def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int) -> Seen:
     """Write what one camera gives in a frame; its name, if there are several, is that of its folders."""
-    kind, center = "", None
+    kind, center = Picture.NONE, None
     if frame.picture is not None:
         try:
             kind, center = _write_picture(source, frame.picture(), part, Path(view) / f"{number:06d}")
@@ -251,7 +253,7 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
             if number == 0:
                 raise
             warnings.warn(f"a frame keeps no picture: {' '.join(str(problem).split())}", stacklevel=2)
-            kind = "broken"
+            kind = Picture.BROKEN
     markers = {name: np.asarray(place, dtype=float).tolist() for name, place in frame.markers.items()}
     strangers = np.asarray(frame.unlabelled, dtype=float).reshape(-1, 3)
     if markers:
@@ -261,23 +263,25 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
     return Seen(markers, strangers.tolist(), kind, center)
 
 
-def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[str, list[float] | None]:
+def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[Picture, list[float] | None]:
     if isinstance(picture, PointCloud):
-        write_cloud_file(part / "clouds" / f"{name}.ply", picture)
-        return "cloud", picture.points.mean(axis=0).tolist() if len(picture) else None
+        file = part / "clouds" / f"{name}.ply"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_cloud(file, picture)
+        return Picture.CLOUD, picture.points.mean(axis=0).tolist() if len(picture) else None
     write_depth(part / "depth" / f"{name}.png", picture.depth)
     if picture.color is not None:
         write_color(part / "color" / f"{name}.png", picture.color)
-    return "depth", _center(picture, source.lens, source.depth_unit_m)
+    return Picture.DEPTH, _center(picture, source.camera)
 
 
-def _center(picture: Images, lens: Lens | None, unit: float) -> list[float] | None:
+def _center(picture: Images, camera: Camera | None) -> list[float] | None:
     """Return the mean of the points of a depth image [m], without its lens's distortion: it serves to see motion."""
-    z = picture.depth[::4, ::4].astype(np.float64) * unit
-    if lens is None or not z.any():
+    z = picture.depth[::4, ::4].astype(np.float64) * (1.0 if camera is None else camera.depth_unit)
+    if camera is None or not z.any():
         return None
     row, column = np.nonzero(z)
     values = z[row, column]
-    x = (4 * column - lens.cx) / lens.fx * values
-    y = (4 * row - lens.cy) / lens.fy * values
+    x = (4 * column - camera.cx) / camera.fx * values
+    y = (4 * row - camera.cy) / camera.fy * values
     return [float(x.mean()), float(y.mean()), float(values.mean())]

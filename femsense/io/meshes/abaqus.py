@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.meshes.content import MeshContent
+from femsense.io.meshes.content import MeshContent, indices_of
 
 SOLIDS = {
     4: "tetra",
@@ -193,18 +193,5 @@ def _chosen(
 def _content(mesh: _Mesh, T: FloatArray, where: str) -> MeshContent:
     numbers = np.array(list(mesh.nodes), dtype=np.int64)
     points = np.array(list(mesh.nodes.values()), dtype=np.float64).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
-    order = np.argsort(numbers)
-    cells: dict[str, IntArray] = {}
-    for kind, rows in mesh.elements.items():
-        wanted = np.array(rows, dtype=np.int64)
-        at = np.searchsorted(numbers[order], wanted)
-        lost = (at >= len(order)) | (numbers[order[np.minimum(at, len(order) - 1)]] != wanted) if len(order) else wanted >= 0
-        if lost.any():
-            raise InputError(
-                "an element names a node that does not exist",
-                where=where,
-                found=f"node {int(wanted[lost][0])}",
-                expected=f"one of the part's {len(numbers)} nodes",
-            )
-        cells[kind] = order[at]
+    cells = {kind: indices_of(np.array(rows, dtype=np.int64), numbers, where) for kind, rows in mesh.elements.items()}
     return MeshContent(points, cells)

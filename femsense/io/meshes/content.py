@@ -1,14 +1,16 @@
-"""What a mesh file holds, whatever its format."""
+"""Content of a mesh file of any format."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -21,6 +23,31 @@ class MeshContent:
     """Kind (meshio's names) → indices of points from 0 in VTK's order, shape (m, k)."""
     data: dict[str, dict[str, npt.NDArray[np.generic]]] = field(default_factory=dict)
     """Name → kind → one value a cell, shape (m,), or several, shape (m, p)."""
+
+
+def indices_of(wanted: IntArray, numbers: IntArray, where: str | Path) -> IntArray:
+    """Return the indices of nodes by their numbers in the file, of the shape of `wanted`.
+
+    Arguments:
+        wanted: numbers that elements name.
+        numbers: of the nodes, each once, in any order, shape (n,).
+        where: what a message names.
+
+    Raises:
+        InputError: a number that no node has.
+    """
+    order = np.argsort(numbers, kind="stable")
+    known = numbers[order]
+    at = np.searchsorted(known, wanted)
+    lost = (at >= len(known)) | (known[np.minimum(at, len(known) - 1)] != wanted) if len(known) else np.ones(wanted.shape, bool)
+    if lost.any():
+        raise InputError(
+            "an element names a node that does not exist",
+            where=where,
+            found=f"node {int(wanted[lost][0])}",
+            expected=f"one of {len(known)} nodes" + (f", {known[0]} … {known[-1]}" if len(known) else ""),
+        )
+    return np.asarray(order[at])
 
 
 def joined(pieces: Iterable[MeshContent]) -> MeshContent:
@@ -66,7 +93,7 @@ def distinct_cells(cells: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def gathered(values: npt.NDArray[np.generic], kept: IntArray, owner: IntArray) -> npt.NDArray[np.generic]:
-    """Return the values of the kept cells with those of their copies beside them, shape (k, p);
+    """Return the values of the kept cells next to those of their copies, shape (k, p);
     a cell without copies repeats its own."""
     table = values.reshape(len(values), -1)
     if len(kept) == len(owner):

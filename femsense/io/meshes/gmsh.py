@@ -1,6 +1,7 @@
 """Gmsh's meshes (MSH 1, 2, 4.0, 4.1; as text or binary), with numbers that start anywhere and cells of any number of groups.
 
-Format: the Gmsh reference manual, "Gmsh mesh file formats" and its appendix of legacy formats.
+Format: the Gmsh reference manual, "Gmsh mesh file formats" and its appendix of legacy formats. Read here, because meshio 5.3.5 refuses
+version 1 and files of which only some entities are in groups (SaveAll), shifts nodes that count from 0, and keeps one group of several.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.io.meshes.content import MeshContent
+from femsense.io.meshes.content import MeshContent, indices_of
 
 KINDS = {
     1: ("line", 2),
@@ -237,9 +238,8 @@ def _size(kind: int) -> int:
 
 def _content(numbers: IntArray, points: FloatArray, blocks: Sequence[Block], where: str) -> MeshContent:
     """Return the content with indices from 0 in place of numbers."""
-    order = np.argsort(numbers, kind="stable")
-    known = numbers[order]
-    if len(known) > 1 and (np.diff(known) == 0).any():
+    known = np.sort(numbers)
+    if (np.diff(known) == 0).any():
         raise InputError(
             "a node stands twice", where=where, found=f"node {int(known[:-1][np.diff(known) == 0][0])}", expected="each node once"
         )
@@ -247,16 +247,7 @@ def _content(numbers: IntArray, points: FloatArray, blocks: Sequence[Block], whe
     tags: dict[str, list[IntArray]] = {}
     for kind, nodes, groups in blocks:
         name = KINDS[kind][0] if kind in KINDS else f"type {kind}"
-        at = np.searchsorted(known, nodes)
-        lost = (at >= len(known)) | (known[np.minimum(at, len(known) - 1)] != nodes)
-        if lost.any():
-            raise InputError(
-                "an element names a node that does not exist",
-                where=where,
-                found=f"node {int(nodes[lost][0])}",
-                expected=f"one of {len(known)} nodes, {known[0]} … {known[-1]}",
-            )
-        index = order[at]
+        index = indices_of(nodes, numbers, where)
         cells.setdefault(name, []).append(index[:, TET10] if name == "tetra10" else index)
         tags.setdefault(name, []).append(groups if groups.shape[1] else np.zeros((len(nodes), 1), dtype=np.int64))
     return MeshContent(

@@ -15,7 +15,7 @@ from femsense.io.meshes import tetgen
 from femsense.io.meshes.abaqus import read_abaqus
 from femsense.io.meshes.content import MeshContent, joined
 from femsense.io.meshes.gmsh import read_gmsh
-from femsense.io.meshes.vtu import listed_files, read_own, split_pieces
+from femsense.io.meshes.vtu import listed_files, split_pieces
 
 NASTRAN = (".bdf", ".nas", ".fem")
 
@@ -80,13 +80,9 @@ def _read(path: Path, where: str) -> MeshContent:
         return tetgen.read_tetgen(path, where)
     if kind == "pvtu":
         return joined(read_content(file, str(file)) for file in listed_files(path, where))
-    own = read_own(path.read_bytes()) if kind == "vtu" else None
-    if own is not None:
-        return own
     if kind == "vtu":
-        folder = tempfile.TemporaryDirectory(prefix="femsense-")
-        with folder:
-            return joined([_through_meshio(file, kind) for file in split_pieces(path, folder)])
+        with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
+            return joined([_through_meshio(file, kind) for file in split_pieces(path, Path(folder))])
     if path.suffix.lower() in NASTRAN and b"BEGIN BULK" not in (data := path.read_bytes()):
         with tempfile.TemporaryDirectory(prefix="femsense-") as place:  # Gmsh leaves the line out, and meshio asks for it
             whole = Path(place, path.name)

@@ -9,7 +9,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import EDGES
-from femsense.io.meshes.content import MeshContent
+from femsense.io.meshes.content import MeshContent, indices_of
 
 ENDINGS = (".node", ".ele")
 
@@ -32,16 +32,7 @@ def read_tetgen(path: Path, where: str) -> MeshContent:
     corners = int(head[1]) if len(head) > 1 else 4
     if corners not in (4, 10) or rows.shape[1] < 1 + corners:
         raise InputError("unknown elements in a TetGen file", where=ele_file, found=f"{corners} nodes each", expected="4 or 10")
-    first = int(nodes[0, 0]) if len(nodes) else 0
-    tets = rows[:, 1 : 1 + corners].astype(np.int64) - first
-    if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
-        bad = int(tets.min() + first if tets.min() < 0 else tets.max() + first)
-        raise InputError(
-            "an element names a node that does not exist",
-            where=ele_file,
-            found=bad,
-            expected=f"{first} … {first + len(points) - 1}",
-        )
+    tets = indices_of(rows[:, 1 : 1 + corners].astype(np.int64), nodes[:, 0].astype(np.int64), ele_file)
     kind = "tetra10" if corners == 10 else "tetra"
     cells = {kind: in_vtk_order(points, tets) if corners == 10 else tets}
     values = rows[:, 1 + corners :]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,7 @@ for dimension, tag in faces:
     triangles.append(np.array(corners, dtype=np.int64).reshape(-1, 3))
 number = np.full(int(tags.max()) + 1, -1)
 number[tags] = np.arange(len(tags))
-np.savez("surface.npz", points=np.array(xyz).reshape(-1, 3), triangles=number[np.concatenate(triangles)])
+np.savez("made.npz", points=np.array(xyz).reshape(-1, 3), triangles=number[np.concatenate(triangles)])
 gmsh.finalize()
 """
 
@@ -55,28 +54,25 @@ def read_cad(path: Path, unit: str) -> tuple[FloatArray, IntArray]:
     """
     if importlib.util.find_spec("gmsh") is None:
         raise MissingDependency(f"a CAD file becomes triangles through gmsh: {INSTALL}")
-    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        words = (str(path.absolute()), unit, str(PER_CIRCLE))
-        try:
-            made = run_program(GMSH, *words, folder=folder, makes="surface.npz", seconds=SECONDS)
-        except ProgramTimeout:
-            raise InputError(
-                "Gmsh did not come to an end",
-                where=path,
-                found=f"stopped after {SECONDS:.0f} s",
-                expected="triangles",
-                hint="export it as STL from the CAD program, in mm",
-            ) from None
-        except ProgramFailed as failed:
-            last = str(failed)
-            if "libGL" in last or "cannot open shared object" in last:
-                raise MissingDependency(f"gmsh needs a library of the system: {last[:160]}") from None
-            raise InputError(
-                "not readable as a CAD file",
-                where=path,
-                found=last[:160],
-                expected="solids in STEP, IGES or BREP",
-                hint="export it as STL from the CAD program, in mm",
-            ) from None
-        with np.load(made) as data:
-            return np.asarray(data["points"], dtype=np.float64), np.asarray(data["triangles"], dtype=np.int64)
+    try:
+        made = run_program(GMSH, str(path.absolute()), unit, str(PER_CIRCLE), seconds=SECONDS)
+    except ProgramTimeout:
+        raise InputError(
+            "Gmsh did not come to an end",
+            where=path,
+            found=f"stopped after {SECONDS:.0f} s",
+            expected="triangles",
+            hint="export it as STL from the CAD program, in mm",
+        ) from None
+    except ProgramFailed as failed:
+        last = str(failed)
+        if "libGL" in last or "cannot open shared object" in last:
+            raise MissingDependency(f"gmsh needs a library of the system: {last[:160]}") from None
+        raise InputError(
+            "not readable as a CAD file",
+            where=path,
+            found=last[:160],
+            expected="solids in STEP, IGES or BREP",
+            hint="export it as STL from the CAD program, in mm",
+        ) from None
+    return np.asarray(made["points"], dtype=np.float64), np.asarray(made["triangles"], dtype=np.int64)

@@ -6,7 +6,6 @@ fTetWild, which fills what was mended, took 110 to 230 s of processor time for p
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,7 +66,7 @@ tags, xyz, _ = gmsh.model.mesh.getNodes()
 _, corners = gmsh.model.mesh.getElementsByType(4)
 number = np.full(int(tags.max()) + 1, -1)
 number[tags] = np.arange(len(tags))
-np.savez("tets.npz", nodes=np.array(xyz).reshape(-1, 3), tets=number[np.array(corners, dtype=np.int64).reshape(-1, 4)])
+np.savez("made.npz", nodes=np.array(xyz).reshape(-1, 3), tets=number[np.array(corners, dtype=np.int64).reshape(-1, 4)])
 gmsh.finalize()
 """
 
@@ -91,7 +90,7 @@ def fill_cad(
         points, triangles: its faces as `read_cad` gives them, in `options.unit`, shapes (n, 3) and (t, 3).
         options: size and unit.
         progress: called with what is being done.
-        program: Python that meshes the file and writes `tets.npz` where it runs.
+        program: Python that meshes the file and writes `made.npz` where it runs.
     """
     if options.close_holes or options.fill_cavities or options.part is not None:
         return None
@@ -130,14 +129,13 @@ def _filled(path: Path, surface: ClosedSurface, edge: float, options: MeshOption
     given = options.tolerance_mm
     usual = min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * surface.diagonal, OF_WALL * 2.0 * surface.volume / surface.area)
     tolerance = usual if given is None else 1e-3 * given
-    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        words = (str(path.absolute()), unit, str(edge * PER_METRE[unit]), str(tolerance * PER_METRE[unit]))
-        try:
-            made = run_program(program, *words, folder=folder, makes="tets.npz", seconds=SECONDS)
-        except (ProgramTimeout, ProgramFailed):
-            return None
-        with np.load(made) as data:
-            nodes, tets = np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
+    try:
+        made = run_program(
+            program, str(path.absolute()), unit, str(edge * PER_METRE[unit]), str(tolerance * PER_METRE[unit]), seconds=SECONDS
+        )
+    except (ProgramTimeout, ProgramFailed):
+        return None
+    nodes, tets = np.asarray(made["nodes"], dtype=np.float64), np.asarray(made["tets"], dtype=np.int64)
     if not len(tets):
         return None
     mesh = oriented(compact(nodes / PER_METRE[unit], tets))

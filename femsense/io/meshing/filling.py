@@ -16,8 +16,8 @@ from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles
 from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.options import MeshOptions
-from femsense.io.meshing.surface import ClosedSurface, repaired, shared_edges
-from femsense.io.meshing.surface_queries import crossing_triangles, distance_to
+from femsense.io.meshing.surface import ClosedSurface, repaired
+from femsense.io.meshing.surface_queries import crossing_triangles, distance_to, sides
 from femsense.io.meshing.tetrahedra import FILL_SECONDS, Unfinished, tetrahedralise
 from femsense.io.meshing.thinning import thinned
 
@@ -118,7 +118,7 @@ def fill(
     if crossing:
         note = f"{crossing} triangles cross others: what lies inside any of them was filled"
         surface = replace(surface, done=(*surface.done, note))
-    walls = len(shared_edges(surface.triangles))
+    walls = int((sides(surface.triangles)[2] > 2).sum())
     if walls:
         note = (
             f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"

@@ -10,12 +10,11 @@ from pydantic import Field, model_validator
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
-from femsense.core.text import key_path
 from femsense.io.meshing.channels import Channel
 from femsense.io.meshing.line_body import Cavity, Fold, LineBody
 from femsense.io.meshing.line_sections import Section, equal_section
-from femsense.io.robot_tables import GravityTable, MaterialTable, Name, Vector
-from femsense.io.tables import Schema, read_toml, validated
+from femsense.io.robot_tables import GravityTable, MaterialTable, Name
+from femsense.io.tables import Schema, Vector, at_key, read_toml, validated
 
 FORMAT = "femsense-line-1"
 PER_METRE = 1000.0
@@ -148,7 +147,7 @@ def line_of(table: LineTable, path: Path) -> LineBody:
     ends = {"chambers": [c.to_mm for c in table.chambers], "bellows": [b.to_mm for b in table.bellows]}
     for kind, places in ends.items():
         for i, end in enumerate(places):
-            _require_on_line(end, line, f"{path}: {key_path((kind, i, 'to_mm'))}")
+            _require_on_line(end, line, at_key(path, kind, i, "to_mm"))
     return line
 
 
@@ -157,12 +156,12 @@ def channels_of(table: LineTable, line: LineBody, path: Path) -> tuple[Channel, 
     channels = []
     for i, tendon in enumerate(table.tendons):
         end = line.length if tendon.end_mm is None else tendon.end_mm / PER_METRE
-        _require_on_line(end * PER_METRE, line, f"{path}: {key_path(('tendons', i, 'end_mm'))}")
+        _require_on_line(end * PER_METRE, line, at_key(path, "tendons", i, "end_mm"))
         start = tendon.start_mm / PER_METRE
         if not 0.0 <= start < end:
             raise InputError(
                 "a channel begins behind its end",
-                where=f"{path}: {key_path(('tendons', i, 'start_mm'))}",
+                where=at_key(path, "tendons", i, "start_mm"),
                 found=tendon.start_mm,
                 expected=f"0 to {end * PER_METRE:g}",
             )
@@ -183,7 +182,7 @@ def channels_of(table: LineTable, line: LineBody, path: Path) -> tuple[Channel, 
 
 
 def cavity_of(chamber: ChamberTable) -> Cavity:
-    """Return the cavity of a chamber; a round one beside the axis becomes a sector of a ring of the same area,
+    """Return the cavity of a chamber; a round one next to the axis becomes a sector of a ring of the same area,
     as thick as it is wide."""
     inner, outer, half = 0.0, (chamber.radius_mm or 0.0), 0.0
     if chamber.inner_mm is not None and chamber.outer_mm is not None and chamber.span_deg is not None:
@@ -227,7 +226,7 @@ def _section(table: SectionTable, i: int, path: Path) -> Section:
     try:
         return equal_section(1e-6 * table.area_mm2, (1e-12 * moments[0], 1e-12 * moments[1]))
     except InputError as error:
-        where = f"{path}: {key_path(('sections', i))}"
+        where = at_key(path, "sections", i)
         raise InputError(error.what, where=where, found=error.found, expected=error.expected) from None
 
 
@@ -236,7 +235,7 @@ def _check_steps(points: FloatArray, sections: tuple[Section, ...], path: Path) 
     legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
     for i, leg in enumerate(legs):
         a, b = sections[i], sections[i + 1]
-        where = f"{path}: {key_path(('sections', i + 1))}"
+        where = at_key(path, "sections", i + 1)
         if leg == 0 and (a.half_width, a.half_height) != (b.half_width, b.half_height):
             raise InputError(
                 "a step of the outline",

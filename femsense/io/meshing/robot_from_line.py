@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,9 @@ from typing import Any
 import numpy as np
 
 import femsense
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem.body import BodyModel, make_body
-from femsense.fem.mesh import TetMesh, element_volumes, to_quadratic
+from femsense.fem.mesh import TetMesh, element_volumes
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import check_target, file_hash, followed, plain, write_json, write_toml
 from femsense.io.mesh_files import write_mesh
@@ -21,6 +22,7 @@ from femsense.io.meshing.channels import Channel, Subdivision, channel_path, pul
 from femsense.io.meshing.line_body import Cavity, LineBody, mesh_line, place
 from femsense.io.meshing.line_file import LineTable, channels_of, line_of, read_line
 from femsense.io.meshing.quality import quality_report, quality_text
+from femsense.io.robot_body import boxes_around
 from femsense.io.robot_toml import load_robot
 from femsense.io.tables import read_toml
 
@@ -64,10 +66,10 @@ def line_into(
     tell("tetrahedra")
     mesh, along = mesh_line(line, most_tets=most_tets, along=None if along_mm is None else 1e-3 * along_mm)
     check_mesh(mesh, str(path))
-    boxes = clamp_boxes(table, line, mesh, along)
+    document = robot_document(table, line, clamp_boxes(table, line, mesh, along), read_toml(path))
     channels = channels_of(table, line, path)
-    paths = subdivisions(table, line, mesh, boxes, channels, tell=tell)
-    document = robot_document(table, line, boxes, channels, paths, read_toml(path))
+    paths = subdivisions(document, mesh, line, channels, tell=tell)
+    document |= {"cables": [_cable(line, channel, path.points) for channel, path in zip(channels, paths)]} if channels else {}
     followed(target).mkdir(parents=True, exist_ok=True)
     write_mesh(mesh, target / MESH_FILE)
     write_toml(target / "robot.toml", document)
@@ -110,38 +112,33 @@ def _known(target: Path) -> dict[str, Any] | None:
     )
 
 
-def clamp_boxes(table: LineTable, line: LineBody, mesh: TetMesh, along: FloatArray) -> list[list[list[float]]]:
-    """Return boxes [m] that hold the clamped nodes and no others: one an end where that works, else one a node."""
+def clamp_boxes(table: LineTable, line: LineBody, mesh: TetMesh, along: FloatArray) -> list[FloatArray]:
+    """Return boxes [m] that hold the clamped nodes and no others (see `boxes_around`)."""
     reach = table.clamp.length_mm / 1e3 + ROUND
     boxes = []
     for end, low, high in (("first", -1.0, reach), ("last", line.length - reach, np.inf)):
         if table.clamp.ends in (end, "both"):
-            boxes += _boxes_around(mesh, np.flatnonzero((along >= low) & (along <= high)))
+            boxes += boxes_around(mesh.nodes, np.flatnonzero((along >= low) & (along <= high)), slack=ROUND)
     return boxes
 
 
-def _boxes_around(mesh: TetMesh, held: IntArray) -> list[list[list[float]]]:
-    nodes = to_quadratic(mesh).nodes
-    low, high = mesh.nodes[held].min(axis=0) - ROUND, mesh.nodes[held].max(axis=0) + ROUND
-    inside = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
-    if set(inside[inside < len(mesh.nodes)]) == set(held):
-        return [np.round([low, high], 9).tolist()]
-    return [np.round([point - ROUND, point + ROUND], 9).tolist() for point in mesh.nodes[held]]
-
-
 def subdivisions(
-    table: LineTable,
-    line: LineBody,
-    mesh: TetMesh,
-    boxes: list[list[list[float]]],
-    channels: Sequence[Channel],
-    *,
-    tell: Callable[[str], None],
+    document: Mapping[str, Any], mesh: TetMesh, line: LineBody, channels: Sequence[Channel], *, tell: Callable[[str], None]
 ) -> tuple[Subdivision, ...]:
-    """Return how many points the path of each tendon needs (see `subdivided`)."""
+    """Return the number of points that the path of each tendon needs (see `subdivided`).
+
+    Arguments:
+        document: the tables of robot.toml without cables.
+        mesh, line, channels: of the body.
+        tell: called with what is being tried.
+    """
     if not channels:
         return ()
-    body = _bare_body(table, mesh, boxes)
+    with tempfile.TemporaryDirectory(prefix="femsense-") as trial, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the finished robot says them
+        write_mesh(mesh, Path(trial, MESH_FILE))
+        write_toml(Path(trial, "robot.toml"), document)
+        body = load_robot(trial).body
     known = dict[tuple[object, ...], Subdivision]()
     for channel in channels:  # tendons that differ in their angle alone need as many
         if channel.need not in known:
@@ -149,31 +146,8 @@ def subdivisions(
     return tuple(replace(known[channel.need], name=channel.name) for channel in channels)
 
 
-def _bare_body(table: LineTable, mesh: TetMesh, boxes: list[list[list[float]]]) -> BodyModel:
-    """Return the body with its weight, clamped, without what drives it."""
-    whole = to_quadratic(mesh) if table.element == "tet10" else mesh
-    held = np.zeros(len(whole.nodes), dtype=bool)
-    for low, high in np.asarray(boxes):
-        held |= ((whole.nodes >= low) & (whole.nodes <= high)).all(axis=1)
-    return make_body(
-        whole,
-        young_modulus=table.material.young_modulus_pa,
-        poisson_ratio=table.material.poisson_ratio,
-        density=table.material.density_kg_m3,
-        clamped=held,
-        gravity=table.gravity.vector_m_s2 if table.gravity else (0.0, 0.0, 0.0),
-    )
-
-
-def robot_document(
-    table: LineTable,
-    line: LineBody,
-    boxes: list[list[list[float]]],
-    channels: Sequence[Channel],
-    paths: Sequence[Subdivision],
-    raw: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the tables of robot.toml; `raw` holds material and gravity as they were written."""
+def robot_document(table: LineTable, line: LineBody, boxes: Sequence[FloatArray], raw: dict[str, Any]) -> dict[str, Any]:
+    """Return the tables of robot.toml without cables; `raw` holds material and gravity as they were written."""
     document: dict[str, Any] = {
         "format": "femsense-robot-1",
         "name": table.name,
@@ -181,8 +155,7 @@ def robot_document(
         "material": raw["material"],
     }
     document |= {"gravity": raw["gravity"]} if "gravity" in raw else {}
-    document["fixed"] = [{"box_m": box} for box in boxes]
-    document["cables"] = [_cable(line, channel, path.points) for channel, path in zip(channels, paths)]
+    document["fixed"] = [{"box_m": np.round(box, 9).tolist()} for box in boxes]
     document["chambers"] = [_chamber(line, cavity) for cavity in line.cavities]
     document["markers"] = [
         {"name": m.name, "position_m": _point(place(line, m.along_mm / 1e3, m.distance_mm / 1e3, float(np.radians(m.angle_deg))))}

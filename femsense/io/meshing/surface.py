@@ -157,12 +157,6 @@ def _weld(points: FloatArray, triangles: IntArray, distance: float) -> IntArray:
     return np.asarray(first[labels][triangles])
 
 
-def shared_edges(triangles: IntArray) -> IntArray:
-    """Return the sides that more than two triangles have, shape (e, 2)."""
-    edges, count = np.unique(np.sort(directed_edges(triangles), axis=1), axis=0, return_counts=True)
-    return np.asarray(edges[count > 2])
-
-
 def _turned_alike(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
     """Turn triangles so that neighbours go round the same way.
 

@@ -97,23 +97,26 @@ def directed_edges(triangles: IntArray) -> IntArray:
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
+def sides(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the sides of triangles (3 t, 2), the number of the edge of each (3 t,), and how many sides each edge has (e,)."""
+    ends = directed_edges(triangles)
+    _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return ends, edge.reshape(-1), count
+
+
 def open_edges(triangles: IntArray) -> IntArray:
     """Return the sides that only one triangle has, as they go round there, shape (e, 2)."""
-    edges = directed_edges(triangles)
-    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(edges[count[inverse.reshape(-1)] == 1])
+    ends, edge, count = sides(triangles)
+    return np.asarray(ends[count[edge] == 1])
 
 
 def neighbours(triangles: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Return pairs of triangles with a side that no third one has, and whether they go round the same way, shapes (p,)."""
-    edges = directed_edges(triangles)
-    owner = np.repeat(np.arange(len(triangles)), 3)
-    _, inverse, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.reshape(-1)
-    order = np.argsort(inverse, kind="stable")
-    pair = order[count[inverse[order]] == 2].reshape(-1, 2)
-    alike = edges[pair[:, 0], 0] == edges[pair[:, 1], 1]
-    return owner[pair[:, 0]], owner[pair[:, 1]], alike
+    ends, edge, count = sides(triangles)
+    order = np.argsort(edge, kind="stable")
+    pair = order[count[edge[order]] == 2].reshape(-1, 2)
+    alike = ends[pair[:, 0], 0] == ends[pair[:, 1], 1]
+    return pair[:, 0] // 3, pair[:, 1] // 3, alike
 
 
 def place_text(points: FloatArray, place: FloatArray) -> str:

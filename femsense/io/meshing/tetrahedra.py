@@ -7,7 +7,6 @@ import hashlib
 import importlib.util
 import os
 import secrets
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -25,19 +24,19 @@ import numpy as np
 if importlib.util.find_spec("pyvista") is None:  # some versions import it for an accessor that is not used here
     sys.modules["pytetwild._accessor"] = types.ModuleType("pytetwild._accessor")
 import pytetwild
-data = np.load("surface.npz")
+data = np.load("given.npz")
 nodes, tets = pytetwild.tetrahedralize(
     data["points"], data["triangles"], edge_length_fac=float(data["edge"]), epsilon=float(data["envelope"]), vtk_ordering=True,
     quiet=True,
 )
-np.savez("tets.npz", nodes=nodes, tets=tets)
+np.savez("made.npz", nodes=nodes, tets=tets)
 """
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
 FILL_SECONDS = 300.0
 """fTetWild is stopped early after this time."""
 ENVELOPE = 1e-3
-"""How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
+"""Largest distance of a mesh from its surface, over the diagonal of its bounding box."""
 
 
 class Unfinished(InputError):
@@ -65,7 +64,7 @@ def tetrahedralise(
         where: what a message names.
         check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
         seconds: it is stopped early after so long [s].
-        program: Python that fills `surface.npz` and writes `tets.npz` where it runs.
+        program: Python that fills the surface in `given.npz` and writes `made.npz` where it runs.
 
     Raises:
         InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
@@ -165,34 +164,26 @@ def _run_ftetwild(
     """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
-    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        np.savez(
-            Path(folder) / "surface.npz",
-            points=points,
-            triangles=triangles.astype(np.int32),
-            edge=edge_fraction,
-            envelope=envelope,
-        )
-        try:
-            made = run_program(program, folder=folder, makes="tets.npz", seconds=seconds)
-        except ProgramTimeout:
-            raise Unfinished(
-                "fTetWild did not come to an end",
-                where=where,
-                found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
-                expected="tetrahedra",
-                hint=(
-                    "surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or "
-                    "femsense mesh with another --tolerance or a larger --size"
-                ),
-            ) from None
-        except ProgramFailed as failed:
-            raise InputError(
-                "fTetWild failed on this surface",
-                where=where,
-                found=str(failed)[:200],
-                expected="tetrahedra",
-                hint="mend the surface (self-intersections, thin walls), or give tetrahedra",
-            ) from None
-        with np.load(made) as data:
-            return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
+    given = {"points": points, "triangles": triangles.astype(np.int32), "edge": edge_fraction, "envelope": envelope}
+    try:
+        made = run_program(program, seconds=seconds, given=given)
+    except ProgramTimeout:
+        raise Unfinished(
+            "fTetWild did not come to an end",
+            where=where,
+            found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
+            expected="tetrahedra",
+            hint=(
+                "surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or "
+                "femsense mesh with another --tolerance or a larger --size"
+            ),
+        ) from None
+    except ProgramFailed as failed:
+        raise InputError(
+            "fTetWild failed on this surface",
+            where=where,
+            found=str(failed)[:200],
+            expected="tetrahedra",
+            hint="mend the surface (self-intersections, thin walls), or give tetrahedra",
+        ) from None
+    return np.asarray(made["nodes"], dtype=np.float64), np.asarray(made["tets"], dtype=np.int64)

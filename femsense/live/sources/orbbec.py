@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import MissingDependency
-from femsense.io.importers.images.pictures import decoded_image
+from femsense.io.clouds.images import decoded_image
 from femsense.live.frames import Image, ImageKind, RawFrame, png_of
 from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo, SourceLost
 from femsense.model.camera import Camera

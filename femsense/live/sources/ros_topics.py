@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
-import numpy as np
-
-from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres, write_cloud_file
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.io.importers.images.pictures import FINE_UNIT, depth_of_metres
 from femsense.io.importers.ros.messages import DEPTH, cloud_of, lens_of, raw_image, red_first, stamp_of
 from femsense.live.frames import Image, ImageKind, RawFrame, png_of
 from femsense.model.camera import Camera
@@ -76,19 +76,7 @@ class TopicFrames:
     def _find_camera(self) -> None:
         info = self._infos.get(self.depth.rpartition("/")[0])
         if self.camera is None and info is not None:
-            lens = lens_of(info, self.depth)
-            self.camera = Camera(
-                "",
-                lens.width,
-                lens.height,
-                lens.fx,
-                lens.fy,
-                lens.cx,
-                lens.cy,
-                np.asarray(lens.distortion),
-                self._unit_m,
-                lens.model,
-            )
+            self.camera = replace(lens_of(info, self.depth), depth_unit=self._unit_m)
 
 
 def _depth_image(message: Any, topic: str) -> Image:
@@ -100,5 +88,5 @@ def _depth_image(message: Any, topic: str) -> Image:
 def _cloud_image(message: Any, topic: str) -> Image:
     with tempfile.TemporaryDirectory(prefix="femsense-cloud-") as folder:
         file = Path(folder, "cloud.ply")
-        write_cloud_file(file, cloud_of(message, topic))
+        write_cloud(file, cloud_of(message, topic))
         return Image(ImageKind.CLOUD, file.read_bytes(), ".ply")

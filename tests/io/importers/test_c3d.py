@@ -110,6 +110,12 @@ def test_a_unit_that_nobody_says_is_asked(tmp_path: Path) -> None:
     assert next(open_c3d(file, Options(unit="cm")).frames()).markers["M0"] == pytest.approx([0.01, 0.02, 0.03])
 
 
+def test_the_unit_that_is_taken_is_reported(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.c3d", np.random.default_rng(0).normal(size=(3, 2, 3)), unit="mm")
+    assert open_c3d(file, Options(unit="m")).found["unit"] == "m"
+    assert open_c3d(file, Options()).found["unit"] == "mm"
+
+
 def test_more_frames_than_the_header_can_count(tmp_path: Path) -> None:
     file = written(tmp_path / "long.c3d", np.full((70_000, 1, 3), 2.0))
     source = open_c3d(file, Options())

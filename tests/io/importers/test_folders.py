@@ -76,7 +76,7 @@ def test_tum_without_a_lens_has_the_benchmarks_or_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no lens"):
         open_source(tum(tmp_path / "small"))
     source = open_source(tum(tmp_path / "usual", 1, (480, 640)))
-    assert source.lens is not None and source.lens.fx == 525.0
+    assert source.camera is not None and source.camera.fx == 525.0
     assert any("525" in note for note in source.notes)
 
 
@@ -245,8 +245,8 @@ def test_a_depth_scale_beside_the_lens(tmp_path: Path) -> None:
             (folder / "depth.txt").write_text("1.5 depth/1.500.png\n")
         lens = {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31, 23, 1], "depth_scale": 4000.0}
         (folder / "intrinsic.json").write_text(json.dumps(lens))
-        assert open_source(folder).depth_unit_m == 1 / 4000
-        assert open_source(folder, Options(depth_unit=0.01)).depth_unit_m == 0.01
+        assert open_source(folder).camera.depth_unit == 1 / 4000
+        assert open_source(folder, Options(depth_unit=0.01)).camera.depth_unit == 0.01
     write_cloud(tmp_path / "1.5.ply", PointCloud(np.ones((3, 3))))
     with pytest.raises(InputError, match="--depth-unit"):
         open_source(tmp_path / "1.5.ply", Options(depth_unit=0.01))

@@ -64,7 +64,7 @@ def test_a_log_with_a_hole_that_ends_early(tmp_path: Path) -> None:
 def test_frames_without_inputs_leave_no_markers_and_pictures(tmp_path: Path) -> None:
     values = [{}, {"cable_a": 1.0}, {}, {"cable_a": 3.0}]
     items = [Frame(0.1 * k, inputs=v, markers={"tip": (0, 0, 1 + k)}) for k, v in enumerate(values)]
-    made = Source("test", Path("x"), lambda: iter(items), actuation="tension")
+    made = Source(Path("x"), lambda: iter(items), actuation="tension")
     with pytest.warns(UserWarning, match="2 of 4 frames are left out"):
         write_recording(made, tmp_path / "out", identity={})
     recording = load_recording(tmp_path / "out")
@@ -74,7 +74,7 @@ def test_frames_without_inputs_leave_no_markers_and_pictures(tmp_path: Path) -> 
 
 def test_no_frame_with_inputs_is_an_error(tmp_path: Path) -> None:
     items = [Frame(0.0, inputs={"cable_a": 1.0}), Frame(0.1, inputs={"cable_b": 1.0})]
-    made = Source("test", Path("x"), lambda: iter(items), actuation="tension")
+    made = Source(Path("x"), lambda: iter(items), actuation="tension")
     with pytest.raises(InputError, match="no frame whose inputs are known"):
         write_recording(made, tmp_path / "out", identity={})
 

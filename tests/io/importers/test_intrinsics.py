@@ -91,7 +91,7 @@ def test_a_fisheye_lens_of_kalibr(tmp_path: Path) -> None:
         f"  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n  resolution: [160, 120]\n"
     )
     lens, _ = read_lens(tmp_path / "camchain.yaml", WIDTH, HEIGHT)
-    assert lens.model == "kannala_brandt"
+    assert lens.distortion_model == "kannala_brandt"
     np.testing.assert_allclose(lens.distortion[:4], [0.01, -0.02, 0.003, 0.004])
 
 

@@ -94,5 +94,5 @@ def test_names_that_are_there_are_listed_of_all_sources(tmp_path: Path) -> None:
     paths = [tmp_path / "vicon.csv", other]
     source = open_sources(paths, Options(columns={"tip": "marker.end", "m": "cable_a"}))
     assert next(source.frames()).inputs == {"cable_a": 0.0}
-    with pytest.raises(InputError, match="base, tip, time, m"):
+    with pytest.raises(InputError, match="base, tip, arm:base, arm:tip, time, m"):
         open_sources(paths, Options(columns={"tp": "marker.end", "m": "cable_a"}))

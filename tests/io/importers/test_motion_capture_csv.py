@@ -85,6 +85,18 @@ def test_nexus(tmp_path: Path) -> None:
     assert found["missing"] == [{"marker": "tip", "share": pytest.approx(1 / 3)}]
 
 
+def test_a_marker_of_nexus_may_be_mapped_with_its_subject(tmp_path: Path) -> None:
+    (tmp_path / "trial.csv").write_text(NEXUS)
+    recording, _ = imported(tmp_path / "trial.csv", tmp_path / "out", Options(columns={"arm:tip": "marker.end"}))
+    assert recording.marker_names == ("base", "end")
+
+
+def test_a_table_of_markers_in_another_unit_is_warned_of(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time_s,tip_x,tip_y,tip_z,mid_x,mid_y,mid_z\n0,0,0,500,0,120,500\n0.1,0,0,501,0,120,501\n")
+    with pytest.warns(UserWarning, match="the scene is 120 m across"):
+        open_source(tmp_path / "a.csv", Options(unit="m"))
+
+
 def test_sections_before_the_trajectories_are_passed_over(tmp_path: Path) -> None:
     devices = "1000\n,,Force 1,,,Force 2,,\nFrame,Sub Frame,Fx,Fy,Fz,Fx,Fy,Fz\n,,N,N,N,N,N,N\n11,0,1,2,3,4,5,6\n\n"
     (tmp_path / "trial.csv").write_text(f"Joints\n{devices}Devices\n{devices}{NEXUS}")

@@ -118,7 +118,7 @@ def test_an_inverse_lens_becomes_clouds(ending: str, request: pytest.FixtureRequ
     """In .db3 a text beside the CameraInfo, which says plumb_bob to all, names the model."""
     pytest.importorskip("rosbags")
     source = open_source(_recorded(request, tmp_path / f"take.{ending}", "inverse"), Options())
-    assert source.lens is not None and source.lens.model == "inverse_brown_conrady"
-    np.testing.assert_allclose(source.lens.distortion[:5], camera.INVERSE, rtol=1e-6)
+    assert source.camera is not None and source.camera.distortion_model == "inverse_brown_conrady"
+    np.testing.assert_allclose(source.camera.distortion[:5], camera.INVERSE, rtol=1e-6)
     pictures = [frame.picture() for frame in source.frames() if frame.picture is not None]
     assert len(pictures) == FRAMES and all(isinstance(picture, PointCloud) for picture in pictures)

@@ -318,7 +318,7 @@ def test_header_stamps_win_over_the_jitter_of_recording(tmp_path: Path) -> None:
             bag.write("/points", stamp + int(rng.integers(1, 20)) * 10**6, bag.cloud(np.ones((4, 3)), None, stamp))
     recording, _ = imported(tmp_path / "take", tmp_path / "a")
     np.testing.assert_allclose(np.diff(recording.time_s), 1e-9 * STEP_NS, atol=1e-6)
-    late, _ = imported(tmp_path / "take", tmp_path / "b", Options(clock=Clock.record))
+    late, _ = imported(tmp_path / "take", tmp_path / "b", Options(clock=Clock.RECORD))
     assert np.ptp(np.diff(late.time_s)) > 1e-3
 
 

@@ -147,7 +147,7 @@ def test_the_lens_of_another_camera_is_not_taken(tmp_path: Path) -> None:
             bag.write("/cam/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS, frame))
             bag.write("/cam/color/camera_info", START_NS, bag.info(START_NS, "color"))
         if taken:
-            assert open_source(tmp_path / frame).lens is not None
+            assert open_source(tmp_path / frame).camera is not None
             continue
         with pytest.raises(InputError, match="without a lens"):
             open_source(tmp_path / frame)
@@ -160,7 +160,7 @@ def test_a_region_and_binning_of_the_lens(tmp_path: Path) -> None:
         info.binning_x, info.binning_y, info.roi = 2, 2, roi
         bag.write("/cam/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
         bag.write("/cam/depth/camera_info", START_NS, info)
-    lens = open_source(tmp_path / "take").lens
+    lens = open_source(tmp_path / "take").camera
     assert lens is not None
     assert (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) == (64, 48, 50, 51, 35, 25)
 
@@ -168,8 +168,8 @@ def test_a_region_and_binning_of_the_lens(tmp_path: Path) -> None:
 def test_another_unit_of_depth(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "take", "mcap") as bag:
         write_camera(bag, FRAMES)
-    assert open_source(tmp_path / "take", Options(depth_unit=0.00025)).depth_unit_m == 0.00025
-    assert open_source(tmp_path / "take").depth_unit_m == 0.001
+    assert open_source(tmp_path / "take", Options(depth_unit=0.00025)).camera.depth_unit == 0.00025
+    assert open_source(tmp_path / "take").camera.depth_unit == 0.001
 
 
 def test_a_list_of_spheres_is_markers_without_names(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_colours_as_cameras_send_them(encoding: str, tmp_path: Path) -> None:
 def test_colours_that_are_not_read_cost_themselves(tmp_path: Path) -> None:
     source = open_source(write_colors(tmp_path / "take", np.zeros(depth_of(0).shape, np.uint8), "something"))
     assert any("are left out: their encoding 'something'" in note for note in source.notes)
-    assert source.lens is not None
+    assert source.camera is not None
 
 
 def test_pictures_that_show_nothing_are_counted(tmp_path: Path) -> None:

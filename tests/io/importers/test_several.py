@@ -16,24 +16,25 @@ from femsense.app import cli
 from femsense.app.import_command import import_into
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
-from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.frames import Frame, Images, Source, camera_of_numbers
 from femsense.io.importers.guess import open_sources
 from femsense.io.importers.options import Options
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
+from femsense.model.camera import Camera
 
-LENS = Lens(8, 6, 5.0, 5.0, 3.5, 2.5)
+LENS = camera_of_numbers(8, 6, (5.0, 5.0), (3.5, 2.5))
 TIMES = 10.0 + 0.1 * np.arange(6)
 
 
-def camera(times: np.ndarray, level: int, *, lens: Lens = LENS, **more: object) -> Source:
+def camera(times: np.ndarray, level: int, *, lens: Camera = LENS, **more: object) -> Source:
     def frames() -> Iterator[Frame]:
         for k, t in enumerate(times.tolist()):
             picture: Callable[[], Images] = lambda k=k: Images(np.full((6, 8), level + k, dtype=np.uint16))  # noqa: E731
             yield Frame(t, picture=picture, markers={"tip": (0.0, 0.1 * level, 1.0)}, **more)
 
-    return Source("test", Path("x"), frames, lens=lens, actuation="tension")
+    return Source(Path("x"), frames, camera=lens, actuation="tension")
 
 
 def levels(folder: Path, name: str) -> dict[int, int]:
@@ -58,9 +59,7 @@ def test_each_frame_takes_the_nearest_of_the_other_cameras(tmp_path: Path) -> No
 
 
 def test_frames_follow_the_camera_with_pictures_and_others_may_be_faster(tmp_path: Path) -> None:
-    capture = Source(
-        "test", Path("x"), lambda: (Frame(t, markers={"tip": (t, 0.0, 0.0)}) for t in np.arange(9.0, 11.0, 0.01).tolist())
-    )
+    capture = Source(Path("x"), lambda: (Frame(t, markers={"tip": (t, 0.0, 0.0)}) for t in np.arange(9.0, 11.0, 0.01).tolist()))
     source = joined({"mocap": capture, "cam": camera(TIMES, 100)}, tmp_path, Options())
     write_recording(source, tmp_path / "r", identity={})
     recording = load_recording(tmp_path / "r")

@@ -12,11 +12,11 @@ import pytest
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.files import folder_hash
-from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.frames import Frame, Images, Source, camera_of_numbers
 from femsense.io.importers.writer import RECORD, write_recording
 from femsense.io.recording_folder import load_recording
 
-LENS = Lens(8, 6, 5.0, 5.0, 3.5, 2.5)
+LENS = camera_of_numbers(8, 6, (5.0, 5.0), (3.5, 2.5))
 
 
 def image(number: int) -> np.ndarray:
@@ -36,7 +36,7 @@ def frames(count: int, *, stop: int | None = None) -> Iterator[Frame]:
 
 
 def source(count: int, *, stop: int | None = None) -> Source:
-    return Source("test", Path("camera"), lambda: frames(count, stop=stop), lens=LENS, actuation="tension")
+    return Source(Path("camera"), lambda: frames(count, stop=stop), camera=LENS, actuation="tension")
 
 
 def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_what_was_made_from_another_is_not_continued(tmp_path: Path) -> None:
 
 def test_gaps_and_frames_out_of_order_are_counted(tmp_path: Path) -> None:
     times = [0.0, 0.1, 0.2, 0.2, 0.15, 0.3, 0.6, 0.7]
-    made = Source("test", Path("x"), lambda: (Frame(t, markers={"a": (t, 0, 1)}) for t in times))
+    made = Source(Path("x"), lambda: (Frame(t, markers={"a": (t, 0, 1)}) for t in times))
     found = write_recording(made, tmp_path / "out", identity={})
     assert found["dropped_out_of_order"] == 2 and found["frames"] == 6
     assert found["gaps"] == 1 and found["frames_missing"] == 2
@@ -75,7 +75,7 @@ def test_gaps_and_frames_out_of_order_are_counted(tmp_path: Path) -> None:
 
 def test_no_frames_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frames"):
-        write_recording(Source("test", Path("x"), lambda: iter(())), tmp_path / "out", identity={})
+        write_recording(Source(Path("x"), lambda: iter(())), tmp_path / "out", identity={})
 
 
 def test_a_picture_that_is_broken_costs_itself_only(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_picture_that_is_broken_costs_itself_only(tmp_path: Path) -> None:
         Frame(0.1, picture=broken),
         Frame(0.2, picture=lambda: Images(image(2))),
     ]
-    made = Source("test", Path("x"), lambda: iter(items), lens=LENS)
+    made = Source(Path("x"), lambda: iter(items), camera=LENS)
     with pytest.warns(UserWarning, match="a frame keeps no picture"):
         found = write_recording(made, tmp_path / "out", identity={})
     recording = load_recording(tmp_path / "out")
@@ -102,20 +102,20 @@ def test_swapped_labels_are_named(tmp_path: Path) -> None:
             yield Frame(0.1 * k, markers={"a": b, "b": a} if k >= 20 else {"a": a, "b": b})
 
     with pytest.warns(UserWarning, match="a and b at frame 20"):
-        found = write_recording(Source("test", Path("x"), items), tmp_path / "out", identity={})
+        found = write_recording(Source(Path("x"), items), tmp_path / "out", identity={})
     assert found["label_swaps"] == 1
 
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     def peak(count: int) -> int:
-        big = Lens(320, 240, 300.0, 300.0, 159.5, 119.5)
+        big = camera_of_numbers(320, 240, (300.0, 300.0), (159.5, 119.5))
 
         def items() -> Iterator[Frame]:
             for k in range(count):
                 yield Frame(0.1 * k, picture=lambda: Images(np.full((240, 320), 700, dtype=np.uint16)))
 
         tracemalloc.start()
-        write_recording(Source("test", Path("x"), items, lens=big), tmp_path / f"out{count}", identity={})
+        write_recording(Source(Path("x"), items, camera=big), tmp_path / f"out{count}", identity={})
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return most

@@ -14,9 +14,8 @@ from helpers import DATA, block_mesh
 
 from femsense.core.errors import InputError
 from femsense.fem.mesh import element_volumes, surface_triangles, to_quadratic
-from femsense.io.mesh_files import read_tets, tet_values, write_mesh
+from femsense.io.mesh_files import read_tets, tet_values
 from femsense.io.meshes.reading import read_content
-from femsense.io.meshes.vtu import read_own
 
 BLOCK = block_mesh((3, 2, 1))
 NODES, TETS = np.asarray(BLOCK.nodes), np.asarray(BLOCK.tets)
@@ -55,27 +54,6 @@ def test_gmsh_1_with_any_numbers(tmp_path: Path) -> None:
     (tmp_path / "a.msh").write_text(text)
     same_body(tmp_path / "a.msh")
     assert (tet_values(tmp_path / "a.msh", "gmsh:physical", "here") == 7).all()
-
-
-def test_a_mesh_of_our_own_is_read_as_meshio_reads_it(tmp_path: Path) -> None:
-    for name, mesh in (("a", BLOCK), ("b", to_quadratic(block_mesh((12, 12, 12))))):
-        file = tmp_path / f"{name}.vtu"
-        write_mesh(mesh, file)
-        own, other = read_own(file.read_bytes()), meshio.read(file)
-        assert own is not None and list(own.cells) == list(other.cells_dict)
-        np.testing.assert_array_equal(own.points, other.points)
-        np.testing.assert_array_equal(*(cells[kind] for cells in (own.cells, other.cells_dict) for kind in cells))
-
-
-def test_other_files_of_vtk_are_left_to_meshio(tmp_path: Path) -> None:
-    file = tmp_path / "a.vtu"
-    write_mesh(BLOCK, file)
-    data = file.read_bytes()
-    assert read_own(data.replace(b"LittleEndian", b"BigEndian")) is None
-    meshio.Mesh(NODES, [("tetra", TETS)], cell_data={"part": [np.arange(len(TETS))]}).write(file)
-    assert read_own(file.read_bytes()) is None
-    meshio.Mesh(NODES, [("tetra", TETS), ("triangle", TETS[:, :3])]).write(file)
-    assert read_own(file.read_bytes()) is None and set(read_content(file, "here").cells) == {"tetra", "triangle"}
 
 
 def gmsh_2(path: Path, *groups: int, first: int = 0) -> Path:

@@ -6,30 +6,31 @@ import json
 import re
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud, viewpoint_doubt
-from femsense.io.clouds.images import png_header, read_png
-from femsense.io.importers.frames import FARTHEST, DepthImage, Frame, Images, Lens, Source, unit_of
+from femsense.io.clouds.images import decoded_image, png_header, read_png
+from femsense.io.importers.frames import FARTHEST, DepthImage, Format, Frame, Images, Source, camera_of_numbers, unit_of
 from femsense.io.importers.images.array_clouds import read_array_cloud
 from femsense.io.importers.images.intrinsics import FILES, JSON_NAMES, lens_line, lens_text, read_lens
-from femsense.io.importers.images.pictures import decoded_image
 from femsense.io.importers.options import Options
+from femsense.io.importers.tables.input_samples import nearest_in_time
+from femsense.model.camera import Camera
 from femsense.model.plausibility import RANGES
 from femsense.pointcloud.cloud import PointCloud
 
-CLOUDS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
+ENDINGS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
 TUM_UNIT = 1 / 5000
 """Metres in one unit of a TUM RGB-D depth image."""
 REDWOOD_UNIT = 1 / 1000
 WIDEST = 20.0
 """Scenes of cameras are not wider [m]."""
-DEFAULT_LENS = Lens(640, 480, 525.0, 525.0, 319.5, 239.5)
+DEFAULT_LENS = camera_of_numbers(640, 480, (525.0, 525.0), (319.5, 239.5))
 """The lens that the TUM benchmark gives for all its sequences, and Redwood for its own."""
 PAIRS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Lists of pairs as `associate.py` of TUM RGB-D prints them: time file time file, depth first or second."""
@@ -37,13 +38,17 @@ NEAR_S = 0.02
 """Images of TUM RGB-D belong together up to this time apart, as its own `associate.py` has it."""
 
 
-def folder_kind(folder: Path) -> str | None:
-    """Return "tum", "redwood" or "clouds"; None where a folder is none of these."""
-    if (folder / "depth").is_dir() and any((folder / name).is_file() for name in ("depth.txt", *PAIRS)):
-        return "tum"
-    if (folder / "depth").is_dir() and any((folder / "depth").glob("*.png")):
-        return "redwood"
-    return "clouds" if folder.is_dir() and _cloud_files(folder) else None
+def is_tum(path: Path, head: bytes = b"") -> bool:
+    """Whether a folder is one of TUM RGB-D."""
+    return (path / "depth").is_dir() and any((path / name).is_file() for name in ("depth.txt", *PAIRS))
+
+
+def _is_redwood(path: Path, head: bytes) -> bool:
+    return (path / "depth").is_dir() and any((path / "depth").glob("*.png"))
+
+
+def _is_clouds(path: Path, head: bytes) -> bool:
+    return bool(_cloud_files(path)) if path.is_dir() else path.suffix.lower() in ENDINGS
 
 
 def open_tum(folder: Path, options: Options) -> Source:
@@ -62,7 +67,7 @@ def open_tum(folder: Path, options: Options) -> Source:
     lost = sum(c is None for _, _, c in pairs) if color else 0
     found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": lens_line(lens)}
     frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs], lens)
-    return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=unit, count=len(pairs), notes=notes)
+    return Source(folder, frames, found=found, camera=replace(lens, depth_unit=unit), count=len(pairs), notes=notes)
 
 
 def open_redwood(folder: Path, options: Options) -> Source:
@@ -90,12 +95,10 @@ def open_redwood(folder: Path, options: Options) -> Source:
         "times": "in the names of the files" if times is not None else f"{options.rate:g} a second",
     }
     return Source(
-        "redwood",
         folder,
         partial(_image_frames, items, lens),
-        found=_given(found),
-        lens=lens,
-        depth_unit_m=unit,
+        found=found,
+        camera=replace(lens, depth_unit=unit),
         count=len(items),
         notes=notes,
     )
@@ -105,7 +108,7 @@ def open_clouds(folder: Path, options: Options) -> Source:
     """Return a folder of clouds (or one file of them) as a source; times from names, times.txt or a rate. Raises InputError."""
     files = [folder] if folder.is_file() else _cloud_files(folder)
     if not files:
-        raise InputError("no clouds", where=folder, expected=", ".join(CLOUDS))
+        raise InputError("no clouds", where=folder, expected=", ".join(ENDINGS))
     times = _cloud_times(folder, files, options)
     doubt = viewpoint_doubt(files[0])
     if doubt is not None:
@@ -114,7 +117,7 @@ def open_clouds(folder: Path, options: Options) -> Source:
     frames = [Frame(t, picture=partial(_scaled_cloud, file, scale)) for t, file in zip(times, files)]
     endings = sorted({file.suffix.lower() for file in files})
     return Source(
-        "clouds", folder, lambda: iter(frames), found={"files": ", ".join(endings), "unit": options.unit or "m"}, count=len(files)
+        folder, lambda: iter(frames), found={"files": ", ".join(endings), "unit": options.unit or "m"}, count=len(files)
     )
 
 
@@ -127,12 +130,12 @@ def read_points(file: Path) -> PointCloud:
 # Images
 
 
-def _image_frames(items: Sequence[tuple[float, Path, Path | None]], lens: Lens) -> Iterator[Frame]:
+def _image_frames(items: Sequence[tuple[float, Path, Path | None]], lens: Camera) -> Iterator[Frame]:
     for time, depth, color in items:
         yield Frame(time, picture=partial(_images, depth, color, lens))
 
 
-def _images(depth: Path, color: Path | None, lens: Lens) -> Images:
+def _images(depth: Path, color: Path | None, lens: Camera) -> Images:
     image = _depth_image(depth)
     if image.shape != (lens.height, lens.width):
         raise InputError(
@@ -199,16 +202,12 @@ def _list(path: Path, column: int = 0) -> list[tuple[float, str]]:
 
 def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) -> list[tuple[float, str, str | None]]:
     """Return each depth image with the colour image nearest in time, at most NEAR_S away."""
-    times = np.array([t for t, _ in color])
-    result: list[tuple[float, str, str | None]] = []
-    for time, file in depth:
-        k = int(np.abs(times - time).argmin()) if len(times) else -1
-        near = k >= 0 and abs(times[k] - time) <= NEAR_S
-        result.append((time, file, color[k][1] if near else None))
-    return result
+    ordered = sorted(color)
+    nearest = nearest_in_time(np.array([t for t, _ in depth]), np.array([t for t, _ in ordered]), NEAR_S)
+    return [(time, file, ordered[k][1] if k >= 0 else None) for (time, file), k in zip(depth, nearest.tolist())]
 
 
-def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, list[str]]:
+def _folder_lens(folder: Path, width: int, height: int) -> tuple[Camera, list[str]]:
     """Return the lens of a folder's images, and where it is from. Raises InputError."""
     file = next((folder / name for name in FILES if (folder / name).is_file()), None)
     if file is not None:
@@ -278,7 +277,7 @@ def _color_of(depth: list[Path], images: list[Path]) -> dict[Path, Path]:
 
 
 def _cloud_files(folder: Path) -> list[Path]:
-    found = [f for f in folder.iterdir() if f.suffix.lower() in CLOUDS and f.is_file() and not f.name.startswith(".")]
+    found = [f for f in folder.iterdir() if f.suffix.lower() in ENDINGS and f.is_file() and not f.name.startswith(".")]
     return sorted(found, key=_order)
 
 
@@ -349,5 +348,6 @@ def _declared_unit(file: Path) -> str | None:
     return "m" if extent < WIDEST and away <= FARTHEST else None
 
 
-def _given(found: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in found.items() if value is not None}
+TUM = Format("tum", open_tum, is_tum, ("--clock", "--rate", "--up", "--unit", "--topic"), whole_depths=True)
+REDWOOD = Format("redwood", open_redwood, _is_redwood, ("--clock", "--up", "--unit", "--topic"), whole_depths=True)
+CLOUDS = Format("clouds", open_clouds, _is_clouds, ("--clock", "--topic"))

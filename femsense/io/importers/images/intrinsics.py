@@ -17,10 +17,11 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Lens
+from femsense.io.importers.frames import camera_of_numbers
 from femsense.io.importers.ros.messages import MODELS
 from femsense.io.tables import read_text
 from femsense.io.text_numbers import notation_of
+from femsense.model.camera import Camera
 from femsense.model.plausibility import lens_problem
 
 JSON_NAMES = ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json", "camera.json", "camera_info.json", "calibration.json")
@@ -64,7 +65,7 @@ NAMES = {
     "k5": ("k5",),
     "k6": ("k6",),
 }
-"""What numbers of a lens are called, in small letters."""
+"""Names of the numbers of a lens, in small letters."""
 PAIRS = {"focal_length": ("fx", "fy"), "focal": ("fx", "fy"), "principal_point": ("cx", "cy"), "center": ("cx", "cy")}
 """Names of two numbers."""
 BY_MODEL = {"pinhole": 4, "simple_pinhole": 3, "opencv": 8, "radtan": 8}
@@ -88,7 +89,7 @@ CENTRED, SQUARE = 0.2, 0.15
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Found:
-    """What a file says of a lens."""
+    """Numbers of a lens that were found in a file."""
 
     numbers: Mapping[str, float]
     """Of fx, fy, cx, cy, width, height, k1 …"""
@@ -96,7 +97,7 @@ class _Found:
     notes: tuple[str, ...] = field(default=())
 
 
-def read_lens(path: Path, width: int, height: int) -> tuple[Lens, list[str]]:
+def read_lens(path: Path, width: int, height: int) -> tuple[Camera, list[str]]:
     """Return the lens of a file for images of a size [px], and what was assumed of it.
 
     Raises:
@@ -124,13 +125,13 @@ def read_lens(path: Path, width: int, height: int) -> tuple[Lens, list[str]]:
     numbers, notes = _in_pixels(numbers, width, height)
     order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     named = [numbers.get(key, 0.0) for key in order] if any(key in numbers for key in order) else []
-    distortion = np.array([*(found.distortion or named), *[0.0] * 5])[: max(5, len(found.distortion or named))]
-    name = _model_name(text) if np.any(distortion != 0.0) else ""
+    distortion = found.distortion or named
+    name = _model_name(text) if any(distortion) else ""
     if name not in MODELS:
         known = ", ".join(sorted(set(MODELS) - {""}))
         raise InputError("an unknown distortion model", where=path, found=name, expected=known)
-    lens = Lens(width, height, numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion, MODELS[name])
-    return check_lens(lens, path), [*found.notes, *notes]
+    focal, middle = (numbers["fx"], numbers["fy"]), (numbers["cx"], numbers["cy"])
+    return check_lens(camera_of_numbers(width, height, focal, middle, distortion, MODELS[name]), path), [*found.notes, *notes]
 
 
 def _model_name(text: str) -> str:
@@ -140,9 +141,9 @@ def _model_name(text: str) -> str:
     return "" if name in ("radtan", "pinhole", "perspective", "opencv") else name
 
 
-def check_lens(lens: Lens, where: str | Path | None) -> Lens:
+def check_lens(lens: Camera, where: str | Path | None) -> Camera:
     """Return a lens that a camera can have. Raises InputError."""
-    problem = lens_problem(lens.width, lens.height, (lens.fx, lens.fy, lens.cx, lens.cy), lens.distortion, lens.model)
+    problem = lens_problem(lens.width, lens.height, (lens.fx, lens.fy, lens.cx, lens.cy), lens.distortion, lens.distortion_model)
     if problem:
         raise InputError(
             "numbers that are no lens of these images",
@@ -154,15 +155,15 @@ def check_lens(lens: Lens, where: str | Path | None) -> Lens:
     return lens
 
 
-def lens_text(lens: Lens) -> str:
+def lens_text(lens: Camera) -> str:
     """Return the numbers of a lens as text."""
     bent = f", distortion {', '.join(f'{v:.4g}' for v in lens.distortion)}" if np.any(lens.distortion != 0.0) else ""
     return f"fx {lens.fx:.6g}, fy {lens.fy:.6g}, cx {lens.cx:.6g}, cy {lens.cy:.6g}{bent}"
 
 
-def lens_line(lens: Lens) -> str:
+def lens_line(lens: Camera) -> str:
     """Return size, model and numbers of a lens as text, for the table of what was imported."""
-    return f"{lens.width} × {lens.height}, {lens.model}, {lens_text(lens)}"
+    return f"{lens.width} × {lens.height}, {lens.distortion_model}, {lens_text(lens)}"
 
 
 def _in_pixels(numbers: dict[str, float], width: int, height: int) -> tuple[dict[str, float], list[str]]:

@@ -19,11 +19,12 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import ColorImage, DepthImage, Frame, Images, Lens, Source, need
+from femsense.io.clouds.images import decoded_image
+from femsense.io.importers.frames import ColorImage, DepthImage, Format, Frame, Images, Source, camera_of_numbers, need
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import pixel_rays, registered_color
-from femsense.io.importers.images.pictures import decoded_image
 from femsense.io.importers.options import Options
+from femsense.model.camera import Camera
 
 DEPTH_MODES = {
     (320, 288): ((512, 512), (96, 90)),
@@ -39,15 +40,15 @@ PLACES = {"depth": "CALIBRATION_CameraLocationD0", "color": "CALIBRATION_CameraL
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tracks:
-    """What stands in a file."""
+    """Tracks and calibration of a recording."""
 
     depth: int
     """Number of the stream."""
     little_endian: bool
     """Of the depth images; only files of early SDKs are."""
     color: int | None
-    lens: Lens
-    color_lens: Lens | None
+    lens: Camera
+    color_lens: Camera | None
     T_color_depth: FloatArray
     """Shape (4, 4), translation [m]."""
     near_s: float
@@ -69,16 +70,15 @@ def open_kinect(path: Path, options: Options) -> Source:
         "serial_number": tracks.serial,
     }
     return Source(
-        "kinect",
         path,
         partial(_frames, path, tracks),
-        found={key: value for key, value in found.items() if value is not None},
-        lens=lens,
+        found=found,
+        camera=lens,
         count=tracks.count,
     )
 
 
-def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Lens:
+def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Camera:
     """Return the lens of one camera of calibration.json for images of a size [px].
 
     The file has it for the whole sensor, as shares of its width and height from the corner of the first pixel.
@@ -106,7 +106,7 @@ def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Lens:
     fx, fy = focal * whole
     cx, cy = middle * whole - corner - 0.5
     k1, k2, k3, k4, k5, k6, _, _, p2, p1 = given[4:14]
-    return Lens(width, height, float(fx), float(fy), float(cx), float(cy), np.array([k1, k2, p1, p2, k3, k4, k5, k6]))
+    return camera_of_numbers(width, height, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
 # What stands in the file
@@ -244,7 +244,7 @@ def _images(path: Path, tracks: Tracks, rays: FloatArray, data: bytes, color: tu
     return Images(depth, registered_color(depth, rays, 0.001, pixels, tracks.color_lens, tracks.T_color_depth))
 
 
-def _color(data: bytes, kind: str, lens: Lens, path: Path) -> ColorImage:
+def _color(data: bytes, kind: str, lens: Camera, path: Path) -> ColorImage:
     """Return a colour image with red first: JPEG, or one of the raw formats of the camera. Raises InputError."""
     import cv2
 
@@ -265,3 +265,12 @@ def _color(data: bytes, kind: str, lens: Lens, path: Path) -> ColorImage:
     shape, code = raw[kind]
     image: npt.NDArray[np.uint8] = np.frombuffer(data, dtype=np.uint8).reshape(shape)
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+
+
+KINECT = Format(
+    "kinect",
+    open_kinect,
+    lambda path, head: head.startswith(b"\x1aE\xdf\xa3"),
+    ("--clock", "--rate", "--up", "--unit", "--topic"),
+    endings=(".mkv",),
+)

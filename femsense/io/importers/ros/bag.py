@@ -5,21 +5,28 @@ from __future__ import annotations
 import contextlib
 import struct
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import need
-from femsense.io.importers.ros.recovery import NotRos, RecoveredReader
+from femsense.io.importers.ros.streamed_mcap import NotRos, StreamedMcap
 
 ENDINGS = (".bag", ".db3", ".mcap")
 BEGINNINGS = ((b"#ROSBAG V2.0", ".bag"), (b"\x89MCAP0", ".mcap"), (b"SQLite format 3\0", ".db3"))
+MENDED = {
+    ".bag": "if it was cut off or not closed, `rosbag reindex FILE` (ROS 1) mends it",
+    ".mcap": "`mcap recover FILE` mends it",
+    "folder": "if it was not closed, `ros2 bag reindex FOLDER` mends it",
+}
+"""Kind of bag → the program that repairs it."""
 IMAGE = "sensor_msgs/msg/Image"
+SDK_PADDING = 4
+"""Bytes that the RealSense SDK writes behind an image of ROS 1, and that its type does not have."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,8 +59,7 @@ class Bag:
         self.topics = _topics(reader)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield messages of these topics in the order in which they were written;
-        stops with a warning where the bag breaks off."""
+        """Yield messages of these topics in the order in which they were written, up to the end or, with a warning, to the break."""
         wanted = [c for c in self.reader.connections if c.topic in topics]
         if not wanted:
             return
@@ -65,17 +71,26 @@ class Bag:
                 yield Message(connection.topic, connection.msgtype, 1e-9 * nanoseconds, bytes(raw))
         except broken as error:
             warnings.warn(
-                f"{self.path}: the file is broken after {count} messages ({_line(error)}); what comes before is read",
+                f"{self.path}: the file is broken after {count} messages ({_line(error)}); those before are read",
                 stacklevel=2,
             )
 
+    def first(self, topics: Collection[str]) -> Any:
+        """Return the first message of these topics, decoded; None where they have none. Raises InputError where it is broken."""
+        message = next(self.messages(topics), None)
+        return None if message is None else self.decode(message)
+
     def decode(self, message: Message) -> Any:
         """Return a message as an object with the fields of its type. Raises InputError where it is broken."""
-        if message.type == IMAGE and not self.reader.is2:
-            return _ros1_image(message, self.path)
+        padded = message.type == IMAGE and not self.reader.is2
         try:
-            return self.reader.deserialize(message.raw, message.type)
-        except Exception as error:  # the decoder raises what its fields raise: any of it means a broken message
+            try:
+                return self.reader.deserialize(message.raw, message.type)
+            except Exception:
+                if not padded:
+                    raise
+            return self.reader.deserialize(message.raw[:-SDK_PADDING], message.type)
+        except Exception as error:  # the decoder raises the errors of its fields: any of them means a broken message
             raise InputError(
                 "a message that its type does not describe",
                 where=f"{self.path}, topic {message.topic}",
@@ -120,70 +135,67 @@ def open_bag(path: Path) -> Iterator[Bag]:
     Raises:
         InputError: the package rosbags is missing, or the file is none of these, is empty, cut off or not indexed.
     """
-    highlevel = need("rosbags.highlevel", "ros", "reading ROS bags")
-    typesys = need("rosbags.typesys", "ros", "reading ROS bags")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    if path.is_file() and not path.stat().st_size:
+        raise InputError("an empty file", where=path, found="0 bytes", expected="a ROS bag")
     with _named_by_content(path) as named:
-        files = _files(named)
-        try:
-            reader = highlevel.AnyReader(files, default_typestore=store)
-            reader.open()
-        except InputError:
-            raise
-        except Exception as error:  # rosbags raises what zlib, sqlite, YAML and struct raise, beside its own
-            reader = _without_metadata(path, highlevel, store, error) if path.is_dir() else _recovered(path, error)
+        reader = _reader(path, named)
         try:
             yield Bag(path, reader)
         finally:
             reader.close()
 
 
-def _without_metadata(path: Path, highlevel: Any, store: Any, error: Exception) -> Any:
-    """Return a reader of the files of a folder whose metadata.yaml is broken, with a warning. Raises InputError."""
-    files = sorted(item for item in path.iterdir() if item.suffix in ENDINGS)
+def _reader(path: Path, named: Path) -> Any:
+    """Return a reader of a bag; `named` is the same under the ending of its content. Raises InputError."""
     try:
-        reader = highlevel.AnyReader(files, default_typestore=store)
-        reader.open()
-    except Exception:
-        raise _unreadable(path, error) from None
-    warnings.warn(f"{path}: metadata.yaml is broken ({_line(error)}); {len(files)} files are read by themselves", stacklevel=4)
+        if path.is_dir() and not (path / "metadata.yaml").is_file():
+            return _reader_of_files(path, "is missing")
+        return _opened([named])
+    except InputError:
+        raise
+    except Exception as error:  # rosbags raises the errors of zlib, sqlite, YAML and struct in addition to its own
+        with contextlib.suppress(Exception):
+            if path.is_dir():
+                return _reader_of_files(path, f"is broken ({_line(error)})")
+        if path.is_dir() or content_ending(path) != ".mcap":
+            raise _unreadable(path, error) from None
+        return _streamed(path, error)
+
+
+def _opened(files: Sequence[Path]) -> Any:
+    """Return a reader of rosbags. Raises any exception of it, and InputError without the package."""
+    highlevel = need("rosbags.highlevel", "ros", "reading ROS bags")
+    typesys = need("rosbags.typesys", "ros", "reading ROS bags")
+    reader = highlevel.AnyReader(files, default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+    reader.open()
     return reader
 
 
-def _recovered(path: Path, error: Exception) -> RecoveredReader:
-    """Return a reader of what comes before the break, with a warning; InputError where there is nothing."""
-    single = path if path.is_file() else None
-    with path.open("rb") if single else contextlib.nullcontext() as stream:
-        head = stream.read(12) if stream is not None else b""
-    if not head.startswith((b"#ROSBAG V2.0", b"\x89MCAP0")):
-        raise _unreadable(path, error) from None
+def _reader_of_files(folder: Path, problem: str) -> Any:
+    """Return a reader of the files of a folder without a readable metadata.yaml, with a warning."""
+    files = sorted(item for item in folder.iterdir() if item.suffix in ENDINGS)
+    if not files:
+        raise InputError("no bag in this folder", where=folder, expected="metadata.yaml, .db3, .mcap or .bag files")
+    reader = _opened(files)
+    warnings.warn(f"{folder}: metadata.yaml {problem}; {len(files)} files are read by themselves", stacklevel=5)
+    return reader
+
+
+def _streamed(path: Path, error: Exception) -> StreamedMcap:
+    """Return a reader of an MCAP file from its beginning, with a warning where the file breaks off. Raises InputError."""
     try:
-        reader = RecoveredReader(path)
+        reader = StreamedMcap(path)
     except NotRos:
         raise
     except InputError:
         raise _unreadable(path, error) from None
     if "Profile is not" not in str(error):  # a whole file that does not say that it is of ROS 2, or is of ROS 1
         warnings.warn(
-            f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages before the break are read",
-            stacklevel=3,
+            f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages of whole chunks before the "
+            f"break are read; {MENDED['.mcap']}",
+            stacklevel=4,
         )
     return reader
-
-
-def _files(path: Path) -> list[Path]:
-    """Return what the reader takes: a file, a folder with its metadata, or the files of a folder that lost them."""
-    if path.is_file():
-        if not path.stat().st_size:
-            raise InputError("an empty file", where=path, found="0 bytes", expected="a ROS bag")
-        return [path]
-    if (path / "metadata.yaml").is_file():
-        return [path]
-    files = sorted(item for item in path.iterdir() if item.suffix in ENDINGS)
-    if not files:
-        raise InputError("no bag in this folder", where=path, expected="metadata.yaml, .db3, .mcap or .bag files")
-    warnings.warn(f"{path}: metadata.yaml is missing; {len(files)} files are read by themselves", stacklevel=3)
-    return files
 
 
 def _topics(reader: Any) -> list[Topic]:
@@ -195,21 +207,14 @@ def _topics(reader: Any) -> list[Topic]:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    text = _line(error)
-    hint = None
-    if "index" in text.lower():
-        hint = "it was not closed properly: `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) mends it"
-    elif path.is_file() and content_ending(path) is None:
-        return InputError(
-            "not readable as a ROS bag: it is none",
-            where=path,
-            found=_head(path),
-            expected="a whole .bag, .db3, .mcap or ROS 2 folder",
-        )
-    elif path.is_file() and content_ending(path) == ".mcap":
-        hint = "it was not closed properly: `mcap recover FILE` mends it"
+    kind = content_ending(path) if path.is_file() else None
+    none = path.is_file() and kind is None
     return InputError(
-        "not readable as a ROS bag", where=path, found=text, expected="a whole .bag, .db3, .mcap or ROS 2 folder", hint=hint
+        "not readable as a ROS bag" + (": it is none" if none else ""),
+        where=path,
+        found=_head(path) if none else _line(error),
+        expected="a whole .bag, .db3, .mcap or ROS 2 folder",
+        hint=None if none else MENDED.get(kind or "folder"),
     )
 
 
@@ -227,25 +232,3 @@ def _head(path: Path) -> str:
 
 def _line(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-
-
-def _ros1_image(message: Message, path: Path) -> Any:
-    """Decode a sensor_msgs/Image of ROS 1; bytes after its body are left out (the RealSense SDK writes four of them)."""
-    raw, at = message.raw, 0
-    try:
-        _, seconds, nanoseconds, length = struct.unpack_from("<IIII", raw, at)
-        frame_id = raw[16 : 16 + length].decode()
-        at = 16 + length
-        height, width, length = struct.unpack_from("<III", raw, at)
-        encoding = raw[at + 12 : at + 12 + length].decode()
-        at += 12 + length
-        big, step, length = struct.unpack_from("<BII", raw, at)
-        data = raw[at + 9 : at + 9 + length]
-    except (struct.error, UnicodeDecodeError) as error:
-        raise InputError("a broken image message", where=f"{path}, topic {message.topic}", found=_line(error)) from None
-    if len(data) < length:
-        raise InputError(
-            "a broken image message", where=f"{path}, topic {message.topic}", found=f"{len(data)} bytes", expected=f"{length}"
-        )
-    header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
-    return SimpleNamespace(header=header, height=height, width=width, encoding=encoding, is_bigendian=big, step=step, data=data)

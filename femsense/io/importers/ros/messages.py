@@ -12,8 +12,11 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Lens
-from femsense.io.importers.images.pictures import decoded_image
+from femsense.core.pose import make_pose
+from femsense.io.clouds.cloud_files import cloud_of_fields
+from femsense.io.clouds.images import decoded_image
+from femsense.io.importers.frames import BROWN, camera_of_numbers
+from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud
 
 Pixels = npt.NDArray[Any]
@@ -62,6 +65,11 @@ def header_of(message: Any) -> Any:
     """Return the header of a message, or that of the first marker of a MarkerArray; None where there is none."""
     first = next(iter(getattr(message, "markers", ())), None)
     return getattr(message, "header", getattr(first, "header", None))
+
+
+def sdk_values(message: Any) -> dict[str, str]:
+    """Return the values of a text `key=value;key=value` of the RealSense SDK; none of another message, or of no message."""
+    return dict(part.split("=", 1) for part in str(getattr(message, "data", "")).split(";") if "=" in part)
 
 
 def stamp_of(message: Any) -> tuple[float, str]:
@@ -135,7 +143,7 @@ def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
     return np.ascontiguousarray(swapped)
 
 
-def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Lens:
+def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Camera:
     """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for the images that its region and binning leave.
 
     Images as they come have the matrix K and the distortion D; rectified ones have the matrix P and no distortion.
@@ -154,13 +162,13 @@ def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) 
     if model is None and np.any(D != 0.0):
         raise InputError("an unknown distortion model", where=where, found=name, expected=", ".join(sorted(set(MODELS) - {""})))
     if not np.any(D != 0.0):
-        model, D = "brown_conrady", np.zeros(5)
-    fx, fy, cx, cy = (float(K[i]) for i in (0, 4, 2, 5))
-    width, height, roi = int(message.width), int(message.height), message.roi
+        model, D = BROWN, np.zeros(5)
+    size, middle, roi = (int(message.width), int(message.height)), np.array([K[2], K[5]]), message.roi
     if roi.width and roi.height:
-        width, height, cx, cy = int(roi.width), int(roi.height), cx - roi.x_offset, cy - roi.y_offset
-    across, down = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
-    return Lens(width // across, height // down, fx / across, fy / down, cx / across, cy / down, D, model or "brown_conrady")
+        size, middle = (int(roi.width), int(roi.height)), middle - [roi.x_offset, roi.y_offset]
+    binning = np.maximum([message.binning_x, message.binning_y], 1)
+    width, height = np.floor_divide(size, binning).tolist()
+    return camera_of_numbers(width, height, np.array([K[0], K[4]]) / binning, middle / binning, D, model or BROWN)
 
 
 def cloud_of(message: Any, where: str | Path | None) -> PointCloud:
@@ -181,25 +189,17 @@ def cloud_of(message: Any, where: str | Path | None) -> PointCloud:
         {"names": list(formats), "formats": list(formats.values()), "offsets": [fields[n][0] for n in formats], "itemsize": size}
     )
     points = np.ascontiguousarray(rows).reshape(-1).view(kind)
-    xyz = np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    kept = np.isfinite(xyz).all(axis=1) & (xyz != 0.0).any(axis=1)
-    colors = _point_colors(points[kept], formats)
-    return PointCloud(xyz[kept], colors)
+    cloud = cloud_of_fields({n: points[n].astype(points[n].dtype.newbyteorder("=")) for n in formats}, where)
+    kept = cloud.points.any(axis=1)
+    return PointCloud(cloud.points[kept], None if cloud.colors is None else cloud.colors[kept])
 
 
 def pose_matrix(translation: Any, rotation: Any) -> FloatArray:
-    """Return the matrix (4, 4) of a translation and a quaternion x, y, z, w."""
-    x, y, z, w = (float(getattr(rotation, name)) for name in "xyzw")
-    n = np.sqrt(x * x + y * y + z * z + w * w) or 1.0
-    x, y, z, w = x / n, y / n, z / n, w / n
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = place(translation)
-    return T
+    """Return the matrix (4, 4) of a translation and a quaternion x, y, z, w, which need not be of length 1; of zeros: no rotation."""
+    from scipy.spatial.transform import Rotation
+
+    quaternion = [float(getattr(rotation, name)) for name in "xyzw"]
+    return make_pose(Rotation.from_quat(quaternion).as_matrix() if any(quaternion) else np.eye(3), place(translation))
 
 
 def place(point: Any) -> list[float]:
@@ -281,12 +281,3 @@ def _unpack_rvl(data: bytes, where: str | Path | None) -> Pixels:
     except (IndexError, OverflowError):
         raise InputError("a broken depth image", where=where, found=f"{done} pixels", expected=f"{len(result)} pixels") from None
     return result.reshape(height, width)
-
-
-def _point_colors(points: Pixels, formats: dict[str, str]) -> FloatArray | None:
-    name = next((n for n in ("rgb", "rgba") if n in formats), None)
-    if name is None or np.dtype(formats[name]).itemsize != 4:
-        return None
-    column = np.ascontiguousarray(points[name])
-    bits = column.view(column.dtype.str[0] + "u4")
-    return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255.0

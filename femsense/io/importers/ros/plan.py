@@ -1,9 +1,10 @@
-"""What is settled before the frames of a bag are read: columns, clock, loads, where markers stand."""
+"""Decisions before the frames of a bag are read: columns, clock, loads, poses of markers."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -11,21 +12,29 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import unit_of
-from femsense.io.importers.images.pictures import FINE_UNIT
 from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.ros.bag import Bag, Message
-from femsense.io.importers.ros.messages import header_of, markers_of, stamp_of
+from femsense.io.importers.ros.messages import header_of, markers_of, sdk_values, stamp_of
 from femsense.io.importers.ros.topics import Choice, Stream, transform_between, transforms_of
 from femsense.io.importers.several import camera_names
-from femsense.io.importers.tables.mapping import INPUT, LOAD, MARKER, Target, kind_of_target, parse_target
+from femsense.io.importers.tables.mapping import Becomes, Target, kind_of_target, parse_target
 
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""
 PEEKED = 50
-"""So many first messages of a topic say whether its header stamps are a clock."""
+"""Number of first messages that decide whether the header stamps of a topic are a clock."""
 
 SCANNED = 5000
-"""So many first messages of motors say which of their fields is used."""
+"""Number of first messages of motors that decide which of their fields is used."""
+
+
+class Stamps(StrEnum):
+    """Which time stamps are taken."""
+
+    HEADER = "header"
+    RECORD = "record"
+    METADATA = "metadata"
+    """Of the device, as the RealSense SDK keeps them next to images."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +49,10 @@ class Taken:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
-    """How the messages of a bag become frames."""
+    """Mapping of the messages of a bag to frames."""
 
     choice: Choice
-    clock: str
-    unit: float
+    clock: Stamps
     actuation: str | None
     columns: dict[str, dict[str, Taken]]
     """Topic → name of a value → what it becomes."""
@@ -57,12 +65,12 @@ class Plan:
     marker_names: dict[str, str]
     """Name of a marker, or topic of one without a name → its name in the recording."""
     scale: float | None
-    """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
-    names: dict[str, str]
+    """Metres in one unit of clouds, markers and depth in floating point; None where no option gives it: metres."""
+    names: dict[str, tuple[Becomes, ...]]
     """Name that `--map` may take → what it may become."""
 
 
-def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
+def plan_of(bag: Bag, choice: Choice, options: Options, clock: Stamps) -> Plan:
     """Return what is read from a bag, and how: streams, columns, clock."""
     notes = list(choice.notes)
     names = _mappable(bag, choice, options)
@@ -86,12 +94,10 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     used = [s for s in choice.markers if s.topic.name in poses]
     choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
     renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
-    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else options.depth_unit or choice.depth_unit_m
     scale = None if options.unit is None else unit_of(options, None, bag.path, 0.0)
     return Plan(
         choice,
         clock,
-        unit,
         actuation,
         columns,
         points,
@@ -128,7 +134,7 @@ PRESSURES = "pressures are taken as pascals above the surroundings; FluidPressur
 
 
 def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
-    """Return what is assumed of inputs whose unit nobody said."""
+    """Return the assumptions about inputs whose unit is not declared."""
     notes = []
     for topic, values in columns.items():
         for field in FIELDS:
@@ -141,20 +147,23 @@ def _notes_of_units(columns: dict[str, dict[str, Taken]]) -> list[str]:
     return notes
 
 
-def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, str]:
+def _mappable(bag: Bag, choice: Choice, options: Options) -> dict[str, tuple[Becomes, ...]]:
     """Return the names that `--map` may take; those of markers are sought in the messages where one is not known otherwise."""
-    names = {stream.topic.name: LOAD for stream in choice.loads} | {stream.topic.name: MARKER for stream in choice.markers}
+    names: dict[str, tuple[Becomes, ...]] = dict.fromkeys((s.topic.name for s in choice.loads), (Becomes.LOAD,))
+    names |= dict.fromkeys((s.topic.name for s in choice.markers), (Becomes.MARKER,))
     for stream in choice.inputs if options.columns else ():
         for name, fld in _largest_values(bag, stream):
             whole = (stream.topic.name,) if _is_pressure(stream) else ()
-            names |= dict.fromkeys((name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), INPUT)
+            names |= dict.fromkeys(
+                (name, *whole, f"{stream.topic.name}.{name}", *([f"{name}.{fld}"] if fld else [])), (Becomes.INPUT,)
+            )
     for stream in choice.markers:
         for message in bag.messages([stream.topic.name]):
             if set(options.columns) <= set(names):
                 break
             with contextlib.suppress(InputError):
                 found = markers_of(bag.decode(message), stream.topic.type)
-                names |= {label: MARKER for label, _ in found if label and label not in names}
+                names |= {label: (Becomes.MARKER,) for label, _ in found if label and label not in names}
     return names
 
 
@@ -186,7 +195,7 @@ def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict
                 fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
                 columns[name] = Taken(fld, parse_target(options.columns[key]))
     if not columns and not any(key in options.columns for key in names):
-        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) == INPUT}
+        targets = {parse_target(new).name for new in options.columns.values() if kind_of_target(new) is Becomes.INPUT}
         prefix = "chamber_" if _is_pressure(stream) else "cable_"
         for name in names:
             usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
@@ -237,17 +246,17 @@ def _marker_poses(bag: Bag, choice: Choice, notes: list[str]) -> dict[str, Float
     return poses
 
 
-def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
+def clock_of(bag: Bag, choice: Choice, options: Options) -> Stamps:
     """Return whose time stamps are used.
 
-    "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
-    like the time of recording (those of the SDK may count from elsewhere); else "record".
+    METADATA where the RealSense SDK keeps the device's time there; HEADER where the stamps of all streams with a header go on like
+    the time of recording (those of the SDK may count from elsewhere); else RECORD.
     """
-    if options.clock is not Clock.auto:
-        return options.clock
+    if options.clock != Clock.AUTO:
+        return Stamps(options.clock)
     sdk = is_sdk(choice.primary.topic.name)
-    if sdk and _metadata(bag, choice, "metadata"):
-        return "metadata"
+    if sdk and _metadata(bag, choice, Stamps.METADATA):
+        return Stamps.METADATA
     for stream in chosen_streams(choice):
         shifts, last = [], -np.inf
         for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
@@ -259,35 +268,36 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
                 continue
             time, _ = stamp_of(decoded)
             if time <= 0.0 or time < last:
-                return "record"
+                return Stamps.RECORD
             last = time
             shifts.append(message.record - time)
         if shifts and not sdk and (np.ptp(shifts) > LAG_S or abs(float(np.median(shifts))) > LAG_S):
-            return "record"
-    return "header"
+            return Stamps.RECORD
+    return Stamps.HEADER
 
 
-def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
+def _metadata(bag: Bag, choice: Choice, clock: Stamps) -> dict[str, str]:
     """Return topic of metadata → topic of images where the first of them holds a time of the device."""
-    if clock != "metadata":
+    if clock is not Stamps.METADATA:
         return {}
     names = {t.name: t.type for t in bag.topics}
     pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
     found = {f"{name.split('/image/')[0]}/image/metadata": name for name in pictures}
-    firsts = [next(bag.messages([topic]), None) for topic in found if names.get(topic) == "std_msgs/msg/String"]
-    told = [first is not None and device_time(bag.decode(first)) is not None for first in firsts]
-    return found if told and len(told) == len(found) and all(told) else {}
+    texts = all(names.get(topic) == "std_msgs/msg/String" for topic in found)
+    return found if texts and all(device_time(bag.first([topic])) is not None for topic in found) else {}
 
 
 def device_time(decoded: Any) -> float | None:
     """Return the device's time [s] in the text of an image's metadata; None where it holds none."""
-    parts = dict(part.split("=", 1) for part in str(decoded.data).split(";") if "=" in part)
+    parts = sdk_values(decoded)
     return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
 
 
-def header_time(decoded: Any, message: Message) -> float:
-    """Return the time in the header of a message [s]; that of its record where it has none."""
-    time, _ = stamp_of(decoded)
+def time_of(bag: Bag, plan: Plan, message: Message, decoded: Any = None) -> float:
+    """Return the time of a message [s] on the chosen clock: of its header, where it has one, else of its recording."""
+    if plan.clock is not Stamps.HEADER:
+        return message.record
+    time, _ = stamp_of(bag.decode(message) if decoded is None else decoded)
     return time if time > 0.0 else message.record
 
 

@@ -15,12 +15,12 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import DepthImage, Frame, Images, Source, check_reach, upright
+from femsense.io.importers.frames import DepthImage, Format, Frame, Images, Source, check_reach, is_kept_as_image, upright
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.images.pictures import depth_of_metres
 from femsense.io.importers.options import Clock, Options
-from femsense.io.importers.ros.bag import Bag, Message, open_bag
+from femsense.io.importers.ros.bag import BEGINNINGS, ENDINGS, Bag, Message, open_bag
 from femsense.io.importers.ros.messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
 from femsense.io.importers.ros.plan import (
     LAG_S,
@@ -28,15 +28,18 @@ from femsense.io.importers.ros.plan import (
     chosen_streams,
     clock_of,
     device_time,
-    header_time,
     is_sdk,
     named_values,
     plan_of,
+    time_of,
 )
-from femsense.io.importers.ros.topics import Stream, cameras_of, choose, robot_pose, streams_of
+from femsense.io.importers.ros.topics import Kind, Stream, cameras_of, choose, robot_pose, streams_of
 from femsense.io.importers.several import camera_names, joined
 from femsense.io.importers.tables.input_samples import NEAR_S, Samples, samples_of
 from femsense.pointcloud.cloud import PointCloud
+
+SDK = "realsense"
+"""Format of a bag that the RealSense SDK wrote."""
 
 
 def open_ros(path: Path, options: Options) -> Source:
@@ -52,7 +55,7 @@ def open_ros(path: Path, options: Options) -> Source:
             return _source(bag, streams, options)
         sources = _sources(bag, streams, cameras, options)
         if len({source.found["clock"] for source in sources.values()}) > 1:
-            sources = _sources(bag, streams, cameras, replace(options, clock=Clock.record))
+            sources = _sources(bag, streams, cameras, replace(options, clock=Clock.RECORD))
     return joined(sources, path, options)
 
 
@@ -65,7 +68,7 @@ def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], option
     for name, topic in zip(camera_names(list(cameras)), cameras):
         left = [s for s in streams if s.topic.name not in taken]
         sources[name] = _source(bag, left, replace(options, topics=(topic, *(t for t in others if t not in taken))))
-        taken |= set(sources[name].found.get("marker_topics", ()))
+        taken |= set(sources[name].found["marker_topics"] or ())
     return sources
 
 
@@ -78,24 +81,23 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
     found = {
         "clock": clock,
         "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in chosen_streams(choice)],
-        "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
+        "not_taken": [s.topic.name for s in streams if s.kind is not Kind.OTHER and s not in chosen_streams(choice)] or None,
         "marker_topics": [s.topic.name for s in choice.markers] or None,
-        "depth_unit_m": plan.unit if choice.lens else None,
+        "depth_unit_m": choice.lens and choice.lens.depth_unit,
         "lens": None if choice.lens is None else lens_line(choice.lens),
         "camera_frame": choice.primary.frame or None,
     }
     return Source(
-        "realsense" if is_sdk(choice.primary.topic.name) else "ros",
         bag.path,
         partial(_frames, bag.path, plan),
-        found={key: value for key, value in found.items() if value is not None},
-        lens=choice.lens,
-        depth_unit_m=plan.unit,
+        found=found,
+        camera=choice.lens,
         actuation=plan.actuation,
         count=choice.primary.topic.count,
         notes=plan.notes,
         T_robot_camera=robot_pose(bag, choice.primary, options.base),
         names=plan.names,
+        format=SDK if is_sdk(choice.primary.topic.name) else "",
     )
 
 
@@ -105,7 +107,7 @@ def list_ros(path: Path) -> dict[str, Any]:
         rows = [
             {"topic": s.topic.name, "holds": s.kind, "type": s.topic.type, "messages": s.topic.count, "frame": s.frame or None}
             for s in streams_of(bag)
-            if s.kind != "other"
+            if s.kind is not Kind.OTHER
         ]
         return {"topics": rows, "other_topics": sum(t.count > 0 for t in bag.topics) - len(rows)}
 
@@ -117,7 +119,7 @@ def topics_of(path: Path) -> set[str]:
 
 @dataclass(eq=False, slots=True)
 class _Track:
-    """What a secondary stream said lately."""
+    """Recent messages of a secondary stream."""
 
     times: deque[float] = field(default_factory=deque)
     values: deque[Any] = field(default_factory=deque)
@@ -188,8 +190,7 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
             except InputError as problem:
                 broken.append(" ".join(str(problem).split()))
                 continue
-            time = message.record if plan.clock != "header" else header_time(decoded, message)
-            rows.extend([time, *_values(plan, message, decoded)])
+            rows.extend([time_of(bag, plan, message, decoded), *_values(plan, message, decoded)])
     if broken:
         warnings.warn(f"{len(broken)} messages of {topic} are left out: {broken[0]}", stacklevel=2)
     table = np.array(rows).reshape(-1, 1 + (3 if topic in plan.load_points else len(plan.columns[topic])))
@@ -199,21 +200,17 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
 def _take(
     bag: Bag, plan: Plan, message: Message, primary: str, tracks: dict[str, _Track], waiting: deque[tuple[float, Message, Any]]
 ) -> None:
-    lazy = plan.choice.lens is not None or plan.choice.primary.kind == "cloud"
+    lazy = plan.choice.lens is not None or plan.choice.primary.kind is Kind.CLOUD
     if message.topic in plan.metadata:
         tracks[plan.metadata[message.topic]].stamp(message.record, device_time(bag.decode(message)))
         return
     if message.topic == primary:
-        needed = None if lazy and plan.clock != "header" else bag.decode(message)
-        time = message.record if needed is None or plan.clock != "header" else header_time(needed, message)
-        waiting.append((time, message, None if lazy else needed))
+        decoded = None if lazy else bag.decode(message)
+        waiting.append((time_of(bag, plan, message, decoded), message, decoded))
         return
-    if plan.choice.color is not None and message.topic == plan.choice.color.topic.name:
-        time = message.record if plan.clock != "header" else header_time(bag.decode(message), message)
-        tracks[message.topic].add(time, message)
-        return
-    decoded = bag.decode(message)
-    tracks[message.topic].add(message.record if plan.clock != "header" else header_time(decoded, message), decoded)
+    is_color = plan.choice.color is not None and message.topic == plan.choice.color.topic.name
+    decoded = None if is_color else bag.decode(message)
+    tracks[message.topic].add(time_of(bag, plan, message, decoded), message if is_color else decoded)
 
 
 def _frame(
@@ -232,9 +229,9 @@ def _frame(
     device = tracks[message.topic].stamps.get(message.record) if plan.metadata else None
     color = None if choice.color is None else tracks[choice.color.topic.name].nearest(time, device)
     picture: Callable[[], Images | PointCloud] | None = None
-    if choice.primary.kind == "depth":
+    if choice.primary.kind is Kind.DEPTH:
         picture = partial(_images, bag, plan, message, color, rays)
-    elif choice.primary.kind == "cloud":
+    elif choice.primary.kind is Kind.CLOUD:
         picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
     now = {topic: one.at(time)[0] for topic, one in samples.items()}
@@ -264,10 +261,10 @@ def _images(bag: Bag, plan: Plan, message: Message, color: Message | None, rays:
         seen = red_first(seen, kind)
         T = choice.T_color_depth
         same = np.array_equal(T, np.eye(4)) and seen.shape[:2] == depth.shape
-        pixels = seen if same else registered_color(depth, rays, plan.unit, seen, choice.color_lens, T)
-    if lens.storable:
+        pixels = seen if same else registered_color(depth, rays, lens.depth_unit, seen, choice.color_lens, T)
+    if is_kept_as_image(lens):
         return Images(depth, pixels)
-    points, mask = depth_points(depth, rays, plan.unit)
+    points, mask = depth_points(depth, rays, lens.depth_unit)
     return PointCloud(points, None if pixels is None else pixels[mask] / 255.0)
 
 
@@ -320,3 +317,13 @@ def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:
     given = named_values(decoded, message.type)
     scaled = ((one.target, given.get((name, one.field), np.nan)) for name, one in columns.items())
     return np.array([target.factor * value + target.offset for target, value in scaled])
+
+
+def _is_bag(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or any(item.suffix in (".db3", ".mcap") for item in path.iterdir())
+    return path.suffix.lower() in ENDINGS or head.startswith(tuple(begin for begin, _ in BEGINNINGS))
+
+
+ROS = Format("ros", open_ros, _is_bag, ("--rate",), list_ros, ENDINGS, topics_of, whole_depths=True, transforms=True)
+REALSENSE = replace(ROS, name=SDK, recognises=lambda path, head: False, unused=("--rate", "--up", "--unit"), endings=())

@@ -5,21 +5,24 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.pose import make_pose
 from femsense.core.text import did_you_mean
-from femsense.io.importers.frames import Lens
 from femsense.io.importers.images.intrinsics import check_lens
+from femsense.io.importers.images.pictures import FINE_UNIT
 from femsense.io.importers.options import Options
 from femsense.io.importers.ros.bag import Bag, Topic
-from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
+from femsense.io.importers.ros.messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, sdk_values, stamp_of
+from femsense.model.camera import Camera
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUD = "PointCloud2"
 MARKERS = ("PoseArray", "MarkerArray", "Markers", "RigidBodies", "PoseStamped", "PointStamped")
 INPUTS = ("JointState", "Float64MultiArray", "Float32MultiArray", "FluidPressure")
 TRANSPORTS = ("/compressedDepth", "/compressed", "/theora", "/ffmpeg")
@@ -27,7 +30,19 @@ INFRARED = re.compile(r"(^|[/_])(ir|infra\d?|infrared\d?)([/_]|$)")
 """Names of topics whose images of 16 bits are no depth."""
 RECTIFIED = re.compile(r"(^|[/_])rect(_[^/]*)?$")
 """Names of topics whose images have no distortion any more, such as image_rect and image_rect_raw (image_proc)."""
-KINDS = ("depth", "cloud", "color", "grey", "markers", "inputs", "loads", "other")
+
+
+class Kind(StrEnum):
+    """The content of a topic."""
+
+    DEPTH = "depth"
+    CLOUD = "cloud"
+    COLOR = "color"
+    GREY = "grey"
+    MARKERS = "markers"
+    INPUTS = "inputs"
+    LOADS = "loads"
+    OTHER = "other"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,8 +50,7 @@ class Stream:
     """A topic and what it holds."""
 
     topic: Topic
-    kind: str
-    """One of KINDS."""
+    kind: Kind
     frame: str = ""
     """Its coordinate frame."""
     encoding: str = ""
@@ -48,15 +62,15 @@ class Choice:
 
     primary: Stream
     """Its messages are the frames."""
-    color: Stream | None
     markers: tuple[Stream, ...]
     inputs: tuple[Stream, ...]
     loads: tuple[Stream, ...]
-    lens: Lens | None
-    color_lens: Lens | None
-    T_color_depth: FloatArray | None
+    color: Stream | None = None
+    lens: Camera | None = None
+    """Of the depth images, with their unit."""
+    color_lens: Camera | None = None
+    T_color_depth: FloatArray | None = None
     """Shape (4, 4), translation [m]; None where it is not known."""
-    depth_unit_m: float
     notes: tuple[str, ...] = ()
 
 
@@ -73,16 +87,16 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
     """
     _check_topics(streams, options)
     wanted = [s for s in streams if not options.topics or s.topic.name in options.topics]
-    of = {kind: [s for s in wanted if s.kind == kind] for kind in KINDS}
-    for kind in ("inputs", "loads", "color", "markers"):
-        of[kind] = of[kind] or [s for s in streams if s.kind == kind]
-    depth, cloud = _one(bag, of["depth"], "depth images"), None
+    of = {kind: [s for s in wanted if s.kind is kind] for kind in Kind}
+    for kind in (Kind.INPUTS, Kind.LOADS, Kind.COLOR, Kind.MARKERS):
+        of[kind] = of[kind] or [s for s in streams if s.kind is kind]
+    depth, cloud = _one(bag, of[Kind.DEPTH], "depth images"), None
     if depth is None:
-        cloud = _one(bag, of["cloud"], "clouds")
-    primary = depth or cloud or next(iter(of["markers"]), None) or next(iter(of["inputs"]), None)
+        cloud = _one(bag, of[Kind.CLOUD], "clouds")
+    primary = depth or cloud or next(iter(of[Kind.MARKERS]), None) or next(iter(of[Kind.INPUTS]), None)
     if primary is None:
         found = ", ".join(f"{s.topic.name} ({s.topic.type})" for s in streams[:12]) or "no messages"
-        lost = [s.topic.name for s in streams if s.kind in ("grey", "color") and "depth" in s.topic.name]
+        lost = [s.topic.name for s in streams if s.kind in (Kind.GREY, Kind.COLOR) and "depth" in s.topic.name]
         raise InputError(
             "nothing that can be taken",
             where=bag.path,
@@ -90,7 +104,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             expected="depth images, PointCloud2, markers or inputs",
             hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
         )
-    choice = Choice(primary, None, tuple(of["markers"]), tuple(of["inputs"]), tuple(of["loads"]), None, None, None, 0.001)
+    choice = Choice(primary, tuple(of[Kind.MARKERS]), tuple(of[Kind.INPUTS]), tuple(of[Kind.LOADS]))
     if depth is None:
         return choice
     lens = _lens(bag, depth)
@@ -101,16 +115,16 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             found="no CameraInfo",
             expected="its CameraInfo topic",
         )
-    choice = replace(choice, lens=lens, depth_unit_m=_depth_unit(bag, depth))
-    others = [s.topic.name for s in of["cloud"]]
+    choice = replace(choice, lens=replace(lens, depth_unit=_depth_unit(bag, depth, options)))
+    others = [s.topic.name for s in of[Kind.CLOUD]]
     notes = (f"clouds that are there too, and not taken: {', '.join(others)}",) if others else ()
-    return _with_color(bag, replace(choice, notes=notes), of["color"])
+    return _with_color(bag, replace(choice, notes=notes), of[Kind.COLOR])
 
 
 def cameras_of(streams: Sequence[Stream], options: Options) -> list[str]:
     """Return the topics of pictures that a person named, where those are several cameras; else none."""
-    for kind in ("depth", "cloud"):
-        named = [s.topic.name for s in streams if s.kind == kind and s.topic.name in options.topics]
+    for kind in (Kind.DEPTH, Kind.CLOUD):
+        named = [s.topic.name for s in streams if s.kind is kind and s.topic.name in options.topics]
         if named:
             return named if len({_base(name) for name in named}) > 1 else []
     return []
@@ -172,41 +186,36 @@ def _stream(bag: Bag, topic: Topic) -> Stream:
     short = topic.type.split("/")[-1]
     if topic.type in IMAGES:
         return _image_stream(bag, topic)
-    if topic.type == CLOUD:
-        return Stream(topic, "cloud", _frame(bag, topic))
-    if short in MARKERS:
-        return Stream(topic, "markers", _frame(bag, topic))
     if short in INPUTS:
-        return Stream(topic, "inputs")
-    return Stream(topic, "loads" if short == "WrenchStamped" else "other", _frame(bag, topic) if short == "WrenchStamped" else "")
+        return Stream(topic, Kind.INPUTS)
+    places = {CLOUD: Kind.CLOUD, "WrenchStamped": Kind.LOADS, **dict.fromkeys(MARKERS, Kind.MARKERS)}
+    return Stream(topic, places[short], _frame(bag, topic)) if short in places else Stream(topic, Kind.OTHER)
 
 
 def _image_stream(bag: Bag, topic: Topic) -> Stream:
-    first = next(bag.messages([topic.name]), None)
-    try:
-        message = None if first is None else bag.decode(first)
-    except InputError:
-        message = None
+    message = _first_whole(bag, topic)
     if message is None:
-        return Stream(topic, "other")
+        return Stream(topic, Kind.OTHER)
     frame = stamp_of(message)[1]
     encoding = getattr(message, "encoding", None) or message.format
     if encoding.partition(";")[0].strip() in DEPTH or "compressedDepth" in encoding:
         infrared = encoding != "32FC1" and INFRARED.search(topic.name) is not None
-        return Stream(topic, "grey" if infrared else "depth", frame, encoding)
+        return Stream(topic, Kind.GREY if infrared else Kind.DEPTH, frame, encoding)
     grey = encoding in ("mono8", "8UC1") or encoding.startswith("mono8")
-    return Stream(topic, "grey" if grey else "color", frame, encoding)
+    return Stream(topic, Kind.GREY if grey else Kind.COLOR, frame, encoding)
 
 
 def _frame(bag: Bag, topic: Topic) -> str:
-    first = next(bag.messages([topic.name]), None)
-    try:
-        message = None if first is None else bag.decode(first)
-    except InputError:
-        return ""
-    if topic.type.endswith("MarkerArray"):
-        return str(message.markers[0].header.frame_id) if message is not None and len(message.markers) else ""
+    message = _first_whole(bag, topic)
     return "" if message is None else stamp_of(message)[1]
+
+
+def _first_whole(bag: Bag, topic: Topic) -> Any:
+    """Return the first message of a topic; None where it has none, or a broken one."""
+    try:
+        return bag.first([topic.name])
+    except InputError:
+        return None
 
 
 def _check_topics(streams: Sequence[Stream], options: Options) -> None:
@@ -254,39 +263,36 @@ def _nearest(name: str, topics: Sequence[Topic]) -> Topic | None:
     return best if best is not None and (_shared(name, best.name) >= 2 or len(topics) == 1) else None
 
 
-def _lens(bag: Bag, stream: Stream) -> Lens | None:
+def _lens(bag: Bag, stream: Stream) -> Camera | None:
     infos = [t for t in bag.topics if t.type.endswith("/CameraInfo") and t.count]
     topic = _nearest(stream.topic.name, infos)
-    first = None if topic is None else next(bag.messages([topic.name]), None)
-    if first is None:
+    info = None if topic is None else bag.first([topic.name])
+    if topic is None or info is None:
         return None
-    info = bag.decode(first)
     frame, folder = stamp_of(info)[1], _base(stream.topic.name).rpartition("/")[0]
-    if frame and stream.frame and frame != stream.frame and not first.topic.startswith((f"{folder}/", "/device_")):
+    if frame and stream.frame and frame != stream.frame and not topic.name.startswith((f"{folder}/", "/device_")):
         return None  # another camera's
-    lens = lens_of(info, f"{bag.path}, topic {first.topic}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
-    check_lens(lens, f"{bag.path}, topic {first.topic}")
+    lens = lens_of(info, f"{bag.path}, topic {topic.name}", rectified=RECTIFIED.search(_base(stream.topic.name)) is not None)
+    check_lens(lens, f"{bag.path}, topic {topic.name}")
     model = _sdk_model(bag, stream.topic.name)
-    return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
+    return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, distortion_model=model)
 
 
 def _sdk_model(bag: Bag, name: str) -> str | None:
     """Return the distortion model that a file of the RealSense SDK from 2.58 names in a text; its CameraInfo says plumb_bob to all."""
-    first = next(bag.messages([t.name for t in bag.topics if t.name == f"{name.split('/image/')[0]}/camera_info"]), None)
-    text = None if first is None else getattr(bag.decode(first), "data", None)
-    parts = dict(part.split("=", 1) for part in str(text).split(";") if "=" in part)
-    return MODELS.get(parts.get("model", "").strip().lower()) if "model" in parts else None
+    parts = sdk_values(bag.first([t.name for t in bag.topics if t.name == f"{name.split('/image/')[0]}/camera_info"]))
+    return MODELS.get(parts["model"].strip().lower()) if "model" in parts else None
 
 
-def _depth_unit(bag: Bag, stream: Stream) -> float:
-    """Return metres in one unit: the option of the sensor in a RealSense recording; else the millimetre that ROS prescribes."""
-    sensor = "/".join(stream.topic.name.split("/")[:3])
-    names = [t.name for t in bag.topics if t.name.startswith(sensor) and t.name.endswith("option/Depth_Units/value")]
-    names += [t.name for t in bag.topics if t.name.startswith(sensor) and t.name.endswith("option/Depth Units/value")]
-    first = next(bag.messages(names), None)
-    if first is None:
-        return 0.001
-    return float(bag.decode(first).data)
+def _depth_unit(bag: Bag, stream: Stream, options: Options) -> float:
+    """Return metres in one unit: FINE_UNIT for floating point, as a person says, the option of a RealSense sensor, or the millimetre of REP 118."""
+    if stream.encoding.startswith("32FC1"):
+        return FINE_UNIT
+    if options.depth_unit is not None:
+        return options.depth_unit
+    sensor, ends = "/".join(stream.topic.name.split("/")[:3]), ("option/Depth_Units/value", "option/Depth Units/value")
+    option = bag.first([t.name for t in bag.topics if t.name.startswith(sensor) and t.name.endswith(ends)])
+    return 0.001 if option is None else float(option.data)
 
 
 def _with_color(bag: Bag, choice: Choice, streams: Sequence[Stream]) -> Choice:
@@ -324,27 +330,21 @@ def _sdk_transform(bag: Bag, name: str) -> FloatArray | None:
     """Return T_stream_reference as the RealSense SDK stores it: a Transform (.bag),
     or text with the rotation by columns (.db3)."""
     stream = name.split("/image/")[0]
-    first = next(bag.messages([t.name for t in bag.topics if t.name.startswith(f"{stream}/tf/")]), None)
-    if first is None:
+    message = bag.first([t.name for t in bag.topics if t.name.startswith(f"{stream}/tf/")])
+    if message is None:
         return None
-    message: Any = bag.decode(first)
     if not hasattr(message, "data"):
         return pose_matrix(message.translation, message.rotation)
-    parts = dict(part.split("=", 1) for part in str(message.data).split(";") if "=" in part)
-    T = np.eye(4)
-    T[:3, :3] = np.array([float(v) for v in parts["rotation"].split(",")]).reshape(3, 3).T
-    T[:3, 3] = [float(v) for v in parts["translation"].split(",")]
-    return T
+    parts = sdk_values(message)
+    return _pose_of_columns(parts["rotation"].split(","), parts["translation"].split(","))
 
 
 def _driver_extrinsics(bag: Bag) -> FloatArray | None:
     """Return T_color_depth of realsense2_camera_msgs/Extrinsics: nine numbers by columns, then a translation [m]."""
-    names = [t.name for t in bag.topics if t.name.endswith("extrinsics/depth_to_color")]
-    first = next(bag.messages(names), None)
-    if first is None:
-        return None
-    message: Any = bag.decode(first)
-    T = np.eye(4)
-    T[:3, :3] = np.asarray(message.rotation, dtype=float).reshape(3, 3).T
-    T[:3, 3] = np.asarray(message.translation, dtype=float)
-    return T
+    message = bag.first([t.name for t in bag.topics if t.name.endswith("extrinsics/depth_to_color")])
+    return None if message is None else _pose_of_columns(message.rotation, message.translation)
+
+
+def _pose_of_columns(rotation: Sequence[Any], translation: Sequence[Any]) -> FloatArray:
+    """Return the matrix (4, 4) of nine numbers by columns and a translation."""
+    return make_pose(np.asarray(rotation, dtype=np.float64).reshape(3, 3).T, np.asarray(translation, dtype=np.float64))

@@ -20,6 +20,7 @@ from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit, unit_named
 from femsense.io.text_numbers import TIMES_READ, Notation, notation_of, number_in
 
+ENDINGS = (".csv", ".txt", ".tsv", ".trc")
 TIMES = (
     "time",
     "t",
@@ -46,10 +47,15 @@ ENDED = re.compile(
 NO_TEXT = bytes([*range(9), *range(14, 27), *range(28, 32)])
 """Bytes that stand in no text."""
 EMPTY = ("", "na", "n/a", "null", "none")
-"""What stands in a cell without a number, in small letters; float() reads "nan" itself."""
+"""Cells without a number, in small letters; float() reads "nan" itself."""
 MARKS = "\t;,"
 LOOKED_AT = 20
-"""So many first lines tell what stands between the cells."""
+"""Number of first lines that decide which mark separates the cells."""
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file has the ending of a table of text, gzipped or not."""
+    return path.is_file() and path.name.lower().removesuffix(".gz").endswith(ENDINGS)
 
 
 @contextmanager
@@ -92,7 +98,7 @@ def _encoding(head: bytes) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a table is written."""
+    """Separator and notation of a table."""
 
     mark: str
     """Between the cells."""

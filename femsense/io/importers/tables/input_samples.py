@@ -8,12 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 
 NEAR_S = 0.05
-"""What was sampled at most this far from a frame belongs to it [s]."""
+"""A sample belongs to a frame at most this far from it [s]."""
 STEPS = 3.0
-"""Two samples that are farther apart than so many usual steps have a hole between: two lost in a row are bridged."""
+"""Two samples farther apart than this times the usual step enclose a hole: two lost in a row are bridged."""
+
+
+def nearest_in_time(times: FloatArray, other: FloatArray, within: float) -> IntArray:
+    """Return for each time the index of the nearest other one, shape (times,); −1 where none is within [s]. `other` increases."""
+    if not len(other):
+        return np.full(len(times), -1, dtype=np.int64)
+    right = np.clip(np.searchsorted(other, times), 0, len(other) - 1)
+    left = np.maximum(right - 1, 0)
+    near = np.where(np.abs(times - other[left]) <= np.abs(times - other[right]), left, right)
+    return np.where(np.abs(times - other[near]) <= within, near, -1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

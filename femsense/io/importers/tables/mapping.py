@@ -1,4 +1,4 @@
-"""`--map NAME=TARGET`: what a name in a source becomes in the recording, and what a unit beside a name says."""
+"""`--map NAME=TARGET`: the target of a name in the recording, and the unit next to a name."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -17,29 +18,33 @@ from femsense.core.text import did_you_mean, plain_name
 from femsense.core.units import Quantity, Unit, unit_named, units_of
 from femsense.io.importers.tables.csv_tables import column_unit
 
-INPUT, MARKER, LOAD, COLUMN = "input", "marker", "load", "input, time, axis"
-"""What a name may become."""
+
+class Becomes(StrEnum):
+    """Kind of target of a name in the recording; the values show how it is written."""
+
+    INPUT = "cable_NAME or chamber_NAME"
+    MARKER = "marker.NAME"
+    LOAD = "load@X,Y,Z"
+    TIME = "time"
+    AXIS = "NAME.x, NAME.y or NAME.z"
+
+
+COLUMN = (Becomes.INPUT, Becomes.TIME, Becomes.AXIS)
+"""Kinds of target of a column of a table."""
 TARGETS = (
     "cable_NAME, chamber_NAME, time (a factor or a unit may follow: *0.001, *kPa, *1-101325), NAME.x, marker.NAME or load@X,Y,Z"
 )
-SHAPES = {
-    INPUT: "cable_NAME or chamber_NAME",
-    MARKER: "marker.NAME",
-    LOAD: "load@X,Y,Z",
-    "time": "time",
-    "axis": "NAME.x, NAME.y or NAME.z",
-}
 NAME = re.compile(r"[^\s,;\"'*=@](?:[^,;\"'*=@]*[^\s,;\"'*=@])?")
 IN_BRACKETS = re.compile(r".+?[\[(]\s*([^\[\]]+?)\s*[\])]\s*")
 NUMBER = r"\d*\.?\d+(?:[eE][-+]?\d+)?"
 SCALE = re.compile(rf"([-+]?{NUMBER}\.?)([-+]{NUMBER})?")
 QUANTITIES = {"time": (Quantity.TIME,), "chamber": (Quantity.PRESSURE,), "cable": (Quantity.FORCE, Quantity.LENGTH)}
-"""What a target holds, by how it begins."""
+"""First word of a target → quantities of its values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What a name becomes: value = factor × what stands there + offset."""
+    """Target of a name: value = factor × value in the file + offset."""
 
     name: str
     factor: float = 1.0
@@ -47,7 +52,7 @@ class Target:
     unit: Unit | None = None
     """Where one was named."""
     scaled: bool = False
-    """Whether a factor or a unit was said."""
+    """Whether the target has a factor or a unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +88,22 @@ def check_targets(columns: Mapping[str, str]) -> None:
         names[name] = old
 
 
-def kind_of_target(target: str) -> str | None:
-    """Return INPUT, MARKER, LOAD, "time" or "axis"; None for what is no target. Raises InputError: a factor that is none."""
+def kind_of_target(target: str) -> Becomes | None:
+    """Return what a target names; None for what is no target. Raises InputError: a factor that is none."""
     if target.startswith("load@"):
-        return LOAD
+        return Becomes.LOAD
     name = parse_target(target).name
     if name == "time":
-        return "time"
+        return Becomes.TIME
     stem, dot, last = name.rpartition(".")
     for begin in ("cable_", "chamber_"):
         if name.startswith(begin):
-            return INPUT if NAME.fullmatch(name.removeprefix(begin)) else None
+            return Becomes.INPUT if NAME.fullmatch(name.removeprefix(begin)) else None
     if "*" in target:  # lengths have --unit
         return None
     if dot and last in ("x", "y", "z") and NAME.fullmatch(stem):
-        return "axis"
-    return MARKER if name.startswith("marker.") and NAME.fullmatch(name.removeprefix("marker.")) else None
+        return Becomes.AXIS
+    return Becomes.MARKER if name.startswith("marker.") and NAME.fullmatch(name.removeprefix("marker.")) else None
 
 
 def parse_target(target: str) -> Target:
@@ -123,12 +128,14 @@ def parse_target(target: str) -> Target:
     )
 
 
-def check_names(columns: Mapping[str, str], known: Mapping[str, str], path: Path, elsewhere: Sequence[str] = ()) -> None:
+def check_names(
+    columns: Mapping[str, str], known: Mapping[str, Sequence[Becomes]], path: Path, elsewhere: Sequence[str] = ()
+) -> None:
     """Refuse names that the source lacks, and markers that would become inputs or the other way round.
 
     Arguments:
         columns: name in the source → target.
-        known: name in the source → what it may become, of INPUT, MARKER, LOAD, COLUMN.
+        known: name in the source → what it may become.
         path: the source, for the message.
         elsewhere: names of the columns of a log of actuation, which were looked at first.
 
@@ -138,21 +145,22 @@ def check_names(columns: Mapping[str, str], known: Mapping[str, str], path: Path
     for old, new in columns.items():
         if old not in known:
             raise unknown_name(old, new, known, path, elsewhere)
-        able, kind = known[old].split(", "), kind_of_target(new)
-        if kind not in able and not (kind == "axis" and new.startswith("marker.") and MARKER in able):
+        able, kind = known[old], kind_of_target(new)
+        if kind not in able and not (kind is Becomes.AXIS and new.startswith("marker.") and Becomes.MARKER in able):
             raise InputError(
                 f"{old} cannot become {new}",
                 where=f"{path}, --map {old}={new}",
                 found=new,
-                expected="; ".join(SHAPES[word] for word in able),
+                expected="; ".join(able),
             )
 
 
-def check_taken(columns: Mapping[str, str], known: Mapping[str, str], path: Path) -> None:
+def check_taken(columns: Mapping[str, str], known: Mapping[str, Sequence[Becomes]], path: Path) -> None:
     """Refuse a marker that gets the name of another one of the same source, which keeps it. Raises InputError."""
     for old, new in columns.items():
         name = new.removeprefix("marker.")
-        if known.get(old) == MARKER == known.get(name) and name not in {old, old.rpartition(":")[2], *columns}:
+        both = known.get(old, ()), known.get(name, ())
+        if all(Becomes.MARKER in able for able in both) and name not in {old, old.rpartition(":")[2], *columns}:
             raise InputError(
                 "two names become the same",
                 where=f"{path}, --map {old}={new}",
@@ -186,7 +194,7 @@ def resolved(columns: Mapping[str, str], names: Sequence[str]) -> dict[str, str]
     return {full.get(old, old): new for old, new in columns.items()}
 
 
-def mappable(names: Sequence[str]) -> dict[str, str]:
+def mappable(names: Sequence[str]) -> dict[str, Sequence[Becomes]]:
     """Return the names of a table's columns, with and without a unit in brackets, as `check_names` takes them."""
     return dict.fromkeys([*names, *(column_unit(name)[0] for name in names if IN_BRACKETS.fullmatch(name))], COLUMN)
 
@@ -201,7 +209,7 @@ def mapped_inputs(names: Sequence[str], columns: Mapping[str, str]) -> tuple[lis
     """
     found, kinds = list[Column](), set[str]()
     for old, new in columns.items():
-        if kind_of_target(new) != INPUT or old not in names:
+        if kind_of_target(new) is not Becomes.INPUT or old not in names:
             continue
         target = parse_target(new)
         if not target.scaled:

@@ -16,17 +16,18 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
-from femsense.io.importers.frames import Frame, Source, check_size, unit_of, upright
+from femsense.io.importers.frames import Format, Source
+from femsense.io.importers.motion_capture import Row, Track, capture_source, tracks_of
 from femsense.io.importers.options import Options
-from femsense.io.importers.tables.csv_tables import is_cut_off, rows_of
-from femsense.io.importers.tables.mapping import MARKER
+from femsense.io.importers.tables.csv_tables import is_cut_off, is_text, rows_of
+from femsense.io.text_numbers import plain_number
 
 HEAD = 20
 """The headers are in the first lines."""
 
 
 class Program(StrEnum):
-    """Who writes an export; the names of its formats."""
+    """Program that wrote an export; the values are names of formats."""
 
     OPTITRACK = "optitrack"
     VICON = "vicon"
@@ -45,13 +46,16 @@ BEGINS = {
 """First cell of an export → its program."""
 
 
+Axes = tuple[int, int, int]
+"""Columns of x, y, z."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Export:
-    """What the header of an export says."""
+    """Header of an export."""
 
     program: Program
-    markers: tuple[tuple[str, tuple[int, int, int]], ...]
-    """Name ("" where the program could not tell which it is) and the columns of x, y, z."""
+    markers: tuple[tuple[Track, Axes], ...]
     unit: str | None
     time: int | None
     """Column of time [s]; None: the frame number over the rate."""
@@ -74,10 +78,10 @@ def program_of(path: Path) -> Program | None:
 
 
 def list_mocap_csv(path: Path) -> dict[str, Any]:
-    """Return what the header of an export says. Raises InputError."""
+    """Return the header of an export. Raises InputError."""
     export = read_export(path)
     return {
-        "markers": [name or "(unnamed)" for name, _ in export.markers],
+        "markers": [track.name or "(unnamed)" for track, _ in export.markers],
         "unit": export.unit,
         "rate_hz": export.rate,
         "frames_announced": export.frames,
@@ -85,42 +89,28 @@ def list_mocap_csv(path: Path) -> dict[str, Any]:
 
 
 def open_mocap_csv(path: Path, options: Options) -> Source:
-    """Return an export as a source. Raises InputError: a header that says nothing, no markers, a unit that nobody says."""
+    """Return an export as a source. Raises InputError: an empty header, no markers, a unit that is not known."""
     export = read_export(path)
-    chosen = [(name, axes) for name, axes in export.markers if not options.topics or name in options.topics]
-    if not chosen:
-        raise InputError(
-            "no markers",
-            where=path,
-            found=", ".join(sorted({n for n, _ in export.markers})) or "none",
-            expected="positions of markers or bodies",
-        )
-    renamed = tuple((options.columns.get(name, name).removeprefix("marker."), axes) for name, axes in chosen)
-    extent = _extent(path, export)
-    scale = unit_of(options, export.unit, path, extent)
-    check_size(scale * extent, path)
+    if not export.markers:
+        raise InputError("no markers", where=path, found="none", expected="positions of markers or bodies")
     rate = export.rate or options.rate
     if export.time is None and rate is None:
         raise InputError("no times", where=path, found="frame numbers without a rate", expected="--rate HZ")
-    nameless = sum(not name for name, _ in chosen)
-    return Source(
-        export.program.value,
+    return capture_source(
         path,
-        partial(_frames, path, export, renamed, scale, rate or 1.0, options.up),
-        found={"unit": options.unit or export.unit, "up": options.up or "as in the file"},
+        [track for track, _ in export.markers],
+        partial(_rows, path, export, rate or 1.0),
+        options,
+        unit=export.unit,
+        found={},
         count=export.frames,
-        notes=_notes(nameless, len(chosen) - nameless, export, options, _step(path, export)),
-        names={name: MARKER for name, _ in export.markers if name},
+        notes=_notes(export, options, _step(path, export)),
     )
 
 
-def _notes(nameless: int, named: int, export: Export, options: Options, step: float | None) -> list[str]:
-    """Return what a person should know: tracks without a name, where header and rows disagree, a rate that was said in vain."""
+def _notes(export: Export, options: Options, step: float | None) -> list[str]:
+    """Return where header and rows disagree, and a rate that has no effect."""
     notes = []
-    if nameless and named:
-        notes.append(f"{nameless} tracks have no name: they are left out of frames that show named markers")
-    elif nameless:
-        notes.append(f"{nameless} tracks have no name: the column marker stays empty, calibration assigns them")
     if export.count is not None and export.count != len(export.markers):
         notes.append(f"the header announces {export.count} markers, {len(export.markers)} stand there")
     if export.rate and step and abs(step * export.rate - 1.0) > 0.05:
@@ -131,32 +121,26 @@ def _notes(nameless: int, named: int, export: Export, options: Options, step: fl
 
 
 def read_export(path: Path) -> Export:
-    """Return what the header of an export says. Raises InputError."""
+    """Return the header of an export. Raises InputError."""
     head = list(islice(rows_of(path), HEAD))
     readers = {Program.OPTITRACK: _optitrack, Program.TRC: _trc, Program.QUALISYS: _qualisys}
     reader = readers.get(program_of(path) or Program.VICON)
     return _vicon(path) if reader is None else reader(head, path)
 
 
-def _frames(
-    path: Path, export: Export, markers: tuple[tuple[str, tuple[int, int, int]], ...], scale: float, rate: float, up: str | None
-) -> Iterator[Frame]:
-    start: float | None = None
-    last = max(j for _, axes in export.markers for j in axes)
+def _rows(path: Path, export: Export, rate: float) -> Iterator[Row]:
+    begun, columns = False, [j for _, axes in export.markers for j in axes]
     for row in islice(rows_of(path), export.first, None):
         if not any(cell.strip() for cell in row):
-            if export.program is Program.VICON and start is not None:
+            if export.program is Program.VICON and begun:
                 return  # the next section begins
             continue
-        if len(row) <= last and is_cut_off(path):
+        if len(row) <= max(columns) and is_cut_off(path):
             warnings.warn(f"{path}: the last line was cut off and is left out", stacklevel=2)
             return
+        begun = True
         time = _cell(row, export.time) if export.time is not None else _cell(row, 0) / rate
-        start = time if start is None else start
-        places = [(name, np.array([_cell(row, j) for j in axes])) for name, axes in markers]
-        seen = [(name, upright(scale * place, up)[0]) for name, place in places if np.isfinite(place).all() and place.any()]
-        # one row has named markers, or markers without a name, or both
-        yield Frame(time, markers={n: p for n, p in seen if n}, unlabelled=[p for n, p in seen if not n])
+        yield Row(time, np.array([_cell(row, j) for j in columns]).reshape(-1, 3), {})
 
 
 def _optitrack(head: list[list[str]], path: Path) -> Export:
@@ -182,7 +166,7 @@ def _optitrack(head: list[list[str]], path: Path) -> Export:
             continue
         unnamed = "unlabeled" in _at(names, j).lower() or "unlabeled" in kind
         markers.setdefault(("" if unnamed else _at(names, j), group), {})[axes[j].strip().lower()] = j
-    found = tuple((name, (a["x"], a["y"], a["z"])) for (name, _), a in markers.items() if set(a) == set("xyz"))
+    found = [(Track(name, name), (a["x"], a["y"], a["z"])) for (name, _), a in markers.items() if set(a) == set("xyz")]
     rate = pairs.get("Export Frame Rate") or pairs.get("Capture Frame Rate")
     announced = _whole(pairs.get("Total Exported Frames") or pairs.get("Total Frames in Take") or "")
     unit = pairs.get("Length Units")
@@ -197,9 +181,9 @@ def _trc(head: list[list[str]], path: Path) -> Export:
         )
     said = dict(zip((cell.strip() for cell in head[1]), (cell.strip() for cell in head[2])))
     names = [(j, plain_name(cell)) for j, cell in enumerate(head[3]) if j > 1 and cell.strip()]
-    found = tuple((name, (j, j + 1, j + 2)) for j, name in names)
+    found = tuple((Track(name, name), (j, j + 1, j + 2)) for j, name in names)
     rate, frames, count = _rate(said.get("DataRate", "")), _whole(said.get("NumFrames", "")), _whole(said.get("NumMarkers", ""))
-    first = next((i for i, row in enumerate(head) if i > 3 and row and _is_number(row[0])), 5)
+    first = next((i for i, row in enumerate(head) if i > 3 and row and plain_number(row[0]) is not None), 5)
     return Export(Program.TRC, found, said.get("Units"), 1, rate, first, frames, count)
 
 
@@ -218,18 +202,14 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
             hint="export the 3D data as TSV, with the header",
         )
     names = [plain_name(name) for name in said["MARKER_NAMES"] if name]
-    first = next((i for i, row in enumerate(head) if row and _is_number(row[0])), len(head))
+    first = next((i for i, row in enumerate(head) if row and plain_number(row[0]) is not None), len(head))
     titles = [cell.strip().lower() for cell in head[first - 1]]
     shift = len([title for title in titles if title in ("frame", "time")]) if titles[:1] == ["frame"] else 0
     time = titles.index("time") if shift and "time" in titles else None
-    found = tuple((name, (shift + 3 * k, shift + 3 * k + 1, shift + 3 * k + 2)) for k, name in enumerate(names))
+    found = tuple((Track(name, name), (shift + 3 * k, shift + 3 * k + 1, shift + 3 * k + 2)) for k, name in enumerate(names))
     value = {key: _whole(row[0]) if row else None for key, row in said.items()}
     rate = _rate(said.get("FREQUENCY", [""])[0])
     return Export(Program.QUALISYS, found, "mm", time, rate, first, value.get("NO_OF_FRAMES"), value.get("NO_OF_MARKERS"))
-
-
-def _is_number(cell: str) -> bool:
-    return bool(np.isfinite(_cell([cell], 0)))
 
 
 def _whole(cell: str) -> int | None:
@@ -251,33 +231,17 @@ def _vicon(path: Path) -> Export:
             expected="Trajectories, rate, names, Frame,Sub Frame,X,Y,Z …, units",
         )
     names, axes, units = section[2], [cell.strip().upper() for cell in section[3]], section[4]
-    labels = [(_at(names, j), (j, j + 1, j + 2)) for j in range(2, len(axes) - 2) if axes[j : j + 3] == ["X", "Y", "Z"]]
-    bare = [label.rpartition(":")[2] for label, _ in labels]
-    found = []  # the subject stays before the name where another has a marker of the same name
-    for (label, columns), name in zip(labels, bare):
-        nameless = name.startswith("*") or not name
-        found.append(("" if nameless else label if bare.count(name) > 1 else name, columns))
+    starts = [j for j in range(2, len(axes) - 2) if axes[j : j + 3] == ["X", "Y", "Z"]]
+    found = zip(tracks_of([_at(names, j) for j in starts]), [(j, j + 1, j + 2) for j in starts])
     unit = next((cell.strip() for cell in units if cell.strip()), None)
     return Export(Program.VICON, tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
 
 
-def _distinct(
-    found: tuple[tuple[str, tuple[int, int, int]], ...], kinds: list[str]
-) -> tuple[tuple[str, tuple[int, int, int]], ...]:
+def _distinct(found: list[tuple[Track, Axes]], kinds: list[str]) -> tuple[tuple[Track, Axes], ...]:
     """Return the tracks with each name once: measured markers before the rigid body's constraint of the same name."""
     order = sorted(found, key=lambda item: "rigid body marker" in _at(kinds, item[1][0]).lower())
-    taken: dict[str, tuple[int, int, int]] = {}
-    for name, axes in order:
-        if name:
-            taken.setdefault(name, axes)
-    return tuple(taken.items()) + tuple(item for item in found if not item[0])
-
-
-def _extent(path: Path, export: Export) -> float:
-    rows = islice(rows_of(path), export.first, export.first + 500)
-    values = np.array([_cell(row, j) for row in rows for _, axes in export.markers for j in axes])
-    finite = values[np.isfinite(values)]
-    return float(np.ptp(finite)) if finite.size else 0.0
+    first = {track.name: (track, axes) for track, axes in reversed(order) if track.name}
+    return (*first.values(), *(item for item in found if not item[0].name))
 
 
 def _step(path: Path, export: Export) -> float | None:
@@ -301,7 +265,22 @@ def _at(row: list[str], j: int) -> str:
 
 def _cell(row: list[str], j: int) -> float:
     """Return a number; NaN where the cell is empty or no number (a gap)."""
-    try:
-        return float(row[j])
-    except (ValueError, IndexError):
-        return np.nan
+    number = plain_number(_at(row, j))
+    return np.nan if number is None else number
+
+
+def _is_export(program: Program, path: Path, head: bytes) -> bool:
+    return (is_text(path) or head.startswith(b"Format Version,")) and program_of(path) is program
+
+
+EXPORTS = tuple(
+    Format(
+        program.value,
+        open_mocap_csv,
+        partial(_is_export, program),
+        unused=("--clock",),
+        list=list_mocap_csv,
+        endings=(".trc",) if program is Program.TRC else (),
+    )
+    for program in Program
+)

@@ -14,12 +14,14 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit
-from femsense.io.importers.frames import Frame, Source, unit_of, upright
+from femsense.io.importers.frames import Format, Source
+from femsense.io.importers.motion_capture import Row, Track, capture_source
 from femsense.io.importers.options import Options
 from femsense.io.importers.tables.clock import seconds_of
-from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_time, layout_of, number_rows, time_column
+from femsense.io.importers.tables.csv_tables import column_unit, header_of, is_text, is_time, layout_of, number_rows, time_column
 from femsense.io.importers.tables.input_samples import Samples, samples_of
 from femsense.io.importers.tables.mapping import (
+    Becomes,
     Column,
     cable_kind,
     check_names,
@@ -62,7 +64,7 @@ def open_plain_csv(path: Path, options: Options) -> Source:
     as cable_… and chamber_…. A file of bare numbers (counter, time, x, y, z, x, y, z …) holds markers without names.
 
     Raises:
-        InputError: nothing to take, or a unit that nobody says.
+        InputError: nothing to take, or a unit that is not known.
     """
     names, headed = header_of(path)
     options = replace(options, columns=resolved(options.columns, names))
@@ -79,29 +81,30 @@ def open_plain_csv(path: Path, options: Options) -> Source:
             hint="--map COLUMN=marker.x names a column, --map COLUMN=cable_north an input",
         )
     times, notes = _times(path, names, headed, options)
-    chosen = [j for _, axes in triples for j in axes]
-    declared = _declared_unit(names, chosen, path)
-    scale = unit_of(options, declared, path, _extent(path, chosen)) if triples else 1.0
-    label = not raw
+    places = [j for _, axes in triples for j in axes]
 
-    def frames() -> Iterator[Frame]:
+    def rows() -> Iterator[Row]:
         between: Samples | None = None
         for time, row in zip(times.tolist(), number_rows(path)):
-            places = {name: scale * np.array([row[j] for j in axes]) for name, axes in triples}
-            seen = {name: upright(p, options.up)[0] for name, p in places.items() if np.isfinite(p).all() and p.any()}
             values = {column.name: float(column.values(row)) for column in inputs}
             drive = {name: value for name, value in values.items() if np.isfinite(value)}
             if len(drive) < len(inputs):
                 between = between or _input_samples(path, inputs, times)
                 filled = zip(inputs, between.at(time)[0].tolist())
                 drive = {column.name: value for column, value in filled if np.isfinite(value)}
-            yield Frame(time, markers=seen if label else {}, unlabelled=() if label else list(seen.values()), inputs=drive)
+            yield Row(time, np.array([row[j] for j in places]).reshape(-1, 3), drive)
 
-    found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
-    notes += [] if label else ["the markers have no names: the column marker stays empty, calibration assigns them"]
-    notes += notation_notes(path) + unit_notes(inputs, names, options.columns)
-    return Source(
-        "csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes, names=mappable(names)
+    return capture_source(
+        path,
+        [Track("" if raw else name, name) for name, _ in triples],
+        rows,
+        replace(options, columns={}, topics=()),
+        unit=_declared_unit(names, places, path),
+        found={"marker_columns": len(triples) or None},
+        notes=notes + notation_notes(path) + unit_notes(inputs, names, options.columns),
+        names=mappable(names),
+        actuation=actuation,
+        actuation_by_unit=True,
     )
 
 
@@ -119,7 +122,7 @@ def notation_notes(path: Path) -> list[str]:
 
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
-    """Return what was assumed of the units of inputs: absolute pressures that were made gauge pressures, and units that nobody said."""
+    """Return the assumptions about units of inputs: absolute pressures that became gauge pressures, and units that are not declared."""
     absolute = [
         column.name for column in inputs if column.offset and not parse_target(columns.get(names[column.index], "")).scaled
     ]
@@ -167,9 +170,9 @@ def _times(path: Path, names: list[str], headed: bool, options: Options) -> tupl
 
 
 def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
-    """Return the column that is mapped to the time, and its unit where one is said; None where none is mapped. Raises InputError."""
+    """Return the column that is mapped to the time, and its unit where one is declared; None where none is mapped. Raises InputError."""
     for old, new in columns.items():
-        if kind_of_target(new) == "time" and old in names:
+        if kind_of_target(new) is Becomes.TIME and old in names:
             target = parse_target(new)
             said = Unit("", Quantity.TIME, target.factor) if target.scaled else unit_beside(old, "time")
             return list(names).index(old), said
@@ -286,8 +289,12 @@ def _raw_triples(path: Path, names: Sequence[str]) -> list[tuple[str, tuple[int,
     return [(str(k), (2 + 3 * k, 3 + 3 * k, 4 + 3 * k)) for k in range((len(names) - 2) // 3)]
 
 
-def _extent(path: Path, columns: Sequence[int]) -> float:
-    """Return the span of the first thousand rows in the file's unit."""
-    rows = np.array([[row[j] for j in columns] for row, _ in zip(number_rows(path), range(1000))])
-    values = rows[np.isfinite(rows)]
-    return float(np.ptp(values)) if values.size else 0.0
+CSV = Format(
+    "csv",
+    open_plain_csv,
+    lambda path, head: is_text(path),
+    ("--clock", "--topic"),
+    list_plain_csv,
+    (".gz",),
+    columns=lambda path: header_of(path)[0],
+)
