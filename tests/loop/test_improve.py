@@ -72,7 +72,7 @@ def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pul
         "load_forces": np.array(list(forces.values())),
     }
     loop = improve(weightless, [replace(recording, **known) if forces else recording], effects=["cable_gain", "cable_friction"])
-    said = "These data do not tell stiffness from cable_gain." in loop.sentence
+    said = "These data do not distinguish stiffness from cable_gain." in loop.sentence
     assert [e.name for e in loop.effects] == ["stiffness"] and said == (not load)
     assert loop.next_experiment.startswith("hang a known weight") == (not load)
 
@@ -148,7 +148,7 @@ def test_where_nothing_explains_what_is_left_effects_are_sought_again_from_the_f
     told: list[str] = []
     soon = ImproveOptions(thresholds=replace(DEFAULTS, lacks=0.3))  # less than any weights leave
     loop = improve(arm((4, 1, 1)), [off], effects=["cable_friction", "payload"], progress=told.append, options=soon)
-    assert any(text.startswith("nothing explains what is left") for text in told)
+    assert any(text.startswith("no effect fits the residual") for text in told)
     assert loop.verdict == "unexplained" and not [e for e in loop.effects if e.name in ("cable_friction", "payload")]
     assert loop.noise_m < 2e-4 and loop.model_error is not None and loop.model_error.held_out_m > 1e-3
 
@@ -165,7 +165,7 @@ def test_a_search_that_begins_again_keeps_what_was_tried_and_takes_other_weights
     weights = Noise({"white": 5e-3}, "", assumed=1e-4)
     course.begin_again(data, weights)
     assert not course.over and not course.found and course.noise is weights and course.holds_error
-    assert not course.outweighed[0].is_named and "asked again" in course.outweighed[0].verdict
+    assert not course.outweighed[0].is_named and "repeated with weights" in course.outweighed[0].verdict
 
 
 def test_a_model_that_lacks_nothing_is_told_so():

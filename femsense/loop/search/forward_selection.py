@@ -1,4 +1,4 @@
-"""Growth: refit the best candidates in full nonlinearity, accept one, polish it, and drop what is no longer needed."""
+"""Forward selection: refit the best candidates with the full nonlinear equilibrium, accept one, and improve its seed and its form."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from femsense.loop.thresholds import Effort, Thresholds
 def select_next(
     data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
 ) -> tuple[Refit | None, list[RefitRecord]]:
-    """Return the effect that comes next, or None where nothing passes; and what became of each candidate that was refitted."""
+    """Return the effect to add, or None if none passes; and the record of each refitted candidate."""
     listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
         return None, []
@@ -40,14 +40,14 @@ def select_next(
     leading = leaders(data, fitted, refits, noise, say)
     if not leading:
         return None, _updated(records, refits)
-    # where evidence is close, what surely predicts better
+    # the highest evidence, with a bonus for a significantly better prediction, which decides if evidence is close
     first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]))
     winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
 def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, say: Progress) -> dict[int, Refit]:
-    """Return the refits that pass and are as good as the best but for `evidence`, each with its seed improved."""
+    """Return the passing refits within `evidence` of the best one, each with its seed improved."""
     passing = {i: r for i, r in refits.items() if r.record.passes}
     best = max((r.score for r in passing.values()), default=np.inf)
     near = {i: r for i, r in passing.items() if r.score > best - data.thresholds.evidence}
@@ -57,7 +57,7 @@ def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise:
 def _refitted(
     data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, say: Progress
 ) -> tuple[dict[int, Refit], list[RefitRecord]]:
-    """Return the refits of a shortlist, and what became of each candidate that was refitted: the number of a refit is that of its record."""
+    """Return the refits of a shortlist by the number of their record, and the record of each refitted candidate."""
     refits: dict[int, Refit] = {}
     records: list[RefitRecord] = []
     evident = data.thresholds.evidence
@@ -67,7 +67,7 @@ def _refitted(
         record = RefitRecord(name, candidate.seed)
         others = [
             r.score for r in refits.values() if r.record.passes and r.candidate.effect.name != name
-        ]  # what bends one form bends both
+        ]  # forms of one effect share their errors, so that one must not stop another early
         wanted = max([evident, *(score - 2.0 * evident for score in others)])
         try:
             made = refit(data, fitted, candidate, noise, wanted=wanted)
@@ -80,12 +80,12 @@ def _refitted(
 
 
 def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
-    """Return records with those of refits in their places."""
+    """Return the records with those of the refits in their places."""
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
 def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
+    """Return a refit with evidence that fails another criterion, tested again with its seed improved: the seed may be the cause."""
     if refitted.score <= data.thresholds.evidence or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
     better = polished(data, fitted, refitted, noise, say)
@@ -95,7 +95,7 @@ def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, s
 
 
 def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with its seed improved, and with the scatter of its coordinates over seeds that explain as much."""
+    """Return a refit with an improved seed, and with the scatter of its coordinates over seeds that fit equally well."""
     made, scatter = _polish(data, fitted, refitted, noise, say)
     record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
@@ -105,7 +105,7 @@ def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say
 
 
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
-    """Return the winner in a form with more parameters where that has `evidence` over the simple one."""
+    """Return the best refit in a form with more parameters if that has `evidence` over the simpler one."""
     winner = _with_more_markers(data, fitted, winner, table, noise, say)
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
@@ -126,8 +126,8 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
 def _with_more_markers(
     data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress
 ) -> Refit:
-    """Return offsets of markers with those of further markers, one after the other, as long as each has `evidence`: all of them at once cost too much.
-    Other effects are returned as they are."""
+    """Return marker offsets extended by those of further markers, one at a time while each has `evidence`: the penalty of all at once is too large.
+    Other effects are returned unchanged."""
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
@@ -153,7 +153,7 @@ def _trying(form: Candidate) -> str:
 
 
 def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:
-    """Return the fit of a richer form of the winner, started from the winner itself where its parameters are among those of the form."""
+    """Return the fit of a richer form of an effect, started from the simpler one if the form contains its parameters."""
     settled, terms = winner.fitted.fit.hypothesis.settled, winner.fitted.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}
     if settled != fitted.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
@@ -175,7 +175,7 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
 
 
 def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
+    """Return the best candidate of each effect, in its simplest form (or forms, if several are equally simple), the best first."""
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.evidence))
     chosen: list[Candidate] = []
     for name in names[: effort.refits if first else (effort.refits + 1) // 2]:
@@ -186,13 +186,13 @@ def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, fi
 
 
 def hinted(table: list[Candidate], decides: Thresholds, effort: Effort) -> bool:
-    """Return whether candidates by fields of the model before may be worth a refit by fields of their own, since these may predict more gain."""
+    """Return whether candidates screened with fields of the previous model may gain enough with fields of the current one."""
     wished = [replace(c, score=c.gain / decides.hinted - c.cost) for c in table]
     return bool(shortlist(wished, decides, effort, first=False))
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
-    """Return the best candidate of each form of an effect (one cable or marker alone is a form of its own)."""
+    """Return the best candidate of each form of an effect; one cable or marker alone is a form of its own."""
     best: dict[tuple[int, int], Candidate] = {}
     for candidate in table:
         if candidate.effect.name == name:
@@ -200,26 +200,26 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
     return list(best.values())
 
 
-# --- polishing -------------------------------------------------------------------------------------------------------------
+# --- improvement of seeds --------------------------------------------------------------------------------------------------
 
 
 def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> tuple[FittedModel, Sequence[float]]:
-    """Return the winner with its seed (place, radius, time) improved, first seeds near by, then fitted along; and the scatter over the seeds."""
+    """Return the model with its seed (place, radius, time) improved, first among neighbouring seeds, then as fitted parameters; and the scatter over seeds."""
     best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
-        say(f"looking near by for {effect.name}")
+        say(f"trying neighbouring seeds of {effect.name}")
         ends = climbed(data, fitted, winner.candidate, noise)
         best, scatter = located(data, fitted, winner.candidate, winner.fitted, ends, noise)
     return (_with_seed_fitted(data, best, noise, say) if winner.candidate.parameters else best), scatter
 
 
 def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress) -> FittedModel:
-    """Return a model whose last effect has its seed fitted along, where that explains more and stays inside the bounds."""
+    """Return a model with the seed of its last effect fitted too, if that reduces χ² and stays inside the bounds."""
     *others, (effect, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best
-    say(f"polishing {effect.name}")
+    say(f"fitting the seed of {effect.name}")
     hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
     null = np.array([p.null for p in more])
     prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))

@@ -1,4 +1,4 @@
-"""The search for effects: screen, refit, add the best, ask again of what was found before, and start again from the better model until nothing passes."""
+"""The search for effects: screen, refit, add the best, re-test the earlier ones, and repeat on the larger model until no candidate passes."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from femsense.model.recording import state_key
 
 
 def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], *, quadratic: bool) -> SearchProgress:
-    """Return a search on top of the last model of a history that has found nothing yet."""
+    """Return the initial state of a search that extends the last model of a history."""
     data, before, history = ready
     last = history[-1][1]
     return SearchProgress(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
 
 
 def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
-    """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
+    """Screen, refit and add effects until none passes; return the data prepared for the last model, and the search."""
     _seek(course, checkpoint, say)
     if nothing_explains(course):
-        say("nothing explains what is left: asking again with weights that hold the error of the model")
+        say("no effect fits the residual: repeating the search with weights that include the model error")
         weights = noise_of(course.data, course.fitted, None, course.noise)[0]
         course.begin_again(with_turning_placements(course.data, course.base), weights)
         _seek(course, checkpoint, say)
@@ -68,8 +68,11 @@ def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None
 
 
 def nothing_explains(course: SearchProgress) -> bool:
-    """Return whether the last model has a large error of its own, or is much farther from the markers than the noise of the richest linear model
-    allows: that noise then weighs only how states differ, and lets a pose and input offsets go wherever these agree."""
+    """Return whether the residual of the last model is dominated by model error.
+
+    It is if its mean square exceeds `lacks` times the noise, or if it exceeds noise and discretisation error together. The noise of the richest
+    linear model then underrates the residual: it weighs only differences between states, and pose and input offsets are free in their common part.
+    """
     data, fitted, noise = course.data, course.fitted, course.noise
     if course.holds_error or noise is None or "clouds" in data.measured:
         return False
@@ -83,7 +86,7 @@ def _most_effects(data: Data) -> int:
 
 
 def _take_step(course: SearchProgress, say: Progress) -> None:
-    """Screen what a model may lack and add the effect that comes next; where none does, the search is over."""
+    """Screen the effects that the model may lack and add the best one; if none passes, end the search."""
     names, found = course.names, course.found
     data, fitted, noise, fields = course.data, course.fitted, course.noise, course.fields
     if found and "clouds" in data.measured:
@@ -122,7 +125,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
 
 
 def _tell_parts_apart(course: SearchProgress, say: Progress) -> None:
-    """Give named effects a value for each cable where these have evidence, and go on; where none has, the search is over."""
+    """Give accepted effects one value per cable where these have evidence, and continue; otherwise end the search."""
     assert course.noise is not None
     fitted, records = with_all_parts(course.data, course.fitted, course.noise, course.n_effective, say)
     course.refits = [*course.refits, *at_step(records, len(course.history))]
@@ -133,8 +136,8 @@ def _tell_parts_apart(course: SearchProgress, say: Progress) -> None:
 def _screened(
     data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str], *, holds_error: bool
 ) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
-    """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
-    of what may come next: by the fields of the model before, as long as these predict no gain."""
+    """Return a model refitted with the noise of its own residual, that noise, the effective number of observations, and the fields and scores of the
+    candidates. The fields of the previous model are reused as long as they predict no gain."""
     fields = _fields(data, fitted, before, names)
     told, n_effective = noise_of(data, fitted, fields, noise)
     noise = noise if noise is not None and holds_error else told
@@ -143,7 +146,7 @@ def _screened(
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
-    """Return the fields of the model before where they tell what may come next, else those of the fitted model itself."""
+    """Return the fields of the previous model if they apply to the current one, else newly computed ones."""
     hints = None if before is None else before.beside(fitted.fit)
     return fields_of(data, fitted, names) if hints is None else hints
 
@@ -151,7 +154,7 @@ def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Seque
 def scored(
     data: Data, fitted: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
 ) -> tuple[Fields, list[Candidate]]:
-    """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
+    """Return fields and scores; if reused fields predict a gain, the fields of the fitted model itself."""
     table = screen_model(data, fitted.fit, noise, fields, n_effective)
     if fields.model is fitted.fit.hypothesis or not hinted(table, data.thresholds, data.effort):
         return fields, table
@@ -160,7 +163,7 @@ def scored(
 
 
 def distinguishes_effects(data: Data) -> bool:
-    """Return whether these data can distinguish effects: a state that is not fitted is held out, or enough different ones are fitted."""
+    """Return whether these data can distinguish effects: a held-out state is not fitted, or enough distinct states are fitted."""
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
     fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
     return fresh or len(fitted) >= data.thresholds.states

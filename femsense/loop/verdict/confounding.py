@@ -1,4 +1,4 @@
-"""What these data cannot distinguish: refits with as much evidence, fields that agree, and effects that are collinear with a named nuisance."""
+"""Limits of the data: alternatives with as much evidence, collinear fields, and effects that a nuisance effect absorbs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from femsense.loop.thresholds import Thresholds
 
 
 def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
-    """Return pairs that these data cannot distinguish: what is named, and what might be in its place."""
+    """Return the pairs that these data cannot distinguish: an accepted effect, and a possible alternative."""
     found: dict[frozenset[str], ConfoundedPair] = {}
     asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common, _alike
     for pair in (pair for ask in asked for pair in ask(search, names, decides)):
@@ -28,7 +28,7 @@ def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> lis
 
 
 def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
-    """Return what two findings say of a pair: the smaller gap, and the larger shares."""
+    """Return two findings on a pair combined: the smaller gap, and the larger shares."""
 
     def chosen(of: Callable[[Iterable[float]], float], *values: float | None) -> float | None:
         known = [v for v in values if v is not None]
@@ -43,7 +43,7 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
 
 
 def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thresholds) -> str:
-    """Return sentences on what might be in the place of what is named, by refits or by what calibration absorbs; nothing where there is nothing."""
+    """Return sentences on the alternatives to the accepted effects, by refits or by absorption; empty if there are none."""
     instead: dict[str, list[str]] = {}
     stands_for: dict[str, list[str]] = {}
     for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
@@ -53,13 +53,13 @@ def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thr
                 (stands_for if far else instead).setdefault(own, []).append(other)
     said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
     told = [f"{own} may stand for {' or '.join(others)}" for own, others in stands_for.items()]
-    return (f" These data do not tell {', nor '.join(said)}." if said else "") + (
-        f" As the model still errs, {', and '.join(told)}." if told else ""
+    return (f" These data do not distinguish {', nor '.join(said)}." if said else "") + (
+        f" Because of the remaining model error, {', and '.join(told)}." if told else ""
     )
 
 
 def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose refits are within `evidence` of a named one's, or make a named nuisance needless with as much evidence."""
+    """Yield the effects whose refits are within `evidence` of an accepted one's, or that replace an accepted nuisance effect with as much evidence."""
     ours = _named(search, names)
     for own in ours:
         for r in search.refits:
@@ -76,8 +76,8 @@ def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> It
 
 
 def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects that pass alone and have nothing left beside what is named, where the weights hold the error of the model: by how much the named
-    one is ahead then says how well it makes up for that error, too."""
+    """Yield the effects that pass by themselves and are not needed in addition to the accepted ones, if the weights include the model error: evidence then also
+    measures how well an effect compensates for that error."""
     if search.noise.assumed is None:
         return
     for own in _named(search, names):
@@ -87,13 +87,13 @@ def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresho
 
 
 def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:
-    """Return the refits of what is named, but for a mesh without which nothing converges: that has no dBIC."""
+    """Return the refits of the accepted effects, without a mesh that has no dBIC because nothing else converges."""
     ours = [r for r in search.refits if r.name in names and r.dbic is not None]
     return [r for r in ours if r.is_named or r.in_place_of == r.name]
 
 
 def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects that this recording cannot test because most of each is collinear with one named nuisance, with the share that calibration absorbs."""
+    """Yield the effects that are not testable because they are collinear with one accepted nuisance effect, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = J[:, : fit.own]
@@ -108,8 +108,8 @@ def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iter
 
 
 def _in_common(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield a named nuisance and what looks like it where all its parameters move alike (a modulus, and a gain that all cables have in common), where
-    calibration absorbs that: one parameter alone, as the gain of one cable, it does not."""
+    """Yield an accepted nuisance effect with an effect that equals it when all its parameters move together (the modulus, and a gain common to all cables), if
+    calibration absorbs that combination. A single parameter, such as the gain of one cable, is not absorbed."""
     for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
         for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
             if alias.common and alias.name in names:
@@ -117,7 +117,7 @@ def _in_common(search: Search, names: Sequence[str], decides: Thresholds) -> Ite
 
 
 def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
+    """Yield an accepted nuisance effect with an effect whose parameters move together, if calibration absorbs that combination."""
     forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
     fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
     left = widest.columns.sum(axis=1)
@@ -129,8 +129,8 @@ def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterat
 
 
 def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose fields agree with that of a named one, once what calibration may move is projected out: those that explain more than they
-    cost, and that no refits distinguish."""
+    """Yield the effects with a field collinear with that of an accepted one after calibration is projected out, if they have a positive score and refits do not
+    distinguish them."""
     ones = [c for c in one_each(search.first) if c.retained >= decides.testable]
     for a in (c for c in ones if c.effect.name in names):
         for b in (c for c in ones if c is not a and c.score > 0.0):
@@ -140,10 +140,10 @@ def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterato
 
 
 def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
-    """Return whether refits of another effect in the place of a named one brought less by `evidence`."""
+    """Return whether refits of another effect in place of an accepted one have less evidence by at least `evidence`."""
     for named in (r for r in _named(search, names) if r.name == own and r.is_named):
         there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
-        tried = [dbic for dbic in there if np.isfinite(dbic)]  # one that was stopped early has none
+        tried = [dbic for dbic in there if np.isfinite(dbic)]  # a fit that stopped early has none
         if tried and max(tried) <= named.evidence - decides.evidence:
             return True
     return False

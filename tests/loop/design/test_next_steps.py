@@ -32,7 +32,7 @@ def test_what_recordings_lack_is_said_with_what_it_brings() -> None:
     said = steps_after(one_at_a_time())
     assert {text.split()[0] for text in said} == {"weigh", "record", "hang", "pull"}
     after, before = (float(part.split()[0]) for part in said[0].split("±")[1:])
-    assert said[0].startswith("hang") and "is then known to ±" in said[0] and 0.0 < after < 0.8 * before
+    assert said[0].startswith("hang") and "the standard deviation of" in said[0] and 0.0 < after < 0.8 * before
 
 
 def test_what_is_recorded_already_is_not_asked_for() -> None:
