@@ -4,10 +4,10 @@ Each part of an experiment (a block of frames) gives the Gram matrices of its co
 those shared by all recordings (nuisance N and effects e). Blocks add up, so that every combination is analysed by linear algebra alone. With G
 the sum,
 
-        S = G_ee − G_eN G_NN⁻¹ G_Ne      (after calibration is projected out, Frisch–Waugh–Lovell theorem).
+    S = G_ee − G_eN G_NN⁻¹ G_Ne      (after calibration is projected out, Frisch–Waugh–Lovell theorem).
 
-    An effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b fits tr(D_a S_ab S_bb⁻¹ S_ba D_a).
-    The parameters of one effect are treated as independent with plausible sizes. `screen` computes the same from data.
+An effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b fits tr(D_a S_ab S_bb⁻¹ S_ba D_a).
+The parameters of one effect are treated as independent with plausible sizes. `screen` computes the same from data.
 """
 
 from __future__ import annotations

@@ -231,11 +231,11 @@ class Likelihood:
 
     With V = Σ v_i V_i, the same for each axis and block-diagonal over recordings, and P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,
 
-            2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,    ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r.
+        2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,    ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r.
 
-        Rotating placements are random effects u in addition to the fixed ones (Henderson 1975): X is extended by their fields and 1/m² is added to
-        their part of the normal matrix N. The same expressions hold, plus n log m² in the value, and
-        ∂(2 L)/∂m² = n/m² − (tr N⁻¹ᵤᵤ + |û|²)/m⁴.
+    Rotating placements are random effects u in addition to the fixed ones (Henderson 1975): X is extended by their fields and 1/m² is added to
+    their part of the normal matrix N. The same expressions hold, plus n log m² in the value, and
+    ∂(2 L)/∂m² = n/m² − (tr N⁻¹ᵤᵤ + |û|²)/m⁴.
     """
 
     def __init__(

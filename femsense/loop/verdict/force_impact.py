@@ -189,7 +189,7 @@ def equivalent_forces(views: list[View], noise: Noise) -> ForceField | None:
     """Return surface forces that would fit the frame with the largest residual; an illustration, not evidence.
 
     Every residual can be written as a field of forces. This is the smallest one (Tikhonov) that leaves the noise, |C f − r|² = 3 k σ².
-        None if that frame does not exceed the noise.
+    None if that frame does not exceed the noise.
     """
     worst = max(((v, int(k)) for v in views for k in v.trial.scene.frames), key=lambda at: _mean_square(*at))
     view, frame = worst

@@ -108,7 +108,7 @@ def _pattern(data: Data, old: list[View], new: list[View]) -> tuple[list[tuple[F
     """Return the amplitude of the leading pattern of the residual before, by frame, (before, after) per trial [m], and its correlations.
 
     The pattern is the first right singular vector of frames × markers, after the mean of each marker over the frames of a trial is subtracted; an
-        amplitude is the residual's component along it over √markers, comparable with a root mean square.
+    amplitude is the residual's component along it over √markers, comparable with a root mean square.
     """
     count = len(data.robot.marker_names)
     names = sorted({int(m) for v in old for m in v.trial.scene.marker})
@@ -143,7 +143,7 @@ def _tip(data: Data, old: list[View], new: list[View]) -> Tip | None:
     """Return the path of the marker farthest from the clamp along its main direction of motion: measured, before and after.
 
     Measured points are placed by the returned calibration; a model's points are measured − residual. None for clouds, which do not identify
-        material points.
+    material points.
     """
     if any(v.trial.scene.crossings is not None for v in old):
         return None

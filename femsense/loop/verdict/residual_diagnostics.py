@@ -31,10 +31,10 @@ def structure_tests(
 
     Marker means and state means are removed first. The statistics and their null distributions are
 
-        * `neighbours`: T = Σ r_k·r_{k+1} / Σ |r_k|² over consecutive states of a sweep, under permutations of the states within sweeps. It is
-          independent of the scale, so that a wrong noise level cannot cause an alarm.
-        * `pattern`: the largest singular value of states × markers, relative to all, under permutations of the states of each marker (Horn 1965).
-        * `sweep`: the largest mean square of a sweep, relative to all, under the same permutations.
+    * `neighbours`: T = Σ r_k·r_{k+1} / Σ |r_k|² over consecutive states of a sweep, under permutations of the states within sweeps. It is
+      independent of the scale, so that a wrong noise level cannot cause an alarm.
+    * `pattern`: the largest singular value of states × markers, relative to all, under permutations of the states of each marker (Horn 1965).
+    * `sweep`: the largest mean square of a sweep, relative to all, under the same permutations.
 
     Errors of a cloud are correlated between neighbouring points, so that its states are permuted as a whole, and `pattern` is not tested.
     """

@@ -72,7 +72,7 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
     """Return the values of one effect; vectors and tables keep their shape. Values that were not fitted have std None.
 
     Values are those of the returned model, at their null if the fit moved them by less than ROUNDED standard deviations. Standard deviations are at
-        least those of the full fit, in which no number is held fixed.
+    least those of the full fit, in which no number is held fixed.
     """
     result = dict[str, Value]()
     for effect, seed in back.fit.hypothesis.settled:

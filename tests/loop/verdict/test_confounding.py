@@ -67,7 +67,7 @@ def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_
     search.last[:] = [candidate("creep", 0, 0, 1)]  # creep still explains something beside the payload
     pairs = confounded(search, ["payload"], DEFAULTS)
     assert [(p.pair, p.dbic_gap) for p in pairs] == [(("payload", "density"), 74.0)]
-    assert in_words(pairs, ["payload"], DEFAULTS) == " As the model still errs, payload may stand for density."
+    assert in_words(pairs, ["payload"], DEFAULTS) == " Because of the remaining model error, payload may stand for density."
     assert not confounded(searched(refits), ["payload"], DEFAULTS)  # by the noise, evidence tells them apart
 
 
