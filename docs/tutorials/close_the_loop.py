@@ -188,7 +188,9 @@ weights_sensed(fs.load_robot("improved"))
 # So does a robot with fewer effects. `--effects` restricts the search, here to gravity and the modulus, which is always fitted:
 
 # %%
-shell("femsense improve beam recordings/gravity_a recordings/load52_a --validation recordings/load101_a --effects gravity -o gravity")
+shell(
+    "femsense improve beam recordings/gravity_a recordings/load52_a --validation recordings/load101_a --effects gravity -o gravity"
+)
 weights_sensed(fs.load_robot("gravity"))
 
 # %% [markdown]
@@ -203,7 +205,9 @@ for pair in loop["confounded"]:
 for effect in loop["not_testable"]:
     print(f"not testable: {effect['name']} ({100 * effect['absorbed_share']:.1f} % absorbed by calibration)")
 for name, effect in list(loop["detectable"].items())[:5]:
-    print(f"not found: {name}; {'a plausible size would have been detected' if effect['would_be_seen'] else 'no plausible size is detectable'}")
+    print(
+        f"not found: {name}; {'a plausible size would have been detected' if effect['would_be_seen'] else 'no plausible size is detectable'}"
+    )
 left = loop["left"]
 print(f"remaining residual: {1e3 * left['rms_m']:.2f} mm, most at {left['where']['marker']}")
 print("next experiment:", loop["next_experiment"])

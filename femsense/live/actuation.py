@@ -164,7 +164,9 @@ class ReadActuation:
                 f"{self.source}: the newest values are {asked - newest:.1f} s older than the frame; they are used until others arrive"
             )
         if stands is not None and self._clock() - stands > self._limits.late_s:
-            found[Notice.ACTUATION_FROZEN] = f"{self._source}: messages arrive, but their time_s does not advance: check the sender"
+            found[Notice.ACTUATION_FROZEN] = (
+                f"{self._source}: messages arrive, but their time_s does not advance: check the sender"
+            )
         return found
 
     def close(self) -> None:

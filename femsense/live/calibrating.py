@@ -106,7 +106,7 @@ def insufficiency(calibration: Calibration, limits: CoverageLimits | None = None
             camera = f"camera {name}" if name else "the camera"
             return (
                 f"{camera} pose: standard deviations of {1e3 * position:.2f} mm and {rotation / DEGREE:.2f}°, required are"
-                                f" {1e3 * wanted.position_m:.2f} mm and {wanted.rotation_rad / DEGREE:.2f}°"
+                f" {1e3 * wanted.position_m:.2f} mm and {wanted.rotation_rad / DEGREE:.2f}°"
             )
     return ""
 

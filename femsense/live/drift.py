@@ -107,7 +107,9 @@ class DriftWatch:
         sizes, errors = (
             np.array([_rms(v[:3]) * np.sqrt(3.0), _rms(v[3:6]) * np.sqrt(3.0), _rms(v[6:])]) for v in (change, error)
         )
-        limits = self.limits.share * np.array([1.0, self._size, self._size])  # a rotation is compared through the displacement at body size
+        limits = self.limits.share * np.array(
+            [1.0, self._size, self._size]
+        )  # a rotation is compared through the displacement at body size
         passed = (sizes > limits) & (sizes > self.limits.significance * errors)
         rotation, position, shape = (float(size) for size in sizes)
         return Drift(position, rotation, shape, bool(passed[:2].any()), bool(passed[2]))

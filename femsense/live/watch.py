@@ -109,7 +109,9 @@ class FrameWatch:
             return
         offset, period = float(np.ptp(raw.view_stamps_s)), float(np.median(self._periods))
         if offset > self.limits.out_of_step_share * period:
-            self.notices[Notice.OUT_OF_STEP] = f"{1e3 * offset:.0f} ms of a period of {1e3 * period:.0f} ms: connect their sync cables"
+            self.notices[Notice.OUT_OF_STEP] = (
+                f"{1e3 * offset:.0f} ms of a period of {1e3 * period:.0f} ms: connect their sync cables"
+            )
         else:
             self.notices.pop(Notice.OUT_OF_STEP, None)
 

@@ -1,4 +1,4 @@
-"""The cameras of a script: lens, place, and what their depths are off by."""
+"""The cameras of a script: intrinsics, pose, and depth errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIKE: dict[str, dict[str, Any]] = {
         "shiny_deg": 6.0,
     }
 }
-"""Keys that stand for a camera; what a script says itself goes before them."""
+"""Keys that a camera's name sets; explicit keys take precedence."""
 STEREO = {
     *("like", "subpixel_px", "baseline_m", "focal_px", "correlated_share", "correlation_px", "grazing_deg", "flying_share"),
     *("disparity_step_px", "bleeding_px", "shadows", "dark_signal", "shiny_deg"),
@@ -36,7 +36,7 @@ BOTH = {"edge_dropout", "quantum_m"}
 
 
 class NoiseTable(Schema):
-    """What depths are off by: active stereo, time of flight, or nothing."""
+    """Errors of the depth: active stereo, time of flight, or none."""
 
     kind: Literal["stereo", "time-of-flight", "perfect"] = Field("stereo", description='"stereo", "time-of-flight" or "perfect"')
     like: Literal["D415"] | None = Field(
@@ -91,7 +91,7 @@ class NoiseTable(Schema):
 
 
 class ViewTable(Schema):
-    """A camera and where it stands."""
+    """A camera and its pose."""
 
     like: Literal["D415"] | None = Field(
         None, description='"D415" sets width, height, fx and noise as that camera has them; keys that are given go before these'
@@ -120,7 +120,7 @@ class ViewTable(Schema):
     @model_validator(mode="before")
     @classmethod
     def _as_that_camera(cls, given: Any) -> Any:
-        """Fill in what `like` stands for: of the camera also where only its noise names it."""
+        """Fill in the keys that `like` sets, of the camera too if only its noise has the name."""
         if not isinstance(given, dict):
             return given
         noise = given.get("noise")

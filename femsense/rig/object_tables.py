@@ -1,4 +1,4 @@
-"""What touches the body in a script: objects, and contacts that follow a path."""
+"""Contacts in a script: objects, and contacts that follow a path."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ KEYS: dict[str, set[str]] = {
     "mesh": {"mesh", "unit"},
     "weight": {"radius_m", "stick_m", "mass_kg"},
 }
-"""What each kind says of its form."""
+"""Keys of the shape of each kind."""
 NEEDED = {"plate": {"size_m"}, "box": {"size_m"}, "mesh": {"mesh", "unit"}, "weight": {"mass_kg"}}
 
 
 class ObjectTable(Schema):
-    """Something that can touch the body. Where it touches is its lowest point; its own z axis points away from the body."""
+    """An object that can touch the body. Its contact point is its lowest point; its z axis points away from the body."""
 
     name: Annotated[str, Field(min_length=1, description="a name, each object its own")]
     kind: Literal["ball", "rod", "plate", "box", "mesh", "weight"] = Field(
@@ -62,7 +62,7 @@ class ObjectTable(Schema):
 
 
 class ContactTable(Schema):
-    """Something that presses on the body and is not declared in the recording."""
+    """An undeclared contact on the body."""
 
     sweep: str = Field(description="label of the sweep in which it acts")
     point_m: Vector | None = Field(None, description=PLACE)

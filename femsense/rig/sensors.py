@@ -1,10 +1,10 @@
 """Sensors in the body of the virtual rig: a strain or a shift between two of its points, with lag, noise and drift.
 
-    strain:  ε = |x_b − x_a| / |X_b − X_a| − 1,                      reading = zero + gain ε
-    colour:  u = (x_b − x_a) · d, d across the way from a to b,      reading_k = zero + gain ½ (1 + cos 2π (u / period − k / 3))
+    strain:  ε = |x_b − x_a| / |X_b − X_a| − 1,                                reading = zero + gain ε
+    colour:  u = (x_b − x_a) · d,  d perpendicular to the line from a to b,      reading_k = zero + gain ½ (1 + cos 2π (u / period − k / 3))
 
-A colour sensor at a looks at a pattern of colours at b; with the shift u other colours come before it (Scharff et al. 2018).
-What a sensor follows with a lag is the body; noise and drift are its own.
+A colour sensor at a looks at a pattern of colours at b; a shift u brings other colours in front of it (Scharff et al. 2018).
+The sensor follows the body with a lag; noise and drift are added to its reading.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DIGITS = 9
 
 
 class SensorTable(Schema):
-    """A sensor in the body; its readings stand in sensors.csv."""
+    """A sensor in the body; its readings are written to sensors.csv."""
 
     name: Annotated[
         str, Field(min_length=1, description="a name; a colour sensor has the channels NAME_red, NAME_green, NAME_blue")
@@ -60,7 +60,7 @@ class SensorTable(Schema):
 def sensor_readings(
     sensors: Sequence[SensorTable], mesh: TetMesh, states: Sequence[FloatArray], time_s: FloatArray, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Return what sensors read, shape (F, channels).
+    """Return the readings of sensors, shape (F, channels).
 
     Arguments:
         sensors: in the order of their columns.
@@ -91,7 +91,7 @@ def sensor_readings(
 
 
 def write_sensors(path: Path, sensors: Sequence[SensorTable], time_s: FloatArray, readings: FloatArray) -> None:
-    """Write sensors.csv: frame, time_s and a column a channel, as `femsense learn` reads it."""
+    """Write sensors.csv: frame, time_s and one column per channel, as read by `femsense learn`."""
     names = [channel for sensor in sensors for channel in sensor.channels]
     rows = [[k, *np.round([t, *row], DIGITS).tolist()] for k, (t, row) in enumerate(zip(time_s, readings))]
     write_csv(path, ("frame", "time_s", *names), rows)
@@ -113,7 +113,7 @@ def _colours(way: FloatArray, ends: FloatArray, sensor: SensorTable) -> FloatArr
 
 
 def _delayed(ideal: FloatArray, time_s: FloatArray, tau: float) -> FloatArray:
-    """Return what follows with a time constant, from the first value on."""
+    """Return values filtered with a time constant, starting at the first value."""
     if tau == 0.0:
         return ideal
     late = ideal.copy()

@@ -268,15 +268,15 @@ def test_the_finger_of_the_peers_reaches_its_heights_and_keeps_its_limits() -> N
     ("target", "more", "text"),
     [
         ({"tap": [0.0, 0.0, 0.0]}, {}, "did you mean 'tip'"),
-        ({}, {}, "nothing is wanted"),
-        ({"tip": [0.0, 0.0]}, {}, "not a place"),
+        ({}, {}, "no target"),
+        ({"tip": [0.0, 0.0]}, {}, "not a position"),
         ({(0.05, 0.5, 0.0): [0.0, 0.0, 0.0]}, {}, r"target: far from the surface of the body\n.* 470.0 mm from the body"),
         ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([0.05, 0.5, 0.0], [0.0, 0.0, 0.1])]}, "forces: far from the surface"),
         ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([50.0, 0.0, 15.0], [0.0, 0.0, 0.1])]}, "divide by 1000"),
         ({"tip": [0.0, 0.0, 0.0]}, {"contacts": [fs.WallContact((0.05, 0.5, 0.0), (0.0, 0.0, 1.0), 0.0, 0.1)]}, "contacts: far"),
         ({"tip": [0.0, 0.0, 0.0]}, {"control": "torque"}, "unknown control"),
-        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "no cable or chamber"),
-        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "wrong way round"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "unknown cable or chamber"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "reversed limits"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(target: dict[str, list[float]], more: dict[str, object], text: str) -> None:

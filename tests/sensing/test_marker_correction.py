@@ -100,7 +100,7 @@ def test_inputs_are_found_for_where_markers_truly_go() -> None:
     motion = fs.reach(robot, target, limits=limits, options=fs.ReachOptions(correct=True))
     assert motion.status == "reached" and motion.inputs["up"] == pytest.approx(1.5, abs=1e-3)
     assert motion.reached_m[TIP][2] == pytest.approx(wanted[2], abs=2e-6) and motion.correction_std_m is not None
-    assert "the correction is sure to" in motion.text
+    assert "standard deviation of the correction" in motion.text
     assert abs(fs.reach(robot, target, limits=limits).inputs["up"] - 1.5) > 0.02
 
 

@@ -4,7 +4,8 @@
 
 r is the residual, u the inputs in units of their ranges, J the columns of calibration and the accepted effects. J is fitted too but not predicted, so that
 g is orthogonal to it (Kennedy & O'Hagan 2001; Plumlee 2017). k is a sum of one kernel per input, which extrapolates from single inputs to
-combinations, or one kernel of all inputs; the choice, its length and s/σ maximise the restricted likelihood. g keeps the terms with variance above σ² (Nyström).
+combinations, or one kernel of all inputs; the choice, its length and s/σ maximise the restricted likelihood. g keeps the terms whose variance
+exceeds σ² (Nyström).
 """
 
 from __future__ import annotations
