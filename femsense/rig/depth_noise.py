@@ -7,8 +7,9 @@ has a baseline of 55 mm and 65° of view). Disparities are matched over windows,
 foreground bleeds over the background. Points that only one imager sees have no depth. Low signal and specular reflections
 give no match.
 
-Time of flight. The depth of a pixel is the amplitude-weighted mean over the returning light: mixed pixels at the edge of two surfaces lie
-between them, and in a corner light with a second bounce arrives later. Noise is inversely proportional to the amplitude (Frank et al. 2009, Optical Engineering 48:013602).
+Time of flight. The depth of a pixel is the amplitude-weighted mean over the returning light: mixed pixels at the edge of two surfaces
+lie between them, and in a corner light with a second bounce arrives later. Noise is inversely proportional to the amplitude (Frank
+et al. 2009, Optical Engineering 48:013602).
 """
 
 from __future__ import annotations
