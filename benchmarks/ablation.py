@@ -43,9 +43,9 @@ INF = float("inf")
 class OneCriterion(HeldOutComparison):
     """No worse in millimetres, or better by the noise and no worse beyond the mesh."""
 
-    def holds(self, decides: Thresholds) -> bool:
-        least = decides.evidence if self.only_calibrated else 0.0
-        return self.error <= decides.not_worse or (self.gain > least and self.beyond_mesh <= decides.not_worse)
+    def holds(self, thresholds: Thresholds) -> bool:
+        least = thresholds.evidence if self.only_calibrated else 0.0
+        return self.error <= thresholds.not_worse or (self.gain > least and self.beyond_mesh <= thresholds.not_worse)
 
 
 def nothing(*given: Any, **more: Any) -> None:

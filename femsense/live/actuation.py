@@ -161,7 +161,7 @@ class ReadActuation:
             found[Notice.ACTUATION_AWAY] = f"{self._source}: {trouble}; the last values hold"
         elif newest is not None and asked - newest > self._limits.late_s:
             found[Notice.ACTUATION_LATE] = (
-                f"{self.source}: the newest values are {asked - newest:.1f} s older than the frame; they are used until others arrive"
+                f"{self._source}: the newest values are {asked - newest:.1f} s older than the frame; they are used until others arrive"
             )
         if stands is not None and self._clock() - stands > self._limits.late_s:
             found[Notice.ACTUATION_FROZEN] = (

@@ -28,7 +28,7 @@ from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.element_order import linear_suffice, need_quadratic, seeks_with_quadratic, with_quadratic
-from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
+from femsense.loop.search.search import distinguishes_effects, new_search, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
 from femsense.loop.search.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
@@ -96,25 +96,25 @@ def improve(
     Raises:
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
-    say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
+    work, options = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     searched: Sequence[Recording]
-    searched, others = _split(recordings, validation, how)
-    names, forms = _asked(robot, searched, effects, without, how, apart=not others)
-    searched, validation = _less_references(robot, searched, validation, how, say)
-    rng = np.random.default_rng(how.seed)
-    with Checkpoint(how.keep, forms) as checkpoint, say.watching():
-        data, search = _search(robot, searched, validation, (names, forms), how, checkpoint, say)
+    searched, others = _split(recordings, validation, options)
+    names, forms = _asked(robot, searched, effects, without, options, apart=not others)
+    searched, validation = _less_references(robot, searched, validation, options, work)
+    rng = np.random.default_rng(options.seed)
+    with Checkpoint(options.keep, forms) as checkpoint, work.watching():
+        data, search = _search(robot, searched, validation, (names, forms), options, checkpoint, work)
         if others:
-            search = in_all_recordings(data, search, others, names, _ask(how, forms), say)
-        say.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
-        say("testing the remaining residual")
-        result = conclude(data, search, rng, correct=how.correct)
+            search = in_all_recordings(data, search, others, names, _ask(options, forms), work)
+        work.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
+        work("testing the remaining residual")
+        result = conclude(data, search, rng, correct=options.correct)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t) or ELSE
-    result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed))
+    result = replace(result, next_experiment=record, data=replace(result.data, seed=options.seed))
     if distinguishes_effects(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states to distinguish effects"
@@ -132,37 +132,37 @@ def search_recordings(
     options: ImproveOptions | None = None,
 ) -> tuple[Data, Search]:
     """Return the data and the completed search, without the conclusion that `conclude` draws; arguments and errors as of `improve`."""
-    how = options or ImproveOptions()
-    names, forms = _asked(robot, recordings, effects, without, how)
-    recordings, validation = _less_references(robot, recordings, validation, how, lambda text: None)
-    with Checkpoint(how.keep, forms) as checkpoint:
-        return _search(robot, recordings, validation, (names, forms), how, checkpoint, WorkPlan(lambda text: None))
+    options = options or ImproveOptions()
+    names, forms = _asked(robot, recordings, effects, without, options)
+    recordings, validation = _less_references(robot, recordings, validation, options, lambda text: None)
+    with Checkpoint(options.keep, forms) as checkpoint:
+        return _search(robot, recordings, validation, (names, forms), options, checkpoint, WorkPlan(lambda text: None))
 
 
 def _split(
-    recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions
+    recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions
 ) -> tuple[list[Recording], list[Recording]]:
     """Return the recordings that are searched for effects, and the others; none of the latter with `validation` or `references`."""
-    if validation or how.references or how.measured not in ("auto", "markers"):
+    if validation or options.references or options.measured not in ("auto", "markers"):
         return list(recordings), []
-    return recordings_to_search(recordings, how.effort.recordings)
+    return recordings_to_search(recordings, options.effort.recordings)
 
 
-def _ask(how: ImproveOptions, forms: Sequence[Effect]) -> Ask:
-    if how.spread is None:
+def _ask(options: ImproveOptions, forms: Sequence[Effect]) -> Ask:
+    if options.spread is None:
         return asked_here(forms)
-    folder = Path(tempfile.gettempdir()) if how.keep is None else Path(how.keep[0]).parent
-    return asked_elsewhere(how.spread, forms, how.user_effects, folder)
+    folder = Path(tempfile.gettempdir()) if options.keep is None else Path(options.keep[0]).parent
+    return asked_elsewhere(options.spread, forms, options.user_effects, folder)
 
 
 def _less_references(
-    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions, say: Progress
+    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions, work: Progress
 ) -> tuple[Sequence[Recording], Sequence[Recording]]:
     """Return the recordings with the residuals of the references subtracted; unchanged if there are none."""
-    if not how.references:
+    if not options.references:
         return recordings, validation
-    say("comparing with the reference")
-    every = less_reference(robot, [*recordings, *validation], how.references)
+    work("comparing with the reference")
+    every = less_reference(robot, [*recordings, *validation], options.references)
     return every[: len(recordings)], every[len(recordings) :]
 
 
@@ -171,17 +171,17 @@ def _asked(
     recordings: Sequence[Recording],
     effects: Sequence[str] | None,
     without: Sequence[str] | None,
-    how: ImproveOptions,
+    options: ImproveOptions,
     *,
     apart: bool = True,
 ) -> tuple[list[str], tuple[Effect, ...]]:
     """Return the names of the effects to try, and all their forms, with one value per recording too if `apart`. Raises InputError."""
-    own = tuple(load_own_effect(file) for file in how.user_effects)
+    own = tuple(load_own_effect(file) for file in options.user_effects)
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
     names = (
-        [name for name in names if name != MESH.name] if how.references else names
+        [name for name in names if name != MESH.name] if options.references else names
     )  # references cancel the discretisation error of the declared mesh only
     if not names:
         raise InputError(
@@ -196,52 +196,57 @@ def _search(
     recordings: Sequence[Recording],
     validation: Sequence[Recording],
     asked: tuple[list[str], tuple[Effect, ...]],
-    how: ImproveOptions,
+    options: ImproveOptions,
     checkpoint: Checkpoint,
-    say: WorkPlan,
+    work: WorkPlan,
 ) -> tuple[Data, Search]:
     names, forms = asked
 
-    def begun(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    def calibrated_search(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
         with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
-            data, before, start = calibrated(data, say)
+            data, before, start = calibrated(data, work)
             finer_is_made()
-        data = with_discretisation_error(data, start[-1][1], names, say)
-        say.next_stage()
-        return search_begun((data, before, start), names, refits, quadratic=quadratic)
+        data = with_discretisation_error(data, start[-1][1], names, work)
+        work.next_stage()
+        return new_search((data, before, start), names, refits, quadratic=quadratic)
 
-    def prepared(body: Robot) -> Data:
-        say("reading and calibrating")
-        every = prepare(body, recordings, validation, how.measured)
+    def prepare_data(body: Robot) -> Data:
+        work("reading and calibrating")
+        every = prepare(body, recordings, validation, options.measured)
         return replace(
-            every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort, relative=bool(how.references)
+            every,
+            forms=forms,
+            declared=robot,
+            thresholds=options.thresholds,
+            effort=options.effort,
+            relative=bool(options.references),
         )
 
-    def ready(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    def prepare_search(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
         elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)
         some = some_states(every)
         with contextlib.suppress(FemsenseError):  # if an effect has no equilibrium in some state, the search runs in all states
             if some is not None:
-                say.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
-                course = begun(some, names, quadratic, refits)
-                search = search_effects(course, Checkpoint(None), say)[1]
-                say.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
-                course = in_all_states(every, course, search, say)
-                say.next_stage()
-                return course
-        say.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
-        return begun(every, names, quadratic, refits)
+                work.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
+                state = calibrated_search(some, names, quadratic, refits)
+                search = search_effects(state, Checkpoint(None), work)[1]
+                work.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
+                state = in_all_states(every, state, search, work)
+                work.next_stage()
+                return state
+        work.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
+        return calibrated_search(every, names, quadratic, refits)
 
-    return _searched(robot, names, prepared, ready, checkpoint, say)
+    return _searched(robot, names, prepare_data, prepare_search, checkpoint, work)
 
 
 def _searched(
     robot: Robot,
     names: list[str],
-    prepared: Callable[[Robot], Data],
-    ready: Callable[..., SearchProgress],
+    prepare_data: Callable[[Robot], Data],
+    prepare_search: Callable[..., SearchProgress],
     checkpoint: Checkpoint,
-    say: WorkPlan,
+    work: WorkPlan,
 ) -> tuple[Data, Search]:
     """Return the data and the search: on quadratic elements if the robot declares linear ones and the data need quadratic ones, else on the declared
     mesh. An interrupted search resumes."""
@@ -249,27 +254,27 @@ def _searched(
     asks = seeks_with_quadratic(robot, names)
     kept = checkpoint.kept(SearchProgress)
     if kept is not None:
-        say(f"resuming the search (effects found: {kept.found})")
+        work(f"resuming the search (effects found: {kept.found})")
     if asks and kept is None:
-        data = prepared(robot)
-        say.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
-        say("testing whether linear elements suffice")
+        data = prepare_data(robot)
+        work.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
+        work("testing whether linear elements suffice")
         record = linear_suffice(data)
         if record is not None:
             names = [name for name in names if name != MESH.name]
-            course = ready(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
-            return search_effects(course, checkpoint, say)
+            state = prepare_search(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
+            return search_effects(state, checkpoint, work)
     if asks and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and converge in states where quadratic ones fold
-            course = kept or ready(prepared(with_quadratic(robot)), names, quadratic=True, refits=[])
-            data, search = search_effects(course, checkpoint, say)
-            say("testing whether quadratic elements are needed")
+            state = kept or prepare_search(prepare_data(with_quadratic(robot)), names, quadratic=True, refits=[])
+            data, search = search_effects(state, checkpoint, work)
+            work("testing whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
             if needed:
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
         kept = None
-    return search_effects(kept or ready(prepared(robot), names, quadratic=False, refits=refits), checkpoint, say)
+    return search_effects(kept or prepare_search(prepare_data(robot), names, quadratic=False, refits=refits), checkpoint, work)
 
 
 def states_of(data: Data) -> int:

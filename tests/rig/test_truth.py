@@ -381,6 +381,6 @@ def test_a_probe_touches_from_outside(kind: str) -> None:
 
 def test_a_camera_that_sees_no_marker_is_refused(robot: Robot, tmp_path: Path) -> None:
     away = changed(SCRIPT, {"camera__eye_m": [1.0, 0.0, 0.3], "camera__target_m": [2.0, 0.0, 0.3]})
-    with pytest.raises(InputError, match="sees no marker"):
+    with pytest.raises(InputError, match="no marker is visible"):
         simulate(robot, away, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -110,7 +110,7 @@ def test_what_it_does_not_know_is_refused() -> None:
         fs.calibrate(arm((4, 1, 1)), recording, correct=True)
     with pytest.raises(InputError, match="other inputs"):
         corrected(replace(recording, actuation="displacement"), learned(), [T_ROBOT_CAMERA])
-    with pytest.raises(InputError, match="no such marker"):
+    with pytest.raises(InputError, match="does not include this marker"):
         fs.reach(robot, {(0.1, 0.0, 0.0): [0.1, 0.0, 0.0]}, options=fs.ReachOptions(correct=True))
 
 

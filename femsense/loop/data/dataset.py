@@ -132,7 +132,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     words: list[str] = []
     for recording, kinds in zip(recordings, used):
         frames = np.union1d(*kinds)
-        fitted, kept, how = (
+        fitted, kept, description = (
             (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
         )
         if not len(kept) and not validation:
@@ -143,7 +143,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
             if later is not None:
                 held.append(replace(later, together=bool(held) and later.together and held_of[-1] == first))
                 held_of.append(first)
-        words.append(how)
+        words.append(description)
     for recording, kinds in zip(validation, used[len(recordings) :]):
         frames = np.union1d(*kinds)
         for one, _ in _trials(robot, declared, recording, kinds, frames, frames[:0], first_only=True):

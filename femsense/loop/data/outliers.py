@@ -38,7 +38,7 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     return replace(trial, scene=trial.scene.of_rows(~off), groups=trial.groups.of_rows(~off), mesh_error=None)
 
 
-def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, decides: Thresholds) -> BoolArray:
+def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, thresholds: Thresholds) -> BoolArray:
     """Return which rows of a residual (k, 3) [m] are outliers, shape (k,).
 
     After the medians of its frame and of its marker are subtracted, an outlier is longer than `far` [m] and than `outlying` times the 90 % quantile.
@@ -48,12 +48,12 @@ def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float
     """
     apart = _less_medians(_less_medians(residual, frame), marker)
     size = np.linalg.norm(apart, axis=1)
-    off = size > max(far, decides.outlying * float(np.quantile(size, 0.9)))
+    off = size > max(far, thresholds.outlying * float(np.quantile(size, 0.9)))
     for k in np.unique(frame[off]):
         rows = np.flatnonzero(off & (frame == k))
         if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():
             off[rows] = False
-    return off if off.sum() <= max(decides.rare * len(off), 1) else np.zeros(len(off), dtype=bool)
+    return off if off.sum() <= max(thresholds.rare * len(off), 1) else np.zeros(len(off), dtype=bool)
 
 
 def _less_medians(values: FloatArray, labels: IntArray) -> FloatArray:

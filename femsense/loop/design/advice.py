@@ -99,8 +99,8 @@ def proposal_text(proposal: Proposal) -> str:
     frames, seconds = sum(e.frames for e in proposal.elements), sum(e.seconds for e in proposal.elements)
     lines = [f"What to record ({frames} frames, {seconds / 60:.1f} minutes of motion; every item starts and ends at rest):", ""]
     for i, e in enumerate(proposal.elements):
-        how = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
-        lines.append(f"{i + 1:3d}. {e.words}{how}")
+        effort = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
+        lines.append(f"{i + 1:3d}. {e.words}{effort}")
         lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
     if not proposal.steps:
         lines.append("no candidate experiment helps within these frames")
@@ -152,7 +152,7 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms, decides=data.thresholds), _most_frames(data, tets)
+    judge, left = Judge(forms, thresholds=data.thresholds), _most_frames(data, tets)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"distinguish {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
     chosen = []
@@ -213,7 +213,7 @@ def _open(identifiability: Identifiability, pairs: Sequence[tuple[str, str]], no
         for i, j, _, gap in reversed(identifiability.pairs())
     }
     alone = {r.name: r.dbic for r in reversed(identifiability.rows)}
-    wanted = identifiability.decides.evidence
+    wanted = identifiability.thresholds.evidence
     answers: list[Any] = [of.get(frozenset(p), wanted) for p in pairs]
     answers += [alone.get(n, wanted) for n in not_testable]
     return np.array(answers or [wanted])

@@ -180,8 +180,8 @@ def _unload(p: Pull) -> Element:
 
 
 def _together(a: Pull, b: Pull) -> Element:
-    how = "against each other" if _cosine(a, b) < -0.5 else "together"
-    words = f"pull {a.words(TOGETHER)} and {b.words(TOGETHER)} {how}, in 2 steps"
+    direction = "against each other" if _cosine(a, b) < -0.5 else "together"
+    words = f"pull {a.words(TOGETHER)} and {b.words(TOGETHER)} {direction}, in 2 steps"
     return Element(
         f"mix:{a.name}+{b.name}", words, (_sweep(f"{a.name} and {b.name}", [(a, TOGETHER), (b, TOGETHER)], [0.5, 1.0]),)
     )

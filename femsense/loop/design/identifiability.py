@@ -40,15 +40,15 @@ class Row:
     form: Form
     dbic: float
     """Expected dBIC at plausible size."""
-    decides: Thresholds
+    thresholds: Thresholds
 
     @property
     def testable(self) -> bool:
-        return self.retained >= self.decides.testable
+        return self.retained >= self.thresholds.testable
 
     @property
     def seen(self) -> bool:
-        return self.testable and self.dbic >= self.decides.evidence
+        return self.testable and self.dbic >= self.thresholds.evidence
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,7 +60,7 @@ class Identifiability:
     """Share of effect i (row) that is collinear with effect j, calibration refitted, shape (r, r)."""
     gap: FloatArray
     """Expected dBIC of i over j if i is true at plausible size, shape (r, r); inf between forms of one effect."""
-    decides: Thresholds = DEFAULTS
+    thresholds: Thresholds = DEFAULTS
 
     def pairs(self) -> list[tuple[int, int, float, float]]:
         """Return (i, j, collinearity, gap) of all pairs of effects, the less favourable direction of each."""
@@ -78,7 +78,7 @@ class Identifiability:
 
     def cannot_distinguish(self, pair: tuple[int, int, float, float]) -> bool:
         """Return whether a pair as of `pairs` is collinear (above `alike`) or too close in evidence."""
-        return pair[2] > self.decides.alike or pair[3] < self.decides.evidence
+        return pair[2] > self.thresholds.alike or pair[3] < self.thresholds.evidence
 
     def distinguished(self) -> tuple[int, int]:
         """Return the number of pairs of detectable effects that are distinguished, and the number of all pairs."""
@@ -98,7 +98,7 @@ class Identifiability:
     @property
     def confusion(self) -> float:
         """The objective of planning: the sum of the shortfalls of effects and pairs, each between 0 and 1."""
-        least, alike, wanted = self.decides.testable, self.decides.alike, self.decides.evidence
+        least, alike, wanted = self.thresholds.testable, self.thresholds.alike, self.thresholds.evidence
         missing = sum(max(0.0, 1.0 - r.retained / least) + np.clip(1.0 - r.dbic / wanted, 0.0, 1.0) for r in self.rows)
         pairs = sum(
             np.clip(1.0 - gap / wanted, 0.0, 1.0) + np.clip((share - alike) / (1 - alike), 0, 1)
@@ -113,7 +113,7 @@ class Judge:
 
     forms: list[Form]
     calibrated: tuple[str, ...] = NUISANCE
-    decides: Thresholds = DEFAULTS
+    thresholds: Thresholds = DEFAULTS
     _by_label: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -140,7 +140,7 @@ class Judge:
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
                     confounding[i, j], gap[i, j] = left.alternative(self.forms.index(a.form), self._by_label[b.label])
-        return Identifiability(tuple(rows), confounding, gap, self.decides)
+        return Identifiability(tuple(rows), confounding, gap, self.thresholds)
 
     def _dropped(self, label: str) -> frozenset[str]:
         return frozenset({label} & set(self.calibrated))
@@ -170,9 +170,9 @@ class Judge:
         at = f.columns
         size, total = np.diag(left.S)[at], np.diag(whole)[at]
         retained = float(np.sqrt(max(size.sum(), 0.0) / total.sum())) if total.sum() > 0 else 0.0
-        needed = np.sqrt(self.decides.evidence + len(f.parameters) * np.log(count))
+        needed = np.sqrt(self.thresholds.evidence + len(f.parameters) * np.log(count))
         smallest = np.where(size > ABSORBED * np.maximum(total, 1e-300), needed / np.sqrt(np.maximum(size, 1e-300)), np.inf)
-        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)), self.decides)
+        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)), self.thresholds)
 
 
 class _Left:

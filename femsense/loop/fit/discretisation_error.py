@@ -111,8 +111,8 @@ def as_shown(data: Data, fitted: FittedModel) -> Data:
     if not data.mesh_as_shown or not errors:
         return data
     shares = np.concatenate([_shares(t, jet, error) for t, jet, error in zip(data.train, fitted.fit.jets, errors)])
-    decides = data.thresholds
-    size = max(float(abs(shares.mean())) / decides.mesh_share, float(shares.std()) / decides.mesh_varies)
+    thresholds = data.thresholds
+    size = max(float(abs(shares.mean())) / thresholds.mesh_share, float(shares.std()) / thresholds.mesh_varies)
     return data.with_trials(lambda t: t if t.mesh_error is None else replace(t, mesh_error=min(size, 1.0) * t.mesh_error))
 
 
@@ -213,7 +213,9 @@ def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
     return embed_points(mesh, fine.nodes)
 
 
-def _by_sweep(trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence[FloatArray], decides: Thresholds) -> FloatArray:
+def _by_sweep(
+    trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence[FloatArray], thresholds: Thresholds
+) -> FloatArray:
     """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each scaled to one standard deviation; moves (f, m, 3) belong to the frames (f,).
 
     In order: the error of all sweeps, of each sweep, and each of its components along each axis (rotation and stretch).
@@ -222,14 +224,14 @@ def _by_sweep(trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence
     along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
     if trial.scene.crossings is not None:
         along = normals_of(trial.scene, poses)[:, None, :]
-    turned = decides.mesh_turns * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
+    turned = thresholds.mesh_turns * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
     error = np.einsum("kca,ka->kc", along, error)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
     by_sweep[np.arange(len(error)), :, number] = (
-        decides.mesh_varies_held if trial.scene.recording.actuation == "displacement" else decides.mesh_varies
+        thresholds.mesh_varies_held if trial.scene.recording.actuation == "displacement" else thresholds.mesh_varies
     ) * error
-    return np.concatenate([decides.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
+    return np.concatenate([thresholds.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
 
 
 def mesh_errors(data: Data) -> list[FloatArray]:

@@ -12,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.joint_fit import FitOptions, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
@@ -73,10 +73,10 @@ def fit_model(
     prior: Prior,
     noise: Noise,
     coordinates: FloatArray,
-    **how: Unpack[FitHow],
+    **options: Unpack[FitOptions],
 ) -> FittedModel:
     """Return the fit of a hypothesis with its held-out data; arguments as of `fit_jointly`."""
-    fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **how)
+    fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **options)
     held = held_out(data, fit, noise)
     return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
 

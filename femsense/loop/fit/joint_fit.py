@@ -326,7 +326,7 @@ SERVES = 0.25
 """Derivatives are reused for another step if their prediction of the residual erred by less than this share of its change."""
 
 
-class FitHow(TypedDict, total=False):
+class FitOptions(TypedDict, total=False):
     """Start and limits of a fit: keyword arguments of `fit_jointly`."""
 
     own: FloatArray | None

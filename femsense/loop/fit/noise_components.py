@@ -207,8 +207,8 @@ def estimate_noise(
     best = min(each(from_start, starting_points(names, scale, jitter, near)), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
-    how = "from repeated states" if "state" in names else "no repeated state: assumed from the residual"
-    return Noise(std, f"restricted maximum likelihood, {how}")
+    origin = "from repeated states" if "state" in names else "no repeated state: assumed from the residual"
+    return Noise(std, f"restricted maximum likelihood, {origin}")
 
 
 def starting_points(names: Sequence[str], scale: float, jitter: float, near: FloatArray | None) -> list[FloatArray]:

@@ -42,27 +42,27 @@ def acceptance_test(
 
     For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. Names in code style are fields of `Thresholds`.
     """
-    decides = data.thresholds
+    thresholds = data.thresholds
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
     # for a true effect `held` has mean `acts` and variance 4 · acts
     acts = held_shift(data, fitted, made, noise)
-    wanted = min(decides.held_gain * gain * held_share(data), acts - 2.0 * decides.significant * float(np.sqrt(acts)))
+    wanted = min(thresholds.held_gain * gain * held_share(data), acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    fit_objection = _objection(made, candidate, score, decides)
-    if fit_objection is None and np.isfinite(std_error) and better <= decides.sweeps_for * std_error:
+    fit_objection = _objection(made, candidate, score, thresholds)
+    if fit_objection is None and np.isfinite(std_error) and better <= thresholds.sweeps_for * std_error:
         fit_objection = f"left-out sweeps are not predicted better (log density {better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = (
             f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} in the fitted data)"
         )
-    if fit_objection is None and score + held <= decides.evidence:  # held-out data weaken the evidence
+    if fit_objection is None and score + held <= thresholds.evidence:  # held-out data weaken the evidence
         fit_objection = f"too little evidence (dBIC {score:.1f}) with the held-out data (χ² {_moves(held)} there)"
-    if fit_objection is None and moved < decides.above_mesh * mesh:
+    if fit_objection is None and moved < thresholds.above_mesh * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm; the discretisation error is {1e3 * mesh:.3f} mm"
-    if fit_objection is None and plainly_worse(fitted, made, decides):
+    if fit_objection is None and plainly_worse(fitted, made, thresholds):
         fit_objection = (
             f"the unweighted error of the fitted data grows (from {1e3 * fitted.fit.rms:.3f} to {1e3 * made.fit.rms:.3f} mm)"
         )
@@ -77,7 +77,7 @@ def acceptance_test(
         held_dchi2=held,
         moved_m=moved,
         mesh_cost_m=mesh,
-        takes_over=_taken_over(fitted, made, decides),
+        takes_over=_taken_over(fitted, made, thresholds),
     )
     return Refit(candidate, made, score, record)
 
@@ -86,9 +86,9 @@ def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def plainly_worse(before: FittedModel, after: FittedModel, decides: Thresholds) -> bool:
+def plainly_worse(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> bool:
     """Return whether an effect enlarges the unweighted rms of the fitted data beyond `plainly_worse` and does not reduce the held-out error."""
-    return after.fit.rms > decides.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
+    return after.fit.rms > thresholds.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
 
 
 def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
@@ -103,9 +103,9 @@ def surely_predicts(refitted: Refit) -> float:
     return gain - (std if np.isfinite(std) else 0.0)
 
 
-def _taken_over(before: FittedModel, after: FittedModel, decides: Thresholds) -> tuple[str, ...]:
+def _taken_over(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> tuple[str, ...]:
     """Return the nuisance effects that are significant before an effect is added, and not after."""
-    return tuple(n for n in NUISANCE if _z(before, n) > decides.significant > _z(after, n))
+    return tuple(n for n in NUISANCE if _z(before, n) > thresholds.significant > _z(after, n))
 
 
 def _z(fitted: FittedModel, name: str) -> float:
@@ -138,13 +138,13 @@ def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) 
     return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
 
 
-def _objection(made: FittedModel, candidate: Candidate, score: float, decides: Thresholds) -> str | None:
+def _objection(made: FittedModel, candidate: Candidate, score: float, thresholds: Thresholds) -> str | None:
     """Return the criterion of evidence, identifiability or bounds that a fit violates, or None."""
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
-    if score <= decides.evidence and made.fit.fit.status == STOPPED_EARLY:
+    if score <= thresholds.evidence and made.fit.fit.status == STOPPED_EARLY:
         return "stopped early: the predicted gain of a step was too small"
-    if score <= decides.evidence:
+    if score <= thresholds.evidence:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():
         return "not identifiable: the data leave a parameter open"

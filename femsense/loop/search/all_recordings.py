@@ -235,7 +235,7 @@ def _question(file: str, digest: str, own: tuple[str, ...]) -> tuple[Question, t
 
 
 def in_all_recordings(
-    data: Data, search: Search, others: Sequence[Recording], names: Sequence[str], ask: Ask, say: Progress
+    data: Data, search: Search, others: Sequence[Recording], names: Sequence[str], ask: Ask, progress: Progress
 ) -> Search:
     """Return a search whose last model is fitted to all recordings, without the effects that have no evidence there.
 
@@ -244,11 +244,11 @@ def in_all_recordings(
         search: in these.
         names: effects that are tried.
         ask: returns the normal equations of the others.
-        say: called with the name of each step.
+        progress: called with the name of each step.
     """
     fitted, noise = search.final, search.noise
     for step in range(MOST_STEPS):
-        say(f"fitting to all {len(others) + len(data.train)} recordings (step {step + 1})")
+        progress(f"fitting to all {len(others) + len(data.train)} recordings (step {step + 1})")
         total = reduce(add, ask(_question_of(data, fitted, noise, ()), others))
         made = _with_others(data, fitted, noise, total)
         moved = np.abs(made.fit.coordinates - fitted.fit.coordinates) / np.maximum(made.fit.std, 1e-300)
@@ -256,7 +256,7 @@ def in_all_recordings(
         if moved.max(initial=0.0) < STILL:
             break
     fitted, dropped = _with_evidence(data, fitted, search, noise)
-    say("screening effects in all recordings")
+    progress("screening effects in all recordings")
     screened = [n for n in names if n not in NUISANCE]
     here = [t.scene.recording for t in data.train]
     question = _question_of(data, fitted, noise, screened)

@@ -14,7 +14,7 @@ from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
-from femsense.loop.fit.joint_fit import FitHow, Prior
+from femsense.loop.fit.joint_fit import FitOptions, Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import UNTOLD, Noise
 from femsense.loop.search.search_state import Progress
@@ -31,16 +31,16 @@ Ready = tuple[Data, FittedModel, History]
 """Data, the declared model with its camera calibrated, and the models that the search extends."""
 
 
-def calibrated(data: Data, say: Progress) -> Ready:
+def calibrated(data: Data, progress: Progress) -> Ready:
     """Return the data without outliers, the declared model with its camera calibrated, and the fully calibrated model; preceded by the same on the
     declared mesh if the search uses another one."""
     placed = calibrated_pose(data, data.robot, START)
     while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
         data, placed = fewer, calibrated_pose(fewer, data.robot, START)
-    say("fitting the nuisance parameters")
+    progress("fitting the nuisance parameters")
     base = calibrated_on(data, data.robot, placed)
     if "clouds" in data.measured:
-        say("recomputing the rows of the clouds")
+        progress("recomputing the rows of the clouds")
         rough = base.fit.normal_rms
         data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), anew=True)
         placed = calibrated_pose(data, data.robot, START, placed)
@@ -68,9 +68,9 @@ def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
     )
 
 
-def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
+def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], progress: Progress) -> Data:
     """Return the data with the discretisation error, and with marker placements that rotate with the body."""
-    say("estimating the discretisation error")
+    progress("estimating the discretisation error")
     try:  # the offsets of `base` may be biased by a missing effect, so only the modulus is kept
         frames = [representative_frames(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
@@ -99,12 +99,12 @@ def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False
     return data, fitted
 
 
-def fitted_again(data: Data, fitted: FittedModel, noise: Noise, **how: Unpack[FitHow]) -> FittedModel:
+def fitted_again(data: Data, fitted: FittedModel, noise: Noise, **options: Unpack[FitOptions]) -> FittedModel:
     """Return a model refitted to other weights or rows, starting from its current values; derivatives known there, or close by, are reused."""
-    fit, how["own"] = fitted.fit, own_of(fitted)
+    fit, options["own"] = fitted.fit, own_of(fitted)
 
     def refitted(steps: int) -> FittedModel:
-        how["max_iterations"] = steps
-        return fit_model(data, fit.hypothesis, fit.prior, noise, fit.coordinates, **how)
+        options["max_iterations"] = steps
+        return fit_model(data, fit.hypothesis, fit.prior, noise, fit.coordinates, **options)
 
     return as_far_as_held_out_states_converge(refitted, STEPS)

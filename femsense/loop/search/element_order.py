@@ -17,7 +17,7 @@ from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
 from femsense.loop.data.representative_states import FEWEST, spread_states
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, span_of
-from femsense.loop.fit.joint_fit import FitHow
+from femsense.loop.fit.joint_fit import FitOptions
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.calibration import START, calibrated_on, calibrated_pose
@@ -98,7 +98,7 @@ def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
     return Candidate(MESH, QUADRATIC, (), [], [], np.zeros((0, 0)), np.zeros((0, 0)), 1.0, nothing, np.inf, np.inf, cost, nothing)
 
 
-def _on(data: Data, mesh_of: Robot, search: Search, **how: Unpack[FitHow]) -> FittedModel:
+def _on(data: Data, mesh_of: Robot, search: Search, **options: Unpack[FitOptions]) -> FittedModel:
     """Return the last model of a search refitted on the mesh of another robot. Nuisance parameters start from their values on linear elements, effects from
     their current ones. Raises DataError."""
     fit, linear, robot = search.final.fit, search.history[0][1], mesh_of
@@ -110,8 +110,8 @@ def _on(data: Data, mesh_of: Robot, search: Search, **how: Unpack[FitHow]) -> Fi
         if name in fit.hypothesis.names:
             start[span_of(fit, name)] = linear.fit.coordinates[span_of(linear.fit, name)]
     hypothesis = replace(fit.hypothesis, robot=robot, settled=others)
-    how["own"] = fit.fit.theta[: fit.own]
-    return fit_model(data, hypothesis, fit.prior, search.noise, start, **how)
+    options["own"] = fit.fit.theta[: fit.own]
+    return fit_model(data, hypothesis, fit.prior, search.noise, start, **options)
 
 
 def _refined(data: Data, search: Search, seed: Entry) -> RefitRecord:

@@ -21,12 +21,12 @@ from femsense.model.effects.base import range_units
 def moved_nuisance(data: Data, fitted: FittedModel, name: str) -> int:
     """Return how many values of a nuisance differ from the declared one by more than `significant` σ and by more than the share `relevant`."""
     part = span_of(fitted.fit, name)
-    values, std, decides = fitted.fit.coordinates[part], fitted.fit.std[part], data.thresholds
+    values, std, thresholds = fitted.fit.coordinates[part], fitted.fit.std[part], data.thresholds
     if not len(values):
         return 0
     parameters = next(own for effect, _, own in fitted.fit.hypothesis.terms if effect.name == name)
     size = np.abs(values) / np.maximum(range_units(parameters, data.robot.body.cable_names, data.input_scale), 1e-12)
-    return int(((np.abs(values) > decides.significant * std) & (size > decides.relevant)).sum())
+    return int(((np.abs(values) > thresholds.significant * std) & (size > thresholds.relevant)).sum())
 
 
 def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:

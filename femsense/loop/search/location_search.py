@@ -72,14 +72,14 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     return apart
 
 
-def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:
+def same_place(a: Candidate, b: Candidate, thresholds: Thresholds) -> bool:
     """Return whether two places have nearly the same field with the same sign; with opposite signs (soft here, stiff there) they are different."""
-    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= decides.alike
+    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= thresholds.alike
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, decides: Thresholds) -> list[float]:
+def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, thresholds: Thresholds) -> list[float]:
     """Return the standard deviation of the steps over the seeds that fit nearly as well as the best one."""
-    steps = [c.step for c in seen if fit.chi2 + best.gain - c.gain <= beyond(fit, decides.evidence)]
+    steps = [c.step for c in seen if fit.chi2 + best.gain - c.gain <= beyond(fit, thresholds.evidence)]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
@@ -163,7 +163,7 @@ def _screen_seeds(
 
 
 def lies_on_body(
-    robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, decides: Thresholds
+    robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, thresholds: Thresholds
 ) -> bool:
     """Return whether each place among parameters lies in the body at rest, or outside it by at most `resolved` of its reach. Without this bound a fit may
     place a force anywhere along its line of action."""
@@ -172,5 +172,5 @@ def lies_on_body(
         if p.unit == "m" and isinstance(p.part, int):
             places.setdefault(p.key, []).append(p.value(float(v)))
     points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
-    most = decides.resolved * robot.body.reach
+    most = thresholds.resolved * robot.body.reach
     return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= most).all())

@@ -11,7 +11,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, Prior
+from femsense.loop.fit.joint_fit import FitOptions, JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
 from femsense.model.drive import has_history
@@ -71,8 +71,8 @@ def refit(
         try:
             theta = _declared(data, fitted, hypothesis, noise) if share is None else fitted.fit.fit.theta + share * answer
             coordinates = np.concatenate([theta[fitted.fit.own :], null + part * (start - null)])
-            how = FitHow(own=theta[: fitted.fit.own], max_iterations=10, known=known, near=near, worth=worth)
-            return fit_model(data, hypothesis, prior, noise, coordinates, **how)
+            options = FitOptions(own=theta[: fitted.fit.own], max_iterations=10, known=known, near=near, worth=worth)
+            return fit_model(data, hypothesis, prior, noise, coordinates, **options)
         except DataError:
             return None
 

@@ -26,13 +26,13 @@ Term = tuple[Effect, Entry, tuple[Parameter, ...]]
 
 
 def with_all_parts(
-    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, progress: Progress
 ) -> tuple[FittedModel, list[RefitRecord]]:
     """Return the model with the richer forms that have evidence, and the record of each form that was fitted."""
     records: list[RefitRecord] = []
     for i, term in enumerate(fitted.fit.hypothesis.terms):
         for richer in _richer_terms(data, term):
-            say(f"trying {term[0].name} with {len(richer[2])} parameters")
+            progress(f"trying {term[0].name} with {len(richer[2])} parameters")
             price = (len(richer[2]) - len(term[2])) * float(np.log(n_effective)) + data.thresholds.evidence
             record = RefitRecord(term[0].name, term[1])
             try:

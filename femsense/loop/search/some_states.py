@@ -41,39 +41,39 @@ def some_states(data: Data) -> Data | None:
     return data.with_trials(lambda t: t.part(spread_states(t, most)[0]))
 
 
-def in_all_states(every: Data, course: SearchProgress, search: Search, say: Progress) -> SearchProgress:
+def in_all_states(every: Data, state: SearchProgress, search: Search, progress: Progress) -> SearchProgress:
     """Return the state of the search in all states: its models refitted to all of them, with the effects that pass there.
 
     Arguments:
         every: the data with all states, none of which is solved yet.
-        course: the completed search in representative states.
+        state: the completed search in representative states.
         search: its record.
-        say: called with the name of each step.
+        progress: called with the name of each step.
 
     Raises:
         DataError: the model without effects has no equilibrium in some state.
     """
-    say(f"fitting to all states (effects found: {len(search.history) - course.given})")
-    noise, given = search.noise, course.given
+    progress(f"fitting to all states (effects found: {len(search.history) - state.given})")
+    noise, given = search.noise, state.given
     fitted = [fitted_again(every, model, noise) for _, model in search.history[:given]]
     data = every
     while (fewer := _without_outliers(data, fitted[-1])) is not data:
         data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
     before = calibrated_pose(data, data.robot_as_declared, START)
-    data = with_turning_placements(as_shown(with_mesh_errors_of(data, course.data, fitted[-1]), fitted[-1]), fitted[-1])
+    data = with_turning_placements(as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
     refits = list(search.refits)
     for name, model in search.history[given:]:
-        say(f"fitting {name} to all states")
+        progress(f"fitting {name} to all states")
         if not _added(data, history, name, model, search, refits):
             break
     last, first = history[-1][1], list[Candidate]()
     n_effective = float(sum(t.groups.observations for t in data.train))
     if len(history) > given:  # otherwise the search screens all states next
-        first = screen_model(data, base.fit, noise, fields_of(data, base, course.names), n_effective)
+        first = screen_model(data, base.fit, noise, fields_of(data, base, state.names), n_effective)
         data = with_turning_placements(data, last)
-    models = replace(course, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
+    models = replace(state, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
     return replace(models, noise=noise, n_effective=n_effective, fields=None, first=first, table=first, over=False)
 
 

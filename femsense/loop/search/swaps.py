@@ -31,20 +31,20 @@ History = list[tuple[str, FittedModel]]
 
 
 def swapped(
-    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, say: Progress
+    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, progress: Progress
 ) -> tuple[History, list[RefitRecord]]:
     """Return the history without earlier effects that the whole model no longer needs, and with alternatives that beat the others; and the refits,
     including those of the alternatives."""
     for name in [name for name, _ in history[1:-1]]:
         fitted = history[-1][1]
-        less = _if_needless(data, fitted, name, noise, n_effective, say)
+        less = _if_needless(data, fitted, name, noise, n_effective, progress)
         if less is not None:
             history = [*history[:-1], (history[-1][0], less)]
             continue
         alternatives = _alternatives(data, fitted, refits, name)
         if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
-        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, say)
+        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, progress)
     return history, refits
 
 
@@ -61,7 +61,7 @@ def predicting_best(
     table: Sequence[Candidate],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
 ) -> tuple[History, list[RefitRecord]]:
     """Return a history and its refits in which an alternative that predicts held-out data significantly better replaces each effect.
 
@@ -74,7 +74,7 @@ def predicting_best(
         better = [r.name for r in others if r.name not in named and own is not None and _held_rms(r) < _held_rms(own)]
         if better:
             best = list(dict.fromkeys(better))[: data.effort.alternatives]
-            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, say, by_held_out=True)
+            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, progress, by_held_out=True)
     return history, refits
 
 
@@ -101,16 +101,16 @@ def _exchanged(
     alternatives: list[str],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
     *,
     by_held_out: bool = False,
 ) -> tuple[History, list[RefitRecord]]:
     """Return a history in which the best alternative replaces an effect if it is better, by evidence or on held-out data; and the refits."""
     fitted = history[-1][1]
-    say(f"refitting {' or '.join(alternatives)} instead of {name}")
+    progress(f"refitting {' or '.join(alternatives)} instead of {name}")
     try:
         without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, say, by_held_out)
+        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, progress, by_held_out)
         if best is not None:
             history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
     except FemsenseError:
@@ -122,7 +122,7 @@ def _exchanged(
 
 
 def _if_needless(
-    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, progress: Progress
 ) -> FittedModel | None:
     """Return a model without an effect that later ones have made unnecessary (evidence for keeping it ≤ q log n), with the place of the last effect
     improved; else None."""
@@ -130,7 +130,7 @@ def _if_needless(
     count = sum(len(p) for effect, _, p in terms if effect.name == name)
     if not count:
         return None
-    say(f"testing whether {name} is still needed")
+    progress(f"testing whether {name} is still needed")
     price = count * float(np.log(n_effective))
     others = [n for n in fitted.fit.hypothesis.names if n != name]
     try:
@@ -171,7 +171,7 @@ def _better(
     alternatives: list[str],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
     by_held_out: bool,
 ) -> tuple[Refit | None, list[RefitRecord]]:
     """Return the best alternative if it is better than the accepted effect, and the records of all."""
@@ -181,7 +181,7 @@ def _better(
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
     listed = [c for c in table if c.effect.name in alternatives]
-    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, say)
+    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, progress)
     passing = [r for r in asked if r.record.passes]
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
     if by_held_out:
@@ -191,7 +191,9 @@ def _better(
     return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
 
 
-def _asked(data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, say: Progress) -> list[Refit]:
+def _asked(
+    data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, progress: Progress
+) -> list[Refit]:
     """Return the acceptance tests of candidates on top of a model, with the seeds of the leading ones improved."""
     asked = list[Refit]()
     for candidate in listed:
@@ -201,7 +203,7 @@ def _asked(data: Data, without: FittedModel, listed: Sequence[Candidate], name: 
         except FemsenseError:
             continue
         asked.append(acceptance_test(data, without, candidate, made, record, noise))
-    leading = leaders(data, without, dict(enumerate(asked)), noise, say)
+    leading = leaders(data, without, dict(enumerate(asked)), noise, progress)
     return [leading.get(i, r) for i, r in enumerate(asked)]
 
 
@@ -223,16 +225,16 @@ def _without(data: Data, history: History, without: FittedModel, name: str, nois
 
 
 def instead_of_offsets(
-    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, progress: Progress
 ) -> OffsetAlternative | None:
     """Return the effect that best replaces the input offsets of a model; None if the data do not need these."""
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None or np.isinf(data.thresholds.swap):
         return None
-    say("testing alternatives to the input offsets")
+    progress("testing alternatives to the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
-    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, say)
+    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, progress)
     best = max((r for r in asked if r.record.passes), key=lambda r: r.score, default=None)
     if best is None:
         return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])

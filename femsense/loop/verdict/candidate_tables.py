@@ -94,9 +94,9 @@ def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> floa
     return float(-2.0 * step @ G[a:b, -1] - step @ G[a:b, a:b] @ step)
 
 
-def confounding_map(first: list[Candidate], decides: Thresholds) -> ConfoundingMap:
+def confounding_map(first: list[Candidate], thresholds: Thresholds) -> ConfoundingMap:
     """Return the share of each effect's field (row) that is collinear with that of another one (column), nuisance projected out."""
-    shown = [c for c in one_each(first) if c.retained >= decides.testable][:MAP]
+    shown = [c for c in one_each(first) if c.retained >= thresholds.testable][:MAP]
     return ConfoundingMap(tuple(c.effect.name for c in shown), tuple(tuple(confounding(a, b) for b in shown) for a in shown))
 
 

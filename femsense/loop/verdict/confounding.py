@@ -17,11 +17,11 @@ from femsense.loop.search.swaps import stand_ins
 from femsense.loop.thresholds import Thresholds
 
 
-def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
+def confounded(search: Search, names: Sequence[str], thresholds: Thresholds) -> list[ConfoundedPair]:
     """Return the pairs that these data cannot distinguish: an accepted effect, and a possible alternative."""
     found: dict[frozenset[str], ConfoundedPair] = {}
     asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common, _alike
-    for pair in (pair for ask in asked for pair in ask(search, names, decides)):
+    for pair in (pair for ask in asked for pair in ask(search, names, thresholds)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
     return list(found.values())
@@ -42,12 +42,12 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
     )
 
 
-def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thresholds) -> str:
+def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], thresholds: Thresholds) -> str:
     """Return sentences on the alternatives to the accepted effects, by refits or by absorption; empty if there are none."""
     instead: dict[str, list[str]] = {}
     stands_for: dict[str, list[str]] = {}
     for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
-        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= decides.evidence
+        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= thresholds.evidence
         for own, other in (pair.pair, pair.pair[::-1]):
             if own in names and other not in names:
                 (stands_for if far else instead).setdefault(own, []).append(other)
@@ -58,24 +58,24 @@ def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thr
     )
 
 
-def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _as_evident(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects whose refits are within `evidence` of an accepted one's, or that replace an accepted nuisance effect with as much evidence."""
     ours = _named(search, names)
     for own in ours:
         for r in search.refits:
-            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - decides.evidence:
+            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - thresholds.evidence:
                 yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
     for name in (n for n in names if n in NUISANCE):
         for r in (r for r in search.refits if name in (r.takes_over or ()) and r.name not in names):
             ahead = max((own.evidence for own in ours if own.answers_as(r)), default=0.0)
-            if r.evidence > max(decides.evidence, ahead - decides.evidence):
+            if r.evidence > max(thresholds.evidence, ahead - thresholds.evidence):
                 yield ConfoundedPair((name, r.name), dbic_gap=max(ahead - r.evidence, 0.0))
     swap = search.in_place
-    if swap is not None and abs(swap.ahead) < decides.evidence and {OFFSETS, swap.name} & set(names):
+    if swap is not None and abs(swap.ahead) < thresholds.evidence and {OFFSETS, swap.name} & set(names):
         yield ConfoundedPair((OFFSETS, swap.name), dbic_gap=abs(swap.ahead))
 
 
-def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _in_place_of_an_error(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects that pass by themselves and are not needed in addition to the accepted ones, if the weights include the model error: evidence then also
     measures how well an effect compensates for that error."""
     if search.noise.assumed is None:
@@ -92,31 +92,31 @@ def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:
     return [r for r in ours if r.is_named or r.in_place_of == r.name]
 
 
-def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _absorbed(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects that are not testable because they are collinear with one accepted nuisance effect, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = J[:, : fit.own]
     present = search.final.fit.hypothesis.names
-    hidden = [c for c in one_each(search.first) if c.retained < decides.testable and c.effect.name not in present]
+    hidden = [c for c in one_each(search.first) if c.retained < thresholds.testable and c.effect.name not in present]
     for name in (n for n in names if n in NUISANCE):
         own = np.hstack([poses, J[:, fit.own :][:, span_of(fit, name)]])
         for c in hidden:
             whole = beside(poses, c.columns - J @ c.response)
-            if np.linalg.norm(beside(own, whole)) < (1.0 - decides.alike**2) ** 0.5 * np.linalg.norm(whole):
+            if np.linalg.norm(beside(own, whole)) < (1.0 - thresholds.alike**2) ** 0.5 * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
-def _in_common(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _in_common(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield an accepted nuisance effect with an effect that equals it when all its parameters move together (the modulus, and a gain common to all cables), if
     calibration absorbs that combination. A single parameter, such as the gain of one cable, is not absorbed."""
     for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
         for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
             if alias.common and alias.name in names:
-                yield from _common(search, alias.name, effect.name, decides)
+                yield from _common(search, alias.name, effect.name, thresholds)
 
 
-def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _common(search: Search, own: str, other: str, thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield an accepted nuisance effect with an effect whose parameters move together, if calibration absorbs that combination."""
     forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
     fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
@@ -124,26 +124,26 @@ def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterat
     J = np.asarray(fit.fit.jacobian)
     size = float(np.linalg.norm(beside(J[:, : fit.own], left - J @ widest.response.sum(axis=1))))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
-    if retained < decides.testable:
+    if retained < thresholds.testable:
         yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))
 
 
-def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+def _alike(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects with a field collinear with that of an accepted one after calibration is projected out, if they have a positive score and refits do not
     distinguish them."""
-    ones = [c for c in one_each(search.first) if c.retained >= decides.testable]
+    ones = [c for c in one_each(search.first) if c.retained >= thresholds.testable]
     for a in (c for c in ones if c.effect.name in names):
         for b in (c for c in ones if c is not a and c.score > 0.0):
             share = min(confounding(a, b), confounding(b, a))
-            if share > decides.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, decides):
+            if share > thresholds.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, thresholds):
                 yield ConfoundedPair((a.effect.name, b.effect.name), cosine=share)
 
 
-def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
+def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, thresholds: Thresholds) -> bool:
     """Return whether refits of another effect in place of an accepted one have less evidence by at least `evidence`."""
     for named in (r for r in _named(search, names) if r.name == own and r.is_named):
         there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
         tried = [dbic for dbic in there if np.isfinite(dbic)]  # a fit that stopped early has none
-        if tried and max(tried) <= named.evidence - decides.evidence:
+        if tried and max(tried) <= named.evidence - thresholds.evidence:
             return True
     return False

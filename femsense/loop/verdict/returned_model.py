@@ -45,9 +45,9 @@ def promoted_nuisances(data: Data, search: Search) -> list[str]:
     return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def is_sure(fitted: FittedModel, name: str, std: FloatArray, decides: Thresholds) -> bool:
+def is_sure(fitted: FittedModel, name: str, std: FloatArray, thresholds: Thresholds) -> bool:
     """Return whether a value of a nuisance effect deviates from the declared one by more than `significant` reported standard deviations."""
-    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > decides.significant * std).any())
+    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > thresholds.significant * std).any())
 
 
 def sure_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
@@ -134,22 +134,22 @@ class HeldOutComparison:
     with_offsets: bool = False
     """Whether these include input offsets."""
 
-    def holds(self, decides: Thresholds) -> bool:
+    def holds(self, thresholds: Thresholds) -> bool:
         """Return whether the held-out data accept the model.
 
         They do if its error does not exceed the declared model's by more than `not_worse`. Otherwise χ² must fall (by `evidence` for calibration alone), and
         either it is calibration alone and the ratio is below `noisy`, or only the discretisation error makes it larger: the errors without it, and relative
         to the fully calibrated model, are within `not_worse`, and it is not a calibration with input offsets.
         """
-        if self.error <= decides.not_worse:
+        if self.error <= thresholds.not_worse:
             return True
-        if self.gain <= (decides.evidence if self.only_calibrated else 0.0):  # effects have already passed a held-out test
+        if self.gain <= (thresholds.evidence if self.only_calibrated else 0.0):  # effects have already passed a held-out test
             return False
-        if self.only_calibrated and self.error <= decides.noisy:
+        if self.only_calibrated and self.error <= thresholds.noisy:
             return True
         only_offsets = self.only_calibrated and self.with_offsets  # many missing effects resemble input offsets
-        shown = not only_offsets and self.error_to_base <= decides.not_worse
-        return shown and self.beyond_mesh <= decides.not_worse
+        shown = not only_offsets and self.error_to_base <= thresholds.not_worse
+        return shown and self.beyond_mesh <= thresholds.not_worse
 
 
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:

@@ -30,15 +30,15 @@ def verdict_in_words(
     before: FittedModel,
     after: FittedModel,
     budget: ModelError,
-    decides: Thresholds = DEFAULTS,
+    thresholds: Thresholds = DEFAULTS,
 ) -> str:
     """Return the verdict as a sentence, with the held-out error and the share of model error in it."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= decides.noisy * np.hypot(known, mesh):
+    if verdict == NONE and before.held_rms <= thresholds.noisy * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        own = finer if mesh and before.held_rms > decides.noisy * known else ""
+        own = finer if mesh and before.held_rms > thresholds.noisy * known else ""
         return f"The model fits the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
     of_it = f"of which {1e3 * budget.held_out_m:.2f} mm is model error and {_noise_in_words(budget)} noise"
     if verdict == NONE:
@@ -112,8 +112,8 @@ def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:
 
 def by_noise(data: Data, measured: Repeatability) -> str:
     """Return a sentence if the noise exceeds that of any camera; else empty."""
-    reach, decides = data.robot.body.reach, data.thresholds
-    if measured.total < decides.significant * decides.resolved * reach:
+    reach, thresholds = data.robot.body.reach, data.thresholds
+    if measured.total < thresholds.significant * thresholds.resolved * reach:
         return ""
     return (
         f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is larger than that of any camera: repeated frames differ."
@@ -121,7 +121,7 @@ def by_noise(data: Data, measured: Repeatability) -> str:
     )
 
 
-def everywhere_in_words(seen: AllRecordings | None, decides: Thresholds) -> str:
+def everywhere_in_words(seen: AllRecordings | None, thresholds: Thresholds) -> str:
     """Return the results in all recordings of a model that was searched for in some; empty if all were searched."""
     if seen is None:
         return ""
@@ -130,7 +130,7 @@ def everywhere_in_words(seen: AllRecordings | None, decides: Thresholds) -> str:
         f" {seen.searched} of {seen.recordings} recordings were searched, and the model was fitted to all: held-out error in all {before:.2f} mm "
         f"before, {after:.2f} mm after."
     )
-    more = [name for name, score in sorted(seen.dbic.items(), key=lambda item: -item[1]) if score > decides.evidence]
+    more = [name for name, score in sorted(seen.dbic.items(), key=lambda item: -item[1]) if score > thresholds.evidence]
     return said + (f" In all recordings there is linear evidence for more: {', '.join(more[:MOST_LISTED])}." if more else "")
 
 

@@ -134,17 +134,17 @@ def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generat
 # Candidates
 
 
-def untestable(first: Sequence[Candidate], names: Collection[str], decides: Thresholds) -> list[Untestable]:
+def untestable(first: Sequence[Candidate], names: Collection[str], thresholds: Thresholds) -> list[Untestable]:
     """Return the effects that calibration absorbs in these data, without the accepted ones."""
     return [
         Untestable(c.effect.name, float(np.sqrt(max(0.0, 1.0 - c.retained**2))), c.retained)
         for c in one_each(list(first))
-        if c.retained < decides.testable and c.effect.name not in names
+        if c.retained < thresholds.testable and c.effect.name not in names
     ]
 
 
 def tried_effects(
-    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], decides: Thresholds
+    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], thresholds: Thresholds
 ) -> list[TriedEffect]:
     """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
     last = {c.effect.name: c for c in one_each(table)}
@@ -156,7 +156,7 @@ def tried_effects(
     ]
     for c in one_each(first):
         joint, end = _refits_of(c.effect.name, refits), last.get(c.effect.name)
-        verdict = _verdict_of(joint) if joint else _why_not(c, end, decides)
+        verdict = _verdict_of(joint) if joint else _why_not(c, end, thresholds)
         rows.append(TriedEffect(c.effect.name, c.seed, c.gain, c.score, c.retained, end.score if end else None, joint, verdict))
     return rows
 
@@ -171,13 +171,13 @@ def _verdict_of(joint: Sequence[RefitRecord]) -> str:
     return next((v for v in (NAMED, PASSES) if v in said), said[-1])
 
 
-def _why_not(c: Candidate, end: Candidate | None, decides: Thresholds) -> str:
-    if c.retained < decides.testable:
+def _why_not(c: Candidate, end: Candidate | None, thresholds: Thresholds) -> str:
+    if c.retained < thresholds.testable:
         share = 100.0 * np.sqrt(max(0.0, 1.0 - c.retained**2))
         return f"not testable: {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it is absorbed by calibration"
-    if c.score > decides.evidence and end is not None and end.score <= decides.evidence:
+    if c.score > thresholds.evidence and end is not None and end.score <= thresholds.evidence:
         return f"the accepted effects fit its share of the residual (dBIC {c.score:.0f}, then {end.score:.1f})"
-    if c.score > decides.evidence:
+    if c.score > thresholds.evidence:
         return f"not refitted: its score is far below the best (dBIC {c.score:.0f})"
     return f"too little evidence (dBIC {c.score:.1f})"
 
