@@ -215,8 +215,9 @@ print("next experiment:", loop["next_experiment"])
 # %% [markdown]
 # - **`unexplained` is not a failure.** Frames of a beam at rest repeat to micrometres, so the millimetre that remains counts as model error. A repetition of the run at 1.00 N differed by 0.59 mm,
 #   which one recording cannot show. If you know the repeatability, declare it (`marker_noise_m` in `recording.toml`): the verdict then becomes `effects` ([study](../studies/beam-study.md)).
-# - **The list is not unique beyond modulus and gravity.** These two reduce the held-out error from 5.5 to 1.2 mm; everything after them changes it by less than the repetition did. On another mesh of the same beam
-#   the loop names the three base markers instead of a soft region, and a modulus of 245 kPa instead of 313 kPa. Use such a list as a question to the robot: is there a bubble at this place, does the marker sit on the clamp?
+# - **The list is not unique beyond modulus and gravity.** These two reduce the held-out error from 5.5 to 1.4 mm; the others change it by 0.5 mm, less than a repetition of the run did. Both robots estimate the weights
+#   correctly, with moduli of 313 kPa (and a soft spot) and 240 kPa; on another mesh of the same beam ([study](../studies/beam-study.md)) the loop names the three base markers instead, with 245 kPa. Use such a list as a
+#   question to the robot: is there a bubble at this place, does that marker sit on the clamp?
 # - **Gravity along the beam is hardly determined.** An axial force of the size of the weight stretches the beam by 0.2 mm. The standard deviation of the first component says so.
 # - **Clamp and modulus are collinear** with one orientation of the base: the modulus is 262 ± 3 kPa with a rigid clamp and 262 ± 38 kPa with one that may rotate.
 # - **Creep does not show** in runs of half a second.
