@@ -79,10 +79,10 @@ box_m = [[-0.001, -0.016, -0.016], [0.0001, 0.016, 0.016]]
 # Nothing, 0.51 N and 1.00 N hang at the tip; `loads.csv` states the weights. The camera pose differs between the runs and is unknown. `rest.csv` has the markers of the beam held straight by hand.
 
 # %%
-weights_n = {"gravity_a": 0.0, "load52_a": 0.51, "load101_a": 1.0}
+weights_n = {"unloaded": 0.0, "half": 0.51, "one": 1.0}
 if is_real:
-    for name in weights_n:
-        shutil.copytree(DATA / "recordings" / name, f"recordings/{name}")
+    for name, source in zip(weights_n, ("gravity_a", "load52_a", "load101_a")):
+        shutil.copytree(DATA / "recordings" / source, f"recordings/{name}")
 else:
     for i, (name, weight) in enumerate(weights_n.items()):
         row = '[[loads]]\nsweep = "hang"\npoint_m = [0.1, {:.4f}, 0.015]\nforce_n = [0.0, 0.0, {:.4f}]\n'
@@ -163,7 +163,7 @@ weights_sensed(fs.apply_effects(robot, [gravity]))
 # Two runs are fitted; the third, with the largest load, is held out.
 
 # %%
-shell("femsense improve beam recordings/gravity_a recordings/load52_a --validation recordings/load101_a -o improved")
+shell("femsense improve beam recordings/unloaded recordings/half --validation recordings/one -o improved")
 
 # %% [markdown]
 # `improved/robot.toml` is the improved robot and `improved/loop.json` the result; `femsense report improved` writes both as one page. The same in Python:
@@ -188,9 +188,7 @@ weights_sensed(fs.load_robot("improved"))
 # So does a robot with fewer effects. `--effects` restricts the search, here to gravity and the modulus, which is always fitted:
 
 # %%
-shell(
-    "femsense improve beam recordings/gravity_a recordings/load52_a --validation recordings/load101_a --effects gravity -o gravity"
-)
+shell("femsense improve beam recordings/unloaded recordings/half --validation recordings/one --effects gravity -o gravity")
 weights_sensed(fs.load_robot("gravity"))
 
 # %% [markdown]
