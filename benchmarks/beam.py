@@ -215,13 +215,22 @@ def print_residuals(beam: Beam, results: dict[str, tuple[FittedModel, Any]]) -> 
 
 def print_causes(beam: Beam) -> None:
     """Print where gravity points when it is fitted next to each thing that may tilt it."""
-    print("\nDirection of gravity if another parameter is fitted or another assumption is made (modulus and poses are always fitted)")
-    print("| also fitted or changed | fitted | held out | χ² | gravity [m/s²] | modulus | its value |\n|---|---|---|---|---|---|---|")
+    print(
+        "\nDirection of gravity if another parameter is fitted or another assumption is made (modulus and poses are always fitted)"
+    )
+    print(
+        "| also fitted or changed | fitted | held out | χ² | gravity [m/s²] | modulus | its value |\n|---|---|---|---|---|---|---|"
+    )
     robot = beam.robot
     cases: list[tuple[str, Data, Robot, list[Term]]] = [
         ("nothing", beam.data, robot, []),
         ("base markers on the clamp", beam.data, apply_effects(robot, [HELD]), []),
-        ("share by which the base markers follow the beam", beam.data, robot, [Term(0, "clamped_marker", [0.5], {"markers": BASE})]),
+        (
+            "share by which the base markers follow the beam",
+            beam.data,
+            robot,
+            [Term(0, "clamped_marker", [0.5], {"markers": BASE})],
+        ),
         ("rotating clamp", beam.data, robot, [Term(1, "base_compliance", [1e-3])]),
         ("compliant clamp", beam.data, robot, [Term(0, "base_compliance")]),
         ("Poisson ratio", beam.data, robot, [Term(0, "poisson")]),

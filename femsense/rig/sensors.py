@@ -34,22 +34,20 @@ class SensorTable(Schema):
         str, Field(min_length=1, description="a name; a colour sensor has the channels NAME_red, NAME_green, NAME_blue")
     ]
     kind: Literal["strain", "colour"] = Field(
-        "strain", description='"strain" between two points, or "colour": a pattern that shifts'
+        "strain", description='"strain" between two points, or "colour": a pattern that is displaced'
     )
     from_m: Vector = Field(description="one point of the body at rest [m], robot frame")
     to_m: Vector = Field(description="the other point at rest [m]")
     across: Vector | None = Field(
         None,
-        description="of a colour sensor: direction in which its pattern shifts; by default the one across that is most vertical",
+        description="of a colour sensor: direction of the measured displacement; default: the most vertical transverse direction",
     )
-    period_m: Annotated[float, Field(gt=0)] = Field(
-        0.01, description="of a colour sensor: length over which its colours repeat [m], > 0"
-    )
-    gain: float = Field(1.0, description="reading per unit of strain, or between dark and bright")
-    zero: float = Field(0.0, description="reading at no strain, or in the dark")
-    lag_s: Annotated[float, Field(ge=0)] = Field(0.0, description="time constant with which it follows the body [s], ≥ 0")
-    noise_std: Annotated[float, Field(ge=0)] = Field(0.0, description="noise of a reading, in its unit, ≥ 0")
-    drift_per_s: float = Field(0.0, description="drift of its zero as the body warms up, in its unit per second")
+    period_m: Annotated[float, Field(gt=0)] = Field(0.01, description="of a colour sensor: period of the colour pattern [m], > 0")
+    gain: float = Field(1.0, description="reading per unit of strain, or difference between dark and bright")
+    zero: float = Field(0.0, description="reading at zero strain, or in the dark")
+    lag_s: Annotated[float, Field(ge=0)] = Field(0.0, description="time constant of the sensor [s], ≥ 0")
+    noise_std: Annotated[float, Field(ge=0)] = Field(0.0, description="noise of a reading, standard deviation in its unit, ≥ 0")
+    drift_per_s: float = Field(0.0, description="drift of the zero reading, in its unit per second")
 
     @property
     def channels(self) -> tuple[str, ...]:

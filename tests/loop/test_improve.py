@@ -96,7 +96,9 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
         ONE_EACH, effects=[{"name": "cable_gain", "scale": {"right": 0.8}}], labels=labels, truth=arm((4, 1, 1))
     )
     train, held, how = hold_out(recording, np.arange(24))
-    assert how == f"{len(held)} of 24 frames (each sweep has inputs that no other has)" and set(train) | set(held) == set(range(24))
+    assert how == f"{len(held)} of 24 frames (each sweep has inputs that no other has)" and set(train) | set(held) == set(
+        range(24)
+    )
     assert {int(k) // 6 for k in held} == {0, 1, 2, 3} and len(held) == 8 and not set(train) & set(held)
     np.testing.assert_array_equal(recording.inputs[train].max(axis=0), recording.inputs.max(axis=0))
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
@@ -342,7 +344,9 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
 def test_noise_that_no_camera_has_is_said():
     data = SimpleNamespace(robot=arm((4, 1, 1)), thresholds=DEFAULTS)
     assert by_noise(data, Repeatability(1e-3, 3, True, "")) == ""
-    assert "Noise of 3.5 mm on a body of 100 mm is larger than that of any camera" in by_noise(data, Repeatability(2e-3, 3, True, ""))
+    assert "Noise of 3.5 mm on a body of 100 mm is larger than that of any camera" in by_noise(
+        data, Repeatability(2e-3, 3, True, "")
+    )
 
 
 def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
