@@ -147,7 +147,7 @@ SEARCH = (
     Switch("elsewhere", {}, {}, {"search.forward_selection._elsewhere": as_it_is}),
     Switch("richer forms", {}, {}, {"search.forward_selection._enriched": as_it_is}),
     Switch("more markers", {}, {}, {"search.forward_selection._with_more_markers": as_it_is}),
-    Switch("surely predicts", {}, {}, {"search.acceptance.surely_predicts": zero}),
+    Switch("surely predicts", {}, {}, {"search.acceptance.cv_lower_bound": zero}),
     Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
     Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
     Switch(BEST, {}, {}, {"search.swaps.predicting_best": as_found}),

@@ -10,7 +10,7 @@ from femsense.control.curvature import Seen, convex, learned
 from femsense.control.goal import Goal
 from femsense.control.limits import Limits
 from femsense.control.motion import NEAREST, REACHED, STOPPED
-from femsense.control.slopes import Slopes, exact_slopes, lent_slopes, may_be_lent
+from femsense.control.slopes import Slopes, approximate_slopes, exact_slopes, has_factorisation
 from femsense.core.arrays import FloatArray
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
@@ -97,7 +97,7 @@ class Search:
         self.last, self.beyond = Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
         self._radius, self._settled = min(FIRST_RADIUS, self.pace.farthest), False
         self._edge = np.inf  # upper bound of the step after one that had no equilibrium
-        self._slopes = lent_slopes(body, goal, self.state) if self.state.converged else None
+        self._slopes = approximate_slopes(body, goal, self.state) if self.state.converged else None
         self._curvature: FloatArray = np.zeros((len(bounds.low),) * 2)
         self._seen: tuple[Seen, FloatArray] | None = None  # the last exact tangent, and the positions there
 
@@ -298,7 +298,7 @@ def _solved(
 ) -> Equilibrium:
     """Return the equilibrium under efforts (a + c,);
     `before` are the tensions along the cables before the motion, for friction."""
-    a, fine, lent = len(body.cables), tolerance <= FINE, start is not None and may_be_lent(body, start)
+    a, fine, lent = len(body.cables), tolerance <= FINE, start is not None and has_factorisation(body, start)
     return solve_equilibrium(
         body,
         tension=dict(zip(body.cable_names, effort[:a].tolist())),

@@ -53,14 +53,16 @@ def exact_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[Slope
     return _slopes(body, goal, state, tangent.factor, exact=True), replace(state, factor=tangent.factor)
 
 
-def lent_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> Slopes | None:
+def approximate_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> Slopes | None:
     """Return the tangent by the factorisation that a state keeps from a neighbouring one; None if there is none or it is not usable."""
     return (
-        _slopes(body, goal, state, state.factor, exact=False) if state.factor is not None and may_be_lent(body, state) else None
+        _slopes(body, goal, state, state.factor, exact=False)
+        if state.factor is not None and has_factorisation(body, state)
+        else None
     )
 
 
-def may_be_lent(body: BodyModel, state: Equilibrium) -> bool:
+def has_factorisation(body: BodyModel, state: Equilibrium) -> bool:
     """Return whether a state keeps a positive definite factorisation of matching size."""
     return state.factor is not None and state.factor.negative == 0 and state.factor.size == len(body.free_map.dofs)
 

@@ -12,7 +12,7 @@ from helpers import DATA, block_mesh
 
 import femsense as fs
 from femsense.control.goal import make_goal
-from femsense.control.slopes import Slopes, exact_slopes, lent_slopes
+from femsense.control.slopes import Slopes, approximate_slopes, exact_slopes
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import SolveOptions
 from femsense.fem.mesh import embed_points
@@ -83,10 +83,10 @@ def test_slopes_are_those_of_the_states_near_by() -> None:
     slopes, keeps = exact_slopes(robot.body, goal, state)
     near = place(robot, {"top": 0.4 + 1e-4, "side": 0.3}) - place(robot, {"top": 0.4 - 1e-4, "side": 0.3})
     np.testing.assert_allclose(slopes.points[:, 0], near / 2e-4, rtol=1e-4, atol=1e-8)
-    lent = lent_slopes(robot.body, goal, keeps)
+    lent = approximate_slopes(robot.body, goal, keeps)
     assert slopes.exact and lent is not None and not lent.exact
     np.testing.assert_allclose(lent.points, slopes.points)
-    assert lent_slopes(robot.body, goal, replace(state, factor=None)) is None
+    assert approximate_slopes(robot.body, goal, replace(state, factor=None)) is None
 
 
 def test_slopes_that_a_step_has_shown_give_that_step_and_leave_others() -> None:

@@ -22,7 +22,7 @@ from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.search import distinguishes_effects
 from femsense.loop.search.search_state import SearchProgress
 from femsense.loop.thresholds import DEFAULTS
-from femsense.loop.verdict.returned_model import is_sure
+from femsense.loop.verdict.returned_model import is_significant
 from femsense.loop.verdict.sentences import by_noise
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, LoadRows, Timeline
@@ -354,9 +354,9 @@ def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     fitted = SimpleNamespace(
         fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
     )
-    assert is_sure(fitted, "stiffness", np.array([0.029]), DEFAULTS) and not is_sure(
+    assert is_significant(fitted, "stiffness", np.array([0.029]), DEFAULTS) and not is_significant(
         fitted, "stiffness", np.array([0.031]), DEFAULTS
     )
-    assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1]), DEFAULTS) and not is_sure(
+    assert is_significant(fitted, "cable_offset", np.array([0.1, 0.1]), DEFAULTS) and not is_significant(
         fitted, "cable_offset", np.array([0.1, 0.2]), DEFAULTS
     )

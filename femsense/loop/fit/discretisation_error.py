@@ -149,7 +149,7 @@ def _by_moves(data: Data, fitted: FittedModel) -> Data:
     return data.with_trials(lambda t: replace(t, mesh_error=errors[id(t)]))
 
 
-def errs_alike(before: FittedModel, after: FittedModel) -> bool:
+def same_mesh_error(before: FittedModel, after: FittedModel) -> bool:
     """Return whether the discretisation error after an added effect equals that before: the effect changes only cable forces, or the camera."""
     old = before.fit.hypothesis
     added, _, mask = some_terms(after, [name for name in after.fit.hypothesis.names if name not in old.names])

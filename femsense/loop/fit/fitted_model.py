@@ -207,21 +207,21 @@ def poses_and_inputs(data: Data, fit: JointFit) -> list[PosesAndInputs]:
     return [t.place(fit.fit.theta[span], pivot) for t, span in zip(data.train, spans_of(data.train))]
 
 
-def rematched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> Data:
-    """Return the data with the rounding of cloud rows recomputed in the states of a fitted model; with `anew` the rows are selected again too."""
+def rematched(data: Data, fitted: FittedModel, noise: Noise, *, reselect: bool = False) -> Data:
+    """Return the data with the rounding of cloud rows recomputed in the states of a fitted model; with `reselect` the rows are selected again too."""
     if "clouds" not in data.measured:
         return data
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
-    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, poses_and_inputs(data, fitted.fit))]
-    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, held_poses_and_inputs(data, fitted.fit, noise))]
+    train = [_rematched(robot, t, *own, reselect) for t, own in zip(data.train, poses_and_inputs(data, fitted.fit))]
+    held = [_rematched(robot, t, *own, reselect) for t, own in zip(data.held, held_poses_and_inputs(data, fitted.fit, noise))]
     return replace(data, train=train, held=held)
 
 
-def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, anew: bool) -> Trial:
+def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, reselect: bool) -> Trial:
     if trial.seen is None:
         return trial
     states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
-    if not anew:
+    if not reselect:
         return replace(trial, scene=renewed_rows(robot, trial.scene, trial.seen, states, poses))
     scene = make_rows(robot, trial.scene, trial.seen, states, poses)
     return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)

@@ -302,10 +302,10 @@ def _as_near(kept: States, near: States, body: BodyModel) -> States:
     shape = next(iter(near.values())).positions.shape
     if any(state.positions.shape != shape for state in kept.values()):
         return dict(kept)
-    return {**kept, **{k: lent_start(kept.get(k), state, body) for k, state in near.items()}}
+    return {**kept, **{k: nearby_start(kept.get(k), state, body) for k, state in near.items()}}
 
 
-def lent_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
+def nearby_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
     """Return the warm start of a frame, from a kept state and that of a fit close by."""
     if kept is None or kept.positions is state.positions:  # such a state has its own factorisation
         return state if kept is None else kept

@@ -96,7 +96,7 @@ def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
     return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
 
 
-def surely_predicts(refitted: Refit) -> float:
+def cv_lower_bound(refitted: Refit) -> float:
     """Return the cross-validation gain minus its standard error, if that is known."""
     gain, std = refitted.record.cv_gain, refitted.record.cv_std
     assert gain is not None and std is not None

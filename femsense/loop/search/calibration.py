@@ -42,7 +42,7 @@ def calibrated(data: Data, progress: Progress) -> Ready:
     if "clouds" in data.measured:
         progress("recomputing the rows of the clouds")
         rough = base.fit.normal_rms
-        data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), anew=True)
+        data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), reselect=True)
         placed = calibrated_pose(data, data.robot, START, placed)
     if not data.settled:
         return data, placed, [("", base)]
@@ -88,12 +88,12 @@ def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps:
     return fit(0)
 
 
-def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
+def matched(data: Data, fitted: FittedModel, noise: Noise, *, reselect: bool = False) -> tuple[Data, FittedModel]:
     """Return the data with cloud rows recomputed in the fitted states, and the model fitted to these; repeated until χ² hardly changes, because the
-    rounding computed in the previous state pulls the fit back towards it. With `anew` the rows are selected again too."""
+    rounding computed in the previous state pulls the fit back towards it. With `reselect` the rows are selected again too."""
     for _ in range(data.effort.matchings):
-        data = rematched(data, fitted, noise, anew=anew)
-        fitted = fitted_again(data, fitted, noise, near=None if anew else fitted.fit.jets)
+        data = rematched(data, fitted, noise, reselect=reselect)
+        fitted = fitted_again(data, fitted, noise, near=None if reselect else fitted.fit.jets)
         if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= data.thresholds.evidence / 2.0:
             break
     return data, fitted

@@ -19,7 +19,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, surely_predicts
+from femsense.loop.search.acceptance import acceptance_test, cv_lower_bound
 from femsense.loop.search.location_search import climbed, lies_on_body, located
 from femsense.loop.search.refit import evidence, refit, tried, with_term, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
@@ -41,7 +41,7 @@ def select_next(
     if not leading:
         return None, _updated(records, refits)
     # the highest evidence, with a bonus for a significantly better prediction, which decides if evidence is close
-    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]))
+    first = max(leading, key=lambda i: leading[i].score + cv_lower_bound(leading[i]))
     winner = _enriched(data, fitted, leading[first], table, noise, progress).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 

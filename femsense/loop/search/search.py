@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
+from femsense.loop.fit.discretisation_error import as_shown, same_mesh_error, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.model_error import excess_of
@@ -116,11 +116,11 @@ def _take_step(state: SearchProgress, progress: Progress) -> None:
         return
     state.earlier = data
     winner = next_one.fitted
-    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
+    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not same_mesh_error(fitted, winner)
     history = [*history, (next_one.candidate.effect.name, winner)]
     history, refits = swapped(data, history, refits, noise, n_effective, progress)
     last = history[-1][1]
-    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if anew else data, last)
+    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if recompute else data, last)
     state.data, state.history, state.refits, state.fitted = data, history, refits, last
 
 

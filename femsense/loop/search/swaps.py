@@ -48,7 +48,7 @@ def swapped(
     return history, refits
 
 
-def stand_ins(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequence[Candidate]) -> list[RefitRecord]:
+def alternatives_to(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequence[Candidate]) -> list[RefitRecord]:
     """Return the refits that pass on top of the same model as an accepted one and that the last screening leaves without a gain."""
     left = {c.effect.name for c in table if c.score > 0.0}
     return [r for r in refits if r.passes and r.answers_as(own) and r.name not in left]
@@ -70,7 +70,7 @@ def predicting_best(
     for name in [name for name, _ in history[1:]]:
         named = history[-1][1].fit.hypothesis.names
         own = next((r for r in reversed(refits) if r.name == name and r.is_named), None)
-        others = [] if own is None else sorted(stand_ins(own, refits, table), key=_held_rms)
+        others = [] if own is None else sorted(alternatives_to(own, refits, table), key=_held_rms)
         better = [r.name for r in others if r.name not in named and own is not None and _held_rms(r) < _held_rms(own)]
         if better:
             best = list(dict.fromkeys(better))[: data.effort.alternatives]
@@ -78,7 +78,7 @@ def predicting_best(
     return history, refits
 
 
-def surely_closer(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
+def predicts_better(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
     """Return whether the squared error of another model in held-out states, paired by state, is smaller by more than one standard error."""
     falls = dict[tuple[int, bytes], list[float]]()
     for i, (trial, own, new) in enumerate(zip(data.held, fitted.held_residuals, other.held_residuals)):
@@ -186,7 +186,7 @@ def _better(
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
     if by_held_out:
         best = min(passing, key=lambda r: r.fitted.held_rms, default=None)
-        return (best if best is not None and surely_closer(data, fitted, best.fitted) else None), records
+        return (best if best is not None and predicts_better(data, fitted, best.fitted) else None), records
     best = max(passing, key=lambda r: r.score, default=None)
     return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
 

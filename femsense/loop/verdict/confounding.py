@@ -13,7 +13,7 @@ from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.search.input_offset import OFFSETS
 from femsense.loop.search.screening import confounding, one_each
 from femsense.loop.search.search_state import Search
-from femsense.loop.search.swaps import stand_ins
+from femsense.loop.search.swaps import alternatives_to
 from femsense.loop.thresholds import Thresholds
 
 
@@ -81,7 +81,7 @@ def _in_place_of_an_error(search: Search, names: Sequence[str], thresholds: Thre
     if search.noise.assumed is None:
         return
     for own in _named(search, names):
-        for r in stand_ins(own, search.refits, search.last):
+        for r in alternatives_to(own, search.refits, search.last):
             if r.name not in names:
                 yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
 

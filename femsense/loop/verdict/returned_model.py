@@ -45,12 +45,12 @@ def promoted_nuisances(data: Data, search: Search) -> list[str]:
     return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def is_sure(fitted: FittedModel, name: str, std: FloatArray, thresholds: Thresholds) -> bool:
+def is_significant(fitted: FittedModel, name: str, std: FloatArray, thresholds: Thresholds) -> bool:
     """Return whether a value of a nuisance effect deviates from the declared one by more than `significant` reported standard deviations."""
     return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > thresholds.significant * std).any())
 
 
-def sure_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
+def significant_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
     """Return the effects with a value that deviates from its null by more than `significant` reported standard deviations, and those without such a value
     (a law, a mesh). Places and times do not count, nor does a weight, which every robot has."""
     terms = {effect.name: (effect, parameters) for effect, _, parameters in fitted.fit.hypothesis.terms}
@@ -66,13 +66,13 @@ def _is_away(data: Data, fitted: FittedModel, effect: Effect, parameters: Sequen
     return bool((off > data.thresholds.significant * std)[sized].any())
 
 
-def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
+def returnable_effects(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
     """Return the names of the returned effects and their model: with all nuisance effects or, if held-out data reject that, refitted without those that are
     not accepted. A nuisance effect that equals its declared value in that model is removed; then, from the last one on, effects that enlarge the
     held-out error or reach a bound of their plausible range."""
     while names:
         models = [_inside(data, search, kept) for kept in ([*NUISANCE, *names], names)]
-        back = next((m for m in models if m is not None and _may_be_handed_back(data, search, m)), None)
+        back = next((m for m in models if m is not None and _is_returnable(data, search, m)), None)
         idle = [] if back is None else [n for n in promoted if n in names and not moved_nuisance(data, back, n)]
         if back is not None and not idle:
             return names, back
@@ -80,36 +80,36 @@ def worth_handing_back(data: Data, search: Search, promoted: list[str], names: l
     return [], search.before
 
 
-def surely_handed_back(
-    data: Data, search: Search, promoted: list[str], sure: list[str], seed_std: dict[str, FloatArray]
+def returned_effects(
+    data: Data, search: Search, promoted: list[str], significant: list[str], seed_std: dict[str, FloatArray]
 ) -> tuple[list[str], FittedModel, list[str]]:
     """Return the names of the returned effects, their model, and the effects that are significant only together with removed ones.
 
     After an effect is removed, the others are refitted and tested for significance again.
     """
-    unsure = list[str]()
+    insignificant = list[str]()
     while True:
-        names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
+        names, back = returnable_effects(data, search, promoted, [*promoted, *significant])
         if not names or back is search.final:
-            return names, back, unsure
+            return names, back, insignificant
         std = parameter_std(data, back, search.noise, seed_std)
-        kept = [n for n in names if n in promoted and is_sure(back, n, std[n], data.thresholds)]
-        kept += sure_effects(data, back, [n for n in names if n not in promoted], std)
+        kept = [n for n in names if n in promoted and is_significant(back, n, std[n], data.thresholds)]
+        kept += significant_effects(data, back, [n for n in names if n not in promoted], std)
         if len(kept) == len(names):
-            return names, back, unsure
-        unsure += [n for n in names if n not in kept]
-        promoted, sure = [n for n in promoted if n in kept], [n for n in sure if n in kept]
+            return names, back, insignificant
+        insignificant += [n for n in names if n not in kept]
+        promoted, significant = [n for n in promoted if n in kept], [n for n in significant if n in kept]
 
 
 def _inside(data: Data, search: Search, names: Sequence[str]) -> FittedModel | None:
     """Return the model of some effects; if one reaches a bound, with places and times fixed. None without equilibrium."""
-    back = _handed_back(data, search.final, names, search.noise)
+    back = _returned_model(data, search.final, names, search.noise)
     if back is None or not at_edge(back.fit):
         return back
-    return _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
+    return _returned_model(data, with_seeds_still(data, search.final), names, search.noise)
 
 
-def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
+def _is_returnable(data: Data, search: Search, back: FittedModel) -> bool:
     return not at_edge(back.fit) and not set(OF_BODY) & set(at_edge(back.fit, nuisance=True)) and holds_out(data, search, back)
 
 
@@ -173,7 +173,7 @@ def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[flo
     return before, after
 
 
-def _handed_back(data: Data, final: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel | None:
+def _returned_model(data: Data, final: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel | None:
     """Return the model of some effects, refitted if others are removed; None without equilibrium."""
     if {effect.name for effect, _, _ in final.fit.hypothesis.terms} <= set(names):
         return final

@@ -94,12 +94,12 @@ def on_linear(data: Data, back: FittedModel, names: Sequence[str], noise_m: floa
     )
 
 
-def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:
-    """Return a sentence on effects that were found and are not returned; values of `unsure` ones do not differ significantly from their null."""
+def evidence_for(data: Data, found: list[str], insignificant: list[str]) -> str:
+    """Return a sentence on effects that were found and are not returned; values of `insignificant` ones do not differ significantly from their null."""
     said = ""
-    others = [n for n in found if n not in unsure]
-    if unsure:
-        said = f" {', '.join(unsure)} would improve the fit, but no value is significant (three standard deviations)."
+    others = [n for n in found if n not in insignificant]
+    if insignificant:
+        said = f" {', '.join(insignificant)} would improve the fit, but no value is significant (three standard deviations)."
     if not others:
         return said
     mesh = mesh_error_rms(data)

@@ -28,11 +28,11 @@ from femsense.loop.verdict.residual_diagnostics import describe_left, frame_erro
 from femsense.loop.verdict.returned_model import (
     MODULUS,
     entries_of,
-    is_sure,
+    is_significant,
     prediction_gap,
     promoted_nuisances,
-    sure_effects,
-    surely_handed_back,
+    returned_effects,
+    significant_effects,
 )
 from femsense.loop.verdict.sentences import by_mesh, by_noise, everywhere_in_words, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
@@ -57,10 +57,10 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     before, final, noise = search.before, search.final, search.noise
     std = parameter_std(data, final, noise, _seed_std(search))
     measured = repeatability(data, final, noise)
-    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n], data.thresholds)]
+    promoted = [n for n in promoted_nuisances(data, search) if is_significant(final, n, std[n], data.thresholds)]
     added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
-    sure = sure_effects(data, final, added, std)
-    names, back, unsure = surely_handed_back(data, search, promoted, sure, _seed_std(search))
+    significant = significant_effects(data, final, added, std)
+    names, back, insignificant = returned_effects(data, search, promoted, significant, _seed_std(search))
     drifted = (
         MODULUS in promoted and MODULUS not in names
     )  # a reduction of the residual by an implausible modulus explains nothing
@@ -73,13 +73,13 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
     excess = excess_of(data, before, final, back, noise, measured)
-    found = _not_handed_back(search, names)
+    found = _not_returned(search, names)
     open_to_doubt = (tests.significant or surprise) and (drifted or excess.explained < data.thresholds.explained)
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names, data.thresholds)
     correction, learned = judged_correction(data, back) if correct else (None, None)
-    robot = _handed_back(data, entries)
+    robot = _returned_robot(data, entries)
     robot = robot if robot.correction is learned else replace(robot, correction=learned)
     robot = replace(robot, name=improved_name(robot.name)) if entries or learned is not None else robot
     only_held = bool(surprise) and not tests.significant and not lacks
@@ -92,7 +92,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)
-        + evidence_for(data, found, [n for n in added if n not in sure or n in unsure])
+        + evidence_for(data, found, [n for n in added if n not in significant or n in insignificant])
         + surprise
         + _by_prediction(data, robot, back, noise)
         + everywhere_in_words(search.everywhere, data.thresholds),
@@ -128,7 +128,7 @@ def improved_name(name: str) -> str:
     return f"{begin}-improved-{int(count[1:] or 1) + 1}"
 
 
-def _handed_back(data: Data, entries: Sequence[Entry]) -> Robot:
+def _returned_robot(data: Data, entries: Sequence[Entry]) -> Robot:
     """Return the declared robot with effects, in its document too."""
     if not entries:
         return data.declared
@@ -187,6 +187,6 @@ def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise)
     return [without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)]
 
 
-def _not_handed_back(search: Search, names: list[str]) -> list[str]:
+def _not_returned(search: Search, names: list[str]) -> list[str]:
     """Return the effects that were found but are not returned."""
     return [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
