@@ -64,7 +64,7 @@ class Experiment:
 
 
 def views_of(script: ScriptTable, robot: Robot) -> tuple[View, ...]:
-    """Return the cameras of a script, with their noise declared if the script says so. Raises InputError."""
+    """Return the cameras of a script, with declared noise if the script requests it. Raises InputError."""
     result = []
     for name, table in script.views.items():
         T = pose_of(table)

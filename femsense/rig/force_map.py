@@ -146,7 +146,7 @@ def force_bound(
         measured: the rows.
         nodes: surface nodes of the forces, shape (p,).
         visible: whether a camera sees each of them, shape (p,).
-        unknowns: prior standard deviations of what is estimated with the force.
+        unknowns: prior standard deviations of the parameters estimated with the force.
     """
     surface, count = body_surface(robot.body.mesh), len(state.positions)
     normals = vertex_normals(state.positions, surface.triangles)[nodes]

@@ -1,7 +1,7 @@
 """Which forces the camera of a recording can resolve at a few places of a robot: the bound of `force_map` with the points
 that were measured in place of points that would be.
 
-The rows are those of one frame: of its clouds, or of its markers where there is no cloud. The standard deviation of a depth
+The rows are those of one frame: of its clouds, or of its markers without a cloud. The standard deviation of a depth
 is the one that the recording declares, or else the scatter of the clouds of contact-free frames.
 """
 

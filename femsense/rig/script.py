@@ -1,5 +1,4 @@
-"""The script of a virtual experiment (`femsense-script-1`): what is pulled when, what touches, what the truth has,
-what is seen."""
+"""The script of a virtual experiment (`femsense-script-1`): inputs, contacts, ground truth and measurements."""
 
 from __future__ import annotations
 
@@ -161,7 +160,7 @@ class ScriptTable(Schema):
 
     @property
     def views(self) -> dict[str, ViewTable]:
-        """The cameras by their names; "" where there is one."""
+        """The cameras by their names; "" for a single camera."""
         return self.cameras or ({} if self.camera is None else {"": self.camera})
 
 

@@ -1,6 +1,6 @@
 """Covariates of a residual: inputs, their direction and history, time, load, gravity and depth, one number per frame.
 
-Rank correlations describe a residual; they decide nothing. Neighbouring frames are not independent, so their p-values are too small even after
+Rank correlations describe a residual; no decision depends on them. Neighbouring frames are not independent, so their p-values are too small even after
 Holm's adjustment (1979).
 """
 

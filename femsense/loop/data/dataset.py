@@ -157,7 +157,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
 
 
 def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]:
-    """Return the frames whose markers, and those whose clouds are used. Raises DataError where there are none."""
+    """Return the frames with used markers, and those with used clouds. Raises DataError if there are none."""
     usable = usable_frames(recording)
     none = usable[:0]
     marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]

@@ -44,7 +44,7 @@ RADIUS = 3.5
 SPACING = 0.6
 """Spacing of the centres of height fields, in radii."""
 ROUNDS = 0.2
-"""Largest rounding of a height field, in radii: 0.16 at a right angle; 0.2 … 2 where the model's own fields do not reach."""
+"""Largest rounding of a height field, in radii: 0.16 at a right angle; 0.2 … 2 where the model's own fields do not cover it."""
 STEEPEST = 0.78
 """Cosine between the measured and the modelled normal below which a place belongs to another side of the body."""
 AROUND = 16
@@ -105,7 +105,7 @@ def diagonal_of(robot: Robot) -> float:
     return float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
 
 
-# What the cameras measured
+# Measured surface
 
 
 def read_clouds(
@@ -278,7 +278,7 @@ def surface_normals(robot: Robot, positions: FloatArray) -> FloatArray:
 
 
 def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
-    """Leave out rows that lie apart from their neighbours in the frame: another limb, a cable, a flying pixel."""
+    """Exclude rows that deviate from their neighbours in the frame: another limb, a cable, a flying pixel."""
     apart = np.zeros(len(heights))
     for k in scene.frames:
         rows = np.flatnonzero(scene.frame == k)
@@ -293,7 +293,7 @@ def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
 def renewed_rows(
     robot: Robot, scene: Scene, seen: MeasuredSurface, states: dict[int, Equilibrium], poses: list[FloatArray]
 ) -> Scene:
-    """Return the same rows with what the model rounds off counted anew where it now has the surface."""
+    """Return the same rows with the rounding recomputed at the present surface of the model."""
     assert scene.crossings is not None
     robot, rounded = robot.in_recording(scene.recording.label), scene.crossings.rounded.copy()
     for i, (k, v) in enumerate(seen.points):

@@ -1,4 +1,4 @@
-"""Candidate experiments: what can be done with a robot and a camera, each as sweeps of a script.
+"""Candidate experiments with a robot and a camera, each as sweeps of a script.
 
 A candidate starts and ends at rest, so that candidates can be combined in any order and analysed one by one. The size of a pull follows from the
 declared robot: it moves a marker by a quarter of the robot's length, within the limits of the cable.
@@ -198,7 +198,7 @@ def _slowly(p: Pull) -> Element:
 
 
 def _hang(setup: Setup, where: str, pulls: Sequence[Pull]) -> Element:
-    """Return a weight at the tip, or twice that half way, where it moves the body less."""
+    """Return a weight at the tip, or twice that at half the length, where it moves the body less."""
     size = setup.weight if where == "tip" else 2.0 * setup.weight
     point = setup.tip if where == "tip" else setup.middle
     force = size * setup.gravity / np.linalg.norm(setup.gravity)

@@ -141,11 +141,11 @@ def make_block(
     Arguments:
         trial: inputs, loads and camera; unless `measured`, its marker positions are replaced by those of the robot.
         robot: the declared robot.
-        forms: whose columns are wanted.
+        forms: forms of effects, one column per parameter.
         recording: its key.
         noise: standard deviation of a marker's coordinate [m].
-        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is that times gravity as declared.
-        see: leave out markers that the camera does not see.
+        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is the rotation times the declared gravity.
+        see: exclude markers hidden from the camera.
         measured: the trial's markers are real.
         with_rest: also with rest.csv.
 

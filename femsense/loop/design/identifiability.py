@@ -34,7 +34,7 @@ class Row:
     label: str
     name: str
     retained: float
-    """ρ, the share that calibration leaves."""
+    """Retained share ρ."""
     smallest: FloatArray
     """Smallest detectable size of each parameter, in coordinates, shape (q,)."""
     form: Form

@@ -1,4 +1,4 @@
-"""What to record next, in words."""
+"""The proposed next recording, in words."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from femsense.model.recording import Recording
 def next_experiment(
     data: Data, final: FittedModel, noise: Noise, confounded: Sequence[ConfoundedPair], not_testable: Sequence[Untestable]
 ) -> str:
-    """Return in words what to record to distinguish what these data cannot: predicted if that is cheap, else by rule."""
+    """Return recordings that distinguish the confounded effects, in words: by prediction if that is cheap, otherwise by rules."""
     pairs = [pair.pair for pair in confounded]
     predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:

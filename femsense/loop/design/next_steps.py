@@ -50,7 +50,7 @@ class Step:
 
 
 def next_steps(data: Data, fitted: FittedModel, noise: Noise, *, noise_is_measured: bool) -> list[str]:
-    """Return in words what to do next, the most beneficial first, each with its benefit.
+    """Return the next steps in words, the most beneficial first, each with its benefit.
 
     Arguments:
         data: of the loop.

@@ -209,7 +209,9 @@ def element_block(setup: Setup, forms: Sequence[Form], element: Element, noise: 
     if any(s.gravity_m_s2 is not None for s in script.sweeps):
         rows = [np.array(s.gravity_m_s2) for s in script.sweeps for _ in s.profile()]
         turns = turns_of(np.array([rows[0], *rows]), setup.gravity)
-        if not np.any(robot.body.gravity):  # a weightless robot stays weightless: turns only give the direction of its weight
+        if not np.any(
+            robot.body.gravity
+        ):  # a weightless robot remains weightless: a rotation only sets the direction of its weight
             script = script.model_copy(update={"sweeps": [s.model_copy(update={"gravity_m_s2": None}) for s in script.sweeps]})
     trial = trial_of(robot, script, plan_script(script, robot), lead=True)
     key = "new, far" if element.far else "new"

@@ -217,7 +217,7 @@ def starting_points(names: Sequence[str], scale: float, jitter: float, near: Flo
     Arguments:
         names: of the components.
         scale: rms of the residuals [m].
-        jitter: scatter of repeated states [m], 0 where there are none.
+        jitter: scatter of repeated states [m], 0 without any.
         near: logarithms of an earlier estimate.
     """
     if near is not None:  # a component estimated as zero has no gradient in its logarithm and would stay zero: raise it once

@@ -157,7 +157,7 @@ class Detectable:
     """The smallest detectable size of an effect."""
 
     smallest: Mapping[str, float | None] = field(default_factory=dict)
-    """Label of a parameter → size in `unit`, as `kind` says; empty for a discrete alternative."""
+    """Label of a parameter → size in `unit`, of the given `kind`; empty for a discrete alternative."""
     would_be_seen: bool = True
     """Whether a plausible size is detectable."""
     kind: str | None = field(default=None, metadata=LEFT_OUT)
@@ -319,7 +319,7 @@ class DataCard:
     noise_components_m: Mapping[str, Number] = field(default_factory=dict)
     noise_source: str = ""
     mesh_error_m: float | None = None
-    """Discretisation error [m], root mean square; None where it is not known."""
+    """Discretisation error [m], root mean square; None if it is unknown."""
     outliers: tuple[Outlier, ...] = ()
     effective_observations: Number = NAN
     nuisance_after: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)

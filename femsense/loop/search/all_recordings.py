@@ -96,7 +96,7 @@ def recordings_to_search(recordings: Sequence[Recording], most: int) -> tuple[li
     ends = np.array([[table.min(axis=0), table.max(axis=0)] for table in tables]).reshape(len(tables), -1)
     unit = np.maximum(np.ptp(ends, axis=0), 1e-12)
     chosen = {int(i) for i in spread_points(ends / unit, most)}
-    chosen |= set([i for i in range(len(tables)) if i not in chosen][: most - len(chosen)])  # where several are alike
+    chosen |= set([i for i in range(len(tables)) if i not in chosen][: most - len(chosen)])  # fill up if several are identical
     return [r for i, r in enumerate(recordings) if i in chosen], [r for i, r in enumerate(recordings) if i not in chosen]
 
 

@@ -190,7 +190,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
     Arguments:
         data, fitted: the residual that is used.
         fields: of the effects that the model may lack; they are projected out. None: the whole residual of the fitted model counts as noise, markers are
-            placed no worse than the prior says, and `before` gives the repeatability of a marker.
+            limited to the prior of their places, and `before` gives the repeatability of a marker.
         before: an earlier estimate.
     """
     own, columns = fitted.fit.own, list[FloatArray]()

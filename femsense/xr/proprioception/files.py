@@ -136,7 +136,7 @@ def _read_markers(
     path: Path, frames: IntArray, poses: dict[str, FloatArray]
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
     """Return names in the order in which they first come, places (n, m, 3), nan where a marker is hidden, and rotations
-    (n, m, 3, 3) of rigid bodies; None where there are only points.
+    (n, m, 3, 3) of rigid bodies; None for points only.
 
     Positions are transformed by the poses of their cameras, if known; with several cameras the mean position is used, and the rotation of
     the last one.

@@ -244,7 +244,7 @@ class DragServer:
     def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
         """Advance the search for a request, publish the result, and set it as the target of the gate.
 
-        Measurements of the point while the robot stands still correct the model's target (see `tip_feedback`).
+        Measurements of the point while the robot is at rest correct the model's target (see `tip_feedback`).
         """
         begun = time.perf_counter()
         with self._lock:
