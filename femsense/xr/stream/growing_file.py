@@ -59,7 +59,7 @@ class GrowingFile:
             if not lines:
                 self.age_s = 0.0  # later rows are written while the file is watched
                 stop.wait(POLL_S)
-                if self._began_anew():
+                if self._was_replaced():
                     self._close()
                     rest = ""
         self._close()
@@ -92,7 +92,7 @@ class GrowingFile:
             text = "\n".join((text + chunk).split("\n")[-2:])
         return text
 
-    def _began_anew(self) -> bool:
+    def _was_replaced(self) -> bool:
         """Whether the file was cut off or replaced; False while it is away."""
         with suppress(FileNotFoundError):
             now = self._file.stat()
