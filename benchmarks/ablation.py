@@ -43,9 +43,9 @@ INF = float("inf")
 class OneCriterion(HeldOutComparison):
     """No worse in millimetres, or better by the noise and no worse beyond the mesh."""
 
-    def holds(self, decides: Thresholds) -> bool:
-        least = decides.evidence if self.only_calibrated else 0.0
-        return self.error <= decides.not_worse or (self.gain > least and self.beyond_mesh <= decides.not_worse)
+    def holds(self, thresholds: Thresholds) -> bool:
+        least = thresholds.evidence if self.only_calibrated else 0.0
+        return self.error <= thresholds.not_worse or (self.gain > least and self.beyond_mesh <= thresholds.not_worse)
 
 
 def nothing(*given: Any, **more: Any) -> None:
@@ -147,7 +147,7 @@ SEARCH = (
     Switch("elsewhere", {}, {}, {"search.forward_selection._elsewhere": as_it_is}),
     Switch("richer forms", {}, {}, {"search.forward_selection._enriched": as_it_is}),
     Switch("more markers", {}, {}, {"search.forward_selection._with_more_markers": as_it_is}),
-    Switch("surely predicts", {}, {}, {"search.acceptance.surely_predicts": zero}),
+    Switch("surely predicts", {}, {}, {"search.acceptance.cv_lower_bound": zero}),
     Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
     Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
     Switch(BEST, {}, {}, {"search.swaps.predicting_best": as_found}),

@@ -10,7 +10,7 @@ from typing import Any
 
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.screening import Candidate
-from femsense.loop.search.swaps import History, predicting_best, stand_ins
+from femsense.loop.search.swaps import History, alternatives_to, predicting_best
 
 SEEN = list[dict[str, Any]]()
 """What `predicting_best` was asked in the case that is under way, and what it changed."""
@@ -21,7 +21,7 @@ def predicting_best_watched(
 ) -> Any:
     """Return what `predicting_best` returns, and note it."""
     own = {name: next((r for r in reversed(refits) if r.name == name and r.is_named), None) for name, _ in history[1:]}
-    others = {name: stand_ins(r, refits, table) for name, r in own.items() if r is not None}
+    others = {name: alternatives_to(r, refits, table) for name, r in own.items() if r is not None}
     found = predicting_best(data, history, refits, table, *given)
     SEEN.append(
         {

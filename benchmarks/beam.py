@@ -173,7 +173,7 @@ def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, f
         ("straight down, modulus, base markers on the clamp", held, [STIFF]),
         ("free, modulus, base markers on the clamp", apply_effects(beam.robot, [HELD]), [STIFF, FREE]),
         ("straight down, modulus, base markers, Poisson", held, [STIFF, Term(0, "poisson")]),
-        ("straight down, modulus, base markers, clamp turns", held, [STIFF, Term(1, "base_compliance", [1e-3])]),
+        ("straight down, modulus, base markers, rotating clamp", held, [STIFF, Term(1, "base_compliance", [1e-3])]),
     ]
     print(f"\nModels (fit on 0 and 0.51 N, judged on 1.00 N; a repeat of that run: {REPEAT_MM} mm)")
     print(
@@ -203,7 +203,7 @@ def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, f
 
 def print_residuals(beam: Beam, results: dict[str, tuple[FittedModel, Any]]) -> None:
     """Print what three models leave at each marker at 0.51 N."""
-    print("\nWhat is left at 0.51 N, measured minus model [mm], along x, y, z")
+    print("\nResiduals at 0.51 N, measured minus model [mm], along x, y, z")
     chosen = [
         n for n in results if n.startswith(("modulus alone", "gravity straight", "straight down, modulus, base markers on"))
     ]
@@ -215,24 +215,33 @@ def print_residuals(beam: Beam, results: dict[str, tuple[FittedModel, Any]]) -> 
 
 def print_causes(beam: Beam) -> None:
     """Print where gravity points when it is fitted next to each thing that may tilt it."""
-    print("\nWhere gravity points when something else is fitted along (modulus and poses always are)")
-    print("| fitted along | fitted | held out | χ² | gravity [m/s²] | modulus | its value |\n|---|---|---|---|---|---|---|")
+    print(
+        "\nDirection of gravity if another parameter is fitted or another assumption is made (modulus and poses are always fitted)"
+    )
+    print(
+        "| also fitted or changed | fitted | held out | χ² | gravity [m/s²] | modulus | its value |\n|---|---|---|---|---|---|---|"
+    )
     robot = beam.robot
     cases: list[tuple[str, Data, Robot, list[Term]]] = [
         ("nothing", beam.data, robot, []),
         ("base markers on the clamp", beam.data, apply_effects(robot, [HELD]), []),
-        ("share by which they follow", beam.data, robot, [Term(0, "clamped_marker", [0.5], {"markers": BASE})]),
-        ("clamp that turns", beam.data, robot, [Term(1, "base_compliance", [1e-3])]),
-        ("clamp that gives", beam.data, robot, [Term(0, "base_compliance")]),
+        (
+            "share by which the base markers follow the beam",
+            beam.data,
+            robot,
+            [Term(0, "clamped_marker", [0.5], {"markers": BASE})],
+        ),
+        ("rotating clamp", beam.data, robot, [Term(1, "base_compliance", [1e-3])]),
+        ("compliant clamp", beam.data, robot, [Term(0, "base_compliance")]),
         ("Poisson ratio", beam.data, robot, [Term(0, "poisson")]),
-        ("size", beam.data, robot, [Term(0, "geometry")]),
+        ("size of the body", beam.data, robot, [Term(0, "geometry")]),
         ("scale of the cameras", beam.data, robot, [Term(0, "depth_scale")]),
         ("neo-Hookean silicone", beam.data, apply_effects(robot, [{"name": "hyperelastic", "law": "neo_hookean"}]), []),
-        ("tip held 0.5 mm too low before", with_tip(beam.data, [0, 0, -0.5e-3]), robot, []),
-        ("tip held 0.5 mm too high before", with_tip(beam.data, [0, 0, 0.5e-3]), robot, []),
-        ("beam pulled by 0.5 mm before", with_tip(beam.data, [0.5e-3, 0, 0]), robot, []),
-        ("beam pushed by 0.5 mm before", with_tip(beam.data, PUSHED), robot, []),
-        ("weights hang 7° towards the tip", with_loads(beam.data, 7.0), robot, []),
+        ("tip held 0.5 mm too low at rest", with_tip(beam.data, [0, 0, -0.5e-3]), robot, []),
+        ("tip held 0.5 mm too high at rest", with_tip(beam.data, [0, 0, 0.5e-3]), robot, []),
+        ("beam stretched by 0.5 mm at rest", with_tip(beam.data, [0.5e-3, 0, 0]), robot, []),
+        ("beam compressed by 0.5 mm at rest", with_tip(beam.data, PUSHED), robot, []),
+        ("load tilted by 7° towards the tip", with_loads(beam.data, 7.0), robot, []),
     ]
     for name, data, body, terms in cases:
         try:
@@ -304,7 +313,7 @@ def without(data: Data, marker: int) -> Data:
     return replace(data, train=[fewer(t) for t in data.train], held=[fewer(t) for t in data.held])
 
 
-CURVES = ("as declared", "base markers on the clamp", "and the beam pushed by 0.5 mm at rest")
+CURVES = ("as declared", "base markers on the clamp", "and the beam compressed by 0.5 mm at rest")
 TILTS = np.array([-35.0, -26.0, -18.0, -9.0, 0.0, 7.0, 14.0, 20.0, 26.0, 32.0, 40.0])
 
 

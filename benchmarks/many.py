@@ -457,7 +457,7 @@ def paper(root: Path) -> str:
         "messages": f"{RECORDINGS * sent * 2 / 1e6:.0f} MB at most",
         "read from the shared disk": f"{RECORDINGS * JOB_READ_MB / 1e6:.0f} TB, {read / 1e3:.1f} GB/s of {DISK_MB_S / 1e3:.0f} GB/s: "
         f"**{RECORDINGS * JOB_READ_MB / min(read, DISK_MB_S) / 60:.0f} min**",
-        "workers that the disk feeds": f"{DISK_MB_S * JOB_S / JOB_READ_MB:.0f}",
+        "workers that the disk supports": f"{DISK_MB_S * JOB_S / JOB_READ_MB:.0f}",
         "written": f"{RECORDINGS * JOB_WRITE_MB / 1e3:.0f} GB, {workers * JOB_WRITE_MB / JOB_S / 1e3:.2f} GB/s",
         "shortest task that the scheduler keeps up with": f"{workers / SCHEDULER_TASKS_S:.1f} s",
         "cost": f"{RECORDINGS * JOB_S / 3600 * CORE_HOUR_EUR:.0f} EUR",

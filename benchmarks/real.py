@@ -30,12 +30,12 @@ from femsense.core.pose import transform_points
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HEADING = (
-    "way of asking",
+    "variant",
     "verdict",
-    "named",
+    "effects",
     "fitted [mm]",
     "held out [mm]",
-    "handed back: fitted, held out",
+    "returned robot: fitted, held out",
     "with the correction, held out [mm]",
     "noise, model error [mm]",
     "CPU min",
@@ -62,7 +62,7 @@ def tentacle_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
 
 def trunk_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
     """Return the trunk without a weight and with one; then each with the run without it as its reference, without it half a second later; at last
-    the same on the robot that the first row hands back, where that is there."""
+    the same on the robot that the first row returns, where that is there."""
     robot, made = trunk.make(out, data)
     free = ["cable_gain", "cable_offset", "cable_stretch", "density", "stiffness"]
     loads = ["payload", "tip_mass"]
@@ -211,7 +211,7 @@ def print_pairs(out: Path, data: Path) -> None:
             force, std, frame_std = trunk.force_of(responses[:, discs, axes], differences[:, discs, axes])
             seen = ", ".join(f"{f:+.2f} ± {s:.2f}" for f, s in zip(force, std))
             print(
-                f"| by pairs | {name} | {part} | [{seen}] N | over frames {frame_std.round(2).tolist()} N | true [0, 0, {true:.2f}] N |",
+                f"| difference of pairs | {name} | {part} | [{seen}] N | over frames {frame_std.round(2).tolist()} N | true [0, 0, {true:.2f}] N |",
                 flush=True,
             )
 
@@ -219,7 +219,7 @@ def print_pairs(out: Path, data: Path) -> None:
 def print_fitted(rows: list[Asked]) -> None:
     """Print what calibration within the loop leaves by both weights (docs/method/closing-the-loop.md, section 4)."""
     print(
-        "| way of asking | declared, held out [mm] | fitted; held out [mm] | modulus | by weights with the error: fitted; held out | modulus | corrected |"
+        "| variant | declared, held out [mm] | fitted; held out [mm] | modulus | weights with the model error: fitted; held out | modulus | corrected |"
     )
     print("|---" * 7 + "|")
     for asked in rows:
@@ -290,9 +290,9 @@ def _value(parameter: Any) -> str:
 
 
 def corrected(correction: Mapping[str, Any]) -> str:
-    """Return what an empirical correction leaves of held-out markers [mm], and whether it is handed back."""
+    """Return what an empirical correction leaves of held-out markers [mm], and whether it is returned."""
     after = correction.get("validation_rms_after_m")
-    return "–" if after is None else f"{1e3 * after:.1f} ({'handed back' if correction['accepted'] else 'refused'})"
+    return "–" if after is None else f"{1e3 * after:.1f} ({'returned' if correction['accepted'] else 'rejected'})"
 
 
 def row(asked: Asked, minutes: float, loop: bool) -> list[str]:

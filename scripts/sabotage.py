@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-NEEDED = ("femsense", "tests", "meshes", "examples", "docs", "benchmarks", "scripts", "pyproject.toml")
+NEEDED = ("femsense", "tests", "meshes", "docs", "benchmarks", "scripts", "pyproject.toml")
 LONGEST_S = 600.0
 """A broken solver may never end: a test that runs longer than this counts as failed."""
 

@@ -181,7 +181,7 @@ def test_help_and_the_bare_import_load_nothing_heavy(code: str) -> None:
 # What scripts import is there
 
 ROOT = PACKAGE.parent
-SCRIPTS = sorted(file for folder in ("benchmarks", "examples", "meshes", "scripts") for file in (ROOT / folder).rglob("*.py"))
+SCRIPTS = sorted(file for folder in ("benchmarks", "meshes", "scripts") for file in (ROOT / folder).rglob("*.py"))
 
 
 def file_of(module: str) -> Path | None:

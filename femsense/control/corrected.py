@@ -1,5 +1,5 @@
-"""Inputs that bring markers to places where the model is known to be off: the robot's empirical correction is a function of the inputs,
-so that aims and inputs are found in turn, p_model(u) = p* − g(u), until they no longer change.
+"""Inputs for targets with the robot's empirical correction g of the model. g is a function of the inputs, so that p_model(u) = p* − g(u) is
+solved by fixed-point iteration.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.model.robot import Robot
 
 ROUNDS, SETTLED = 20, 1e-6
-"""Rounds at most, and the change of the correction [m] at which they end."""
+"""Maximum number of iterations, and change of the correction [m] at which they end."""
 
 
 Start = Equilibrium | Motion | None
 
 
 def reach_corrected(robot: Robot, target: Target, control: str, find: Callable[[Target, Start], Motion], start: Start) -> Motion:
-    """Return the motion that brings markers to places by the model with its correction.
+    """Return the motion that brings markers to targets by the model with its correction.
 
     Arguments:
         robot: with a correction.
-        target: marker → where it is wanted [m], robot frame.
-        control: what is commanded of the cables.
-        find: inputs for a target by the model alone, from a state.
-        start: where the robot is now.
+        target: marker → its target position [m], robot frame.
+        control: kind of the cable commands.
+        find: returns the inputs for a target by the model alone, from a state.
+        start: the current state of the robot.
 
     Raises:
-        InputError: no correction, one that was learned from other inputs, or a target that is no marker of it.
+        InputError: no correction, one that was learned with other inputs, or a target that is not one of its markers.
     """
     correction = robot.require_correction()
     correction.check(control, (*robot.body.cable_names, *robot.body.chamber_names), where="control")
     for key in target:
         if key not in correction.marker_names:
             raise InputError(
-                "the correction knows no such marker",
+                "the correction does not include this marker",
                 where="target",
                 found=key,
                 expected=", ".join(correction.marker_names),
@@ -61,7 +61,7 @@ def reach_corrected(robot: Robot, target: Target, control: str, find: Callable[[
 
 
 def _with_correction(motion: Motion, wanted: FloatArray, shift: FloatArray, std: float, *, settled: bool) -> Motion:
-    """Return a motion with places as the correction has them; one that did not settle is stopped."""
+    """Return a motion with corrected positions; without convergence its status is stopped."""
     places = {name: freeze(place + s) for (name, place), s in zip(motion.reached_m.items(), shift)}
     off = np.nan_to_num(wanted - np.array(list(places.values())))
     status = motion.status if settled or motion.status != REACHED else STOPPED

@@ -15,22 +15,22 @@ from femsense.core.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """A state with exact slopes."""
+    """A state with its exact tangent."""
 
     effort: FloatArray
     """[N, Pa], shape (d,)."""
     points: FloatArray
-    """J, the rows' change by unit efforts, shape (r, d)."""
+    """J, derivative of the rows by the efforts, shape (r, d)."""
     miss: FloatArray
-    """Wanted less present coordinates [m], shape (r,)."""
+    """Target minus current coordinates [m], shape (r,)."""
 
 
 def learned(curvature: FloatArray, last: Seen, now: Seen) -> FloatArray:
-    """Return Σ r ∇²r at a state [m² per unit of effort, squared], shape (d, d), as the step to it shows.
+    """Return Σ r ∇²r at a state [m² per squared unit of effort], shape (d, d), updated with the step to it.
 
     Arguments:
-        curvature: as known before, shape (d, d).
-        last, now: where the step began and ended.
+        curvature: the previous estimate, shape (d, d).
+        last, now: the start and the end of the step.
     """
     step = now.effort - last.effort
     bent = -(now.points - last.points).T @ now.miss

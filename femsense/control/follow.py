@@ -21,8 +21,8 @@ from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.model.robot import Robot
 
 PACE = Pace(farthest=0.02, by_body=True, sure_gain=1e-3, faithful=0.5, tolerance=1e-4, least_m=1e-5)
-"""Of steps while a hand drags. Steps of 0.05 take twice the processor time on the four-leg robot, since they need stiffnesses
-of their own (24 and 47 ms). Without `least_m` the gripper pulls its other finger to the limit for micrometres."""
+"""Step parameters while a hand drags. Steps of 0.05 take twice the processor time on the four-leg robot (47 instead of 24 ms), because each needs
+its own stiffness. Without `least_m` the gripper pulls its other finger to the limit for micrometres."""
 
 
 class Follower:
@@ -47,7 +47,7 @@ class Follower:
             options: criteria to end a search; an empirical correction is ignored.
 
         Raises:
-            InputError: an unknown cable or control, limits the wrong way round.
+            InputError: an unknown cable or control, or reversed limits.
         """
         self.robot, self.control, self.calibration = robot, control, calibration
         self.options = options or ReachOptions()
@@ -55,7 +55,7 @@ class Follower:
         self._start: Equilibrium | None = None
         self._search: Search | None = None
         self._other: Search | None = None
-        self._compared = False  # with the result of a search from rest
+        self._compared = False  # whether a search from rest was compared
 
     def begin(self, inputs: Mapping[str, float]) -> None:
         """Restart at the equilibrium under given inputs: commands of all cables [N or m] and chambers [Pa].
@@ -80,12 +80,12 @@ class Follower:
 
     @property
     def ended(self) -> bool:
-        """Whether the way has ended: further steps change nothing, unless the target stays and is sought from rest."""
+        """Whether the search has ended: further steps change nothing, except with `stays`, which also searches from rest."""
         return self._search is not None and bool(self._search.status)
 
     @property
     def resting(self) -> bool:
-        """Whether further steps towards the same target change nothing at all."""
+        """Whether further steps towards the same target change nothing, with `stays` too."""
         search = self._search
         return search is not None and bool(search.status) and (search.status == REACHED or self._compared)
 
@@ -103,7 +103,7 @@ class Follower:
             the motion; its status is "converging" while further steps reduce the error.
 
         Raises:
-            InputError: an unknown marker, or a target that is no place.
+            InputError: an unknown marker, or an invalid target.
         """
         end = time.perf_counter() + seconds
         search = self._advanced(self._aimed(make_goal(self.robot, target, (), ())), stays)
@@ -112,11 +112,11 @@ class Follower:
         return found(self.robot, self.control, search, search.status or CONVERGING, self.calibration)
 
     def _is_there(self, search: Search) -> bool:
-        """Whether a target is reached by a state that may be coarse still: solved finely, its error is no longer smaller."""
+        """Return whether the target is reached within the tolerance, by a state that may not be solved to full tolerance yet."""
         return search.state.converged and search.goal.error(search.state.positions) <= self.options.tolerance_m
 
     def _aimed(self, goal: Goal) -> Search:
-        """Return the search for a goal: the last one, turned to it where the same points are wanted."""
+        """Return the search for a goal: the current one with new targets if the points are the same, else a new one."""
         last = self._search
         if last is not None and last.state.converged and last.serves(goal):
             if not np.array_equal(last.goal.wanted, goal.wanted):
@@ -129,7 +129,7 @@ class Follower:
         return self._search
 
     def _advanced(self, search: Search, stays: bool) -> Search:
-        """Solve one equilibrium further on, for a target that stays from rest where the search itself is over."""
+        """Solve one more equilibrium; after the search has ended, one of the search from rest."""
         if not search.status:
             search.advance()
             return search

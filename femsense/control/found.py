@@ -1,4 +1,4 @@
-"""What a search has found, as commands, places and words."""
+"""The state of a search as a `Motion`: commands, positions and texts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from femsense.model.robot import Robot
 
 
 def found(robot: Robot, control: str, search: Search, status: str, calibration: Calibration | None) -> Motion:
-    """Return where a search stands as a motion of a status."""
+    """Return the state of a search as a motion with a status."""
     body, goal, bounds, state = robot.body, search.goal, search.bounds, search.state
     effort, wound, miss = efforts_of(state), wound_up(body, state), goal.miss(state.positions)
     true = effort[: len(wound)] if control == "tension" else wound
@@ -35,6 +35,6 @@ def found(robot: Robot, control: str, search: Search, status: str, calibration: 
 
 
 def _words(search: Search) -> tuple[str, ...]:
-    """Return what stops a motion in words: limits that are active, and equilibria that end."""
+    """Return the active limits, and the end of the equilibria, in words."""
     active = tuple(search.bounds.text(i, which, search.body) for _, i, which in search.last.active)
     return (*active, f"no equilibrium further on ({search.beyond})") if search.beyond else active

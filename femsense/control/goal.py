@@ -30,11 +30,11 @@ class Goal:
     ties: Embedding
     """The points, p of them."""
     directions: FloatArray
-    """Which combination of coordinates each row wants, shape (r, p, 3)."""
+    """Coefficients of each row in the coordinates of the points, shape (r, p, 3)."""
     wanted: FloatArray
     """[m], shape (r,)."""
     names: tuple[str, ...]
-    """Of the points that are targets, the first ones."""
+    """Names of the points with targets, which come first."""
     nodal_forces: FloatArray
     """Contact forces, known and wanted [N], shape (n, 3)."""
 
@@ -43,7 +43,7 @@ class Goal:
         return np.asarray(self.wanted - np.einsum("rpc,pc->r", self.directions, self.ties.positions(positions)))
 
     def rows(self, moves: FloatArray) -> FloatArray:
-        """Return the rows' change for k displacements of the nodes (k, n, 3), shape (r, k)."""
+        """Return the change of the rows by k displacements of the nodes (k, n, 3), shape (r, k)."""
         return np.stack([np.einsum("rpc,pc->r", self.directions, self.ties.moves(move)) for move in moves], axis=1)
 
     def error(self, positions: FloatArray) -> float:
@@ -52,7 +52,7 @@ class Goal:
         return float(np.linalg.norm(off, axis=1).max(initial=0.0))
 
 
-# What is wanted, and within what
+# Construction of goals
 
 
 def make_goal(
@@ -61,14 +61,14 @@ def make_goal(
     forces: Forces,
     contacts: Sequence[WallContact],
 ) -> Goal:
-    """Return the rows that are wanted: the coordinates of the targets that are not free, then the places of the walls.
+    """Return a goal: rows for the fixed coordinates of the targets, then for the walls.
 
     Raises InputError.
     """
     keys, points = list(target), [_numbers(value, f"target {key}") for key, value in target.items()]
     places = [_place(robot, key) for key in keys] + [_numbers(contact.point_m, "contacts") for contact in contacts]
     if not places:
-        raise InputError("nothing is wanted", where="target", expected="a marker or a point of the body, and where it should be")
+        raise InputError("no target", where="target", expected="a marker or a point of the body, and its target position")
     rest = np.array(places)
     rows = [(i, np.eye(3)[axis], point[axis]) for i, point in enumerate(points) for axis in np.flatnonzero(~np.isnan(point))]
     rows += [(len(keys) + i, _normal(contact), contact.offset_m) for i, contact in enumerate(contacts)]
@@ -84,12 +84,12 @@ def _numbers(value: npt.ArrayLike, where: str) -> FloatArray:
     """Return three numbers, NaN allowed, shape (3,). Raises InputError."""
     point = np.asarray(value, dtype=np.float64)
     if point.shape != (3,) or np.isinf(point).any():
-        raise InputError("not a place", where=where, found=value, expected="x, y, z in metres; NaN leaves a direction free")
+        raise InputError("not a position", where=where, found=value, expected="x, y, z in metres; NaN leaves a direction free")
     return point
 
 
 def _place(robot: Robot, key: str | tuple[float, float, float]) -> FloatArray:
-    """Return where a marker sits at rest, or the point itself [m], shape (3,). Raises InputError."""
+    """Return the place of a marker at rest, or the point itself [m], shape (3,). Raises InputError."""
     if not isinstance(key, str):
         place = _numbers(key, "target")
         check_on_body(robot.body.mesh, place[None], where="target")
@@ -106,7 +106,7 @@ def _place(robot: Robot, key: str | tuple[float, float, float]) -> FloatArray:
 
 
 def _ties(robot: Robot, keys: list[str | tuple[float, float, float]], rest: FloatArray) -> Embedding:
-    """Return the ties of points at rest (p, 3), the targets first: markers follow the body as they are declared to."""
+    """Return the embedding of points at rest (p, 3), targets first; markers follow body and clamp with their declared share."""
     ties = embed_points(robot.body.mesh, rest)
     if robot.marker_share is None:
         return ties
@@ -123,7 +123,7 @@ def _normal(contact: WallContact) -> FloatArray:
     length = float(np.linalg.norm(normal))
     if not (length > 0 and contact.force_n >= 0):
         raise InputError(
-            "no wall",
+            "invalid wall",
             where="contacts",
             found=f"normal {contact.normal}, {contact.force_n:g} N",
             expected="a normal that is not zero, and a force ≥ 0",

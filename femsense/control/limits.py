@@ -1,4 +1,4 @@
-"""Limits of cables and chambers, and the way from commands to true inputs and back."""
+"""Limits of cables and chambers, and the conversion between commands and true inputs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Limits:
     def rows(
         self, slopes: FloatArray, wound: FloatArray, low: FloatArray, high: FloatArray
     ) -> tuple[FloatArray | None, FloatArray | None, list[tuple[int, str]]]:
-        """Return G and h of the limits of length for scaled steps within low … high, and which limit each row is.
+        """Return G and h of the length limits for scaled steps within low … high, and the limit of each row.
 
         A violated limit is relaxed to a value that most of the trust region can reach, so that the problem is feasible.
         """
@@ -64,11 +64,11 @@ class Limits:
         return f"{name} cannot push" if which == "least" and value == 0 else f"{name} at its {which} tension, {value:.4g} N"
 
 
-# From commands to efforts, and back
+# Commands and efforts
 
 
 def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, float]], calibration: Calibration | None) -> Limits:
-    """Return the limits of the inputs: those of the robot, narrowed by given ones. Raises InputError."""
+    """Return the limits of the inputs: those of the robot, narrowed by the given ones. Raises InputError."""
     if control not in CONTROLS:
         raise InputError("unknown control", where="control", found=control, expected=" or ".join(CONTROLS))
     body = robot.body
@@ -80,7 +80,7 @@ def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, fl
     for name, pair in limits.items():
         if name not in names:
             raise InputError(
-                "no cable or chamber of this robot",
+                "unknown cable or chamber",
                 where="limits",
                 found=name,
                 expected=", ".join(names),
@@ -89,7 +89,7 @@ def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, fl
         least, largest = (float(v) for v in pair)
         if not least <= largest:
             raise InputError(
-                "limits the wrong way round",
+                "reversed limits",
                 where=f"limits[{name}]",
                 found=f"{least:g}, {largest:g}",
                 expected="(least, largest)",
@@ -108,7 +108,7 @@ def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, fl
 
 
 def true_input(robot: Robot, control: str, i: int, command: float, calibration: Calibration | None) -> float:
-    """Return the true tension [N] or shortening [m] that a command to cable i brings."""
+    """Return the true tension [N] or shortening [m] under a command to cable i."""
     act, counted = robot.actuation, command + _initial(robot, control, i, calibration)
     if control == "tension":
         return float(act.gain[i] * counted + act.tension_offset[i])
@@ -116,7 +116,7 @@ def true_input(robot: Robot, control: str, i: int, command: float, calibration: 
 
 
 def command(robot: Robot, control: str, i: int, true: float, calibration: Calibration | None) -> float:
-    """Return the command to cable i that brings a true tension [N] or shortening [m]."""
+    """Return the command to cable i for a true tension [N] or shortening [m]."""
     act = robot.actuation
     offset = act.tension_offset[i] if control == "tension" else act.displacement_offset[i] - act.slack[i]
     return float((true - offset) / act.gain[i]) - _initial(robot, control, i, calibration)

@@ -12,66 +12,70 @@ REACHED, NEAREST, STOPPED, CONVERGING = "reached", "nearest", "stopped", "conver
 
 @dataclass(frozen=True, slots=True)
 class WallContact:
-    """A point of the body that is to press against a wall with a wanted force (hybrid control of position and force)."""
+    """A point of the body that presses against a wall with a given force (hybrid control of position and force)."""
 
     point_m: tuple[float, float, float]
-    """The point of the body that touches, at rest, robot frame [m]."""
+    """The contact point of the body at rest, robot frame [m]."""
     normal: tuple[float, float, float]
-    """Unit normal of the wall, away from it and into the body's side, robot frame."""
+    """Unit normal of the wall towards the body, robot frame."""
     offset_m: float
-    """The wall holds the places x with normal · x = offset [m]."""
+    """The wall is the plane of points x with normal · x = offset [m]."""
     force_n: float
-    """Wanted force of the wall on the body along the normal [N], ≥ 0."""
+    """Force of the wall on the body along the normal [N], ≥ 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """How far an answer is from the conditions of Karush, Kuhn and Tucker, all of them measured at the end."""
+    """Residuals of the Karush–Kuhn–Tucker conditions in the final state."""
 
     equilibrium_n: float
     """Largest unbalanced nodal force [N]."""
     gradient: float
-    """Share of the squared error that the linearised problem could still take away within the limits [1]."""
+    """Share of the squared error that the linearised problem could still remove within the limits [1]."""
     violation: float
-    """Largest violation of a limit, in units of the limit's range [1]."""
+    """Largest violation of a length limit [m] plus that of an effort limit [N or Pa]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Motion:
-    """Inputs that bring points of the body to wanted places, or as near as the limits allow."""
+    """Inputs that bring points of the body to their targets, or as close as the limits allow."""
 
     inputs: dict[str, float]
     """Commands: tension [N] or shortening [m] of each cable, pressure [Pa] of each chamber."""
     positions: FloatArray
-    """Where the nodes end up at equilibrium [m], shape (n, 3)."""
+    """Node positions in the final equilibrium [m], shape (n, 3)."""
     reached_m: dict[str, FloatArray]
-    """Target → where its point ends up at equilibrium, robot frame [m], shape (3,)."""
+    """Target → position of its point in the final equilibrium, robot frame [m], shape (3,)."""
     error_m: float
-    """Largest distance of a point from its target, along the directions that are wanted [m]."""
+    """Largest distance of a point from its target, along the constrained directions [m]."""
     status: str
-    """"reached"; "nearest": the limits allow no better, or no equilibrium was found further on; "stopped": steps ran out on the way;
-    "converging": more steps come nearer (`Follower`)."""
+    """"reached"; "nearest": no step within the limits reduces the error, or no equilibrium was found farther on; "stopped": the steps ran out;
+    "converging": further steps reduce the error (`Follower`)."""
     limits: tuple[str, ...]
-    """The limits that stop it, in words, those that cost most first."""
+    """The active limits in words, the most costly first."""
     certificate: Certificate
     iterations: int
-    """Equilibria that were solved."""
+    """Number of equilibria that were solved."""
     equilibrium: Equilibrium
-    """The state, a start for the next target."""
+    """The final state, a warm start for the next target."""
     correction_std_m: float | None = None
     """Standard deviation along each axis of the empirical correction in `reached_m` [m]; None if it is not used."""
 
     @property
     def text(self) -> str:
-        """The outcome in one sentence."""
+        """The result in one sentence."""
         if self.status == REACHED:
-            sure = "" if self.correction_std_m is None else f"; the correction is sure to ± {1e3 * self.correction_std_m:.2g} mm"
+            sure = (
+                ""
+                if self.correction_std_m is None
+                else f"; standard deviation of the correction {1e3 * self.correction_std_m:.2g} mm"
+            )
             return f"reached to {1e3 * self.error_m:.3g} mm{sure}"
         by = f"; stopped by {', '.join(self.limits)}" if self.limits else ""
         if self.status == CONVERGING:
-            return f"converging: {1e3 * self.error_m:.3g} mm off by now{by}"
+            return f"converging: {1e3 * self.error_m:.3g} mm from the target{by}"
         if self.status == NEAREST:
-            reason = by or "; no input moves the points that way"
-            return f"out of reach: the nearest is {1e3 * self.error_m:.3g} mm off{reason}"
+            reason = by or "; no input moves the points in that direction"
+            return f"out of reach: the closest state is {1e3 * self.error_m:.3g} mm from the target{reason}"
         why = by if self.equilibrium.converged else f": {self.equilibrium.advice}{by}"
-        return f"stopped {1e3 * self.error_m:.3g} mm off after {self.iterations} equilibria{why}"
+        return f"stopped {1e3 * self.error_m:.3g} mm from the target after {self.iterations} equilibria{why}"

@@ -1,17 +1,17 @@
-"""The inverse problem of motion: cable inputs and pressures that bring points of the body to wanted places.
+"""The inverse problem of motion: cable inputs and pressures that bring points of the body to target positions.
 
-The unknowns are the tensions of the cables and the pressures of the chambers, u. Each round linearises the equilibrium,
+The unknowns u are the tensions of the cables and the pressures of the chambers. Each iteration linearises the equilibrium,
 
     p(u + du) ≈ p(u) + W_pa du,    s(u + du) ≈ s(u) + W_aa du,
 
-(W of the exact tangent, p the wanted coordinates, s the shortening of the cables) and solves the quadratic problem
+(W from the exact tangent, p the controlled coordinates, s the lengths wound up by the motors) and solves the quadratic programme
 
     min ½ |p + W_pa du − p*|² + ½ duᵀ S du + ½ λ |du|²   with  u_min ≤ u + du ≤ u_max,  s_min ≤ s + W_aa du ≤ s_max,
 
-as Duriez (2013) and Coevoet et al. (2017) pose it, within a trust region that the next equilibrium widens or narrows.
-S is the second-order part, which counts where the target is out of reach (`curvature`).
-The damping λ acts on the step, not on the input, so that it moves no answer. A wanted contact force is applied to the body,
-and the place of the wall becomes one more target: both hold where the robot presses the wall with that force.
+of Duriez (2013) and Coevoet et al. (2017) in a trust region that follows the next equilibrium. S is the estimated second-order
+part, which matters for unreachable targets (`curvature`). The damping λ acts on the step, not on the input, so that it does not bias the
+result. A wanted contact force is applied to the body and the position of the wall becomes one more target: both hold if the robot
+presses the wall with that force.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def reach(
         the motion; an unreachable target is a status with the closest state and the active limits, not an exception.
 
     Raises:
-        InputError: an unknown marker, cable or control, limits the wrong way round, or no correction where one is asked for.
+        InputError: an unknown marker, cable or control, reversed limits, or a requested correction that the robot lacks.
     """
     known = options or ReachOptions()
     bounds = make_limits(robot, control, limits or {}, calibration)

@@ -1,4 +1,4 @@
-"""The search for inputs, one equilibrium at a time (`reach` says what is solved in each round)."""
+"""The search for inputs, one equilibrium at a time; the module docstring of `reach` states the problem of each iteration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from femsense.control.curvature import Seen, convex, learned
 from femsense.control.goal import Goal
 from femsense.control.limits import Limits
 from femsense.control.motion import NEAREST, REACHED, STOPPED
-from femsense.control.slopes import Slopes, exact_slopes, lent_slopes, may_be_lent
+from femsense.control.slopes import Slopes, approximate_slopes, exact_slopes, has_factorisation
 from femsense.core.arrays import FloatArray
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
@@ -18,62 +18,62 @@ from femsense.qp.problem import Problem
 from femsense.qp.solve import solve
 
 WEAKEST = 1e-3
-"""An actuator that moves the points less than this share of the strongest is not pulled harder for it."""
+"""An actuator that moves the points by less than this share of the strongest one is scaled as if it moved them by that share."""
 PENALTY = 50.0
-"""A limit of length that is missed by so much weighs like an error so many times as large."""
+"""Weight of the violation of length limits in the exact penalty, relative to the distance from the target."""
 ACTIVE = 1e-9
-"""A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
+"""A limit is active if its multiplier exceeds this, in units of the scaled problem."""
 FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
-"""Trust region at first and the step at which a search is over, in units of the body's reach;
-error from which states are solved finely [m]."""
+"""Initial trust region and step at which a search ends, relative to the body's reach;
+error below which states are solved to full tolerance [m]."""
 EDGE = 1e-4
-"""A search ends where no equilibrium was found within a step of this size: the body collapses or buckles there. Going on to
-SMALLEST_STEP took 10 more solves on data/diamond and came 0.03 mm of 49.6 mm nearer."""
+"""A search ends if there is no equilibrium within a step of this size: the body collapses or buckles there. Continuing to
+SMALLEST_STEP took 10 more solves on data/diamond and reduced the error of 49.6 mm by 0.03 mm."""
 COARSE, FINE = 1e-9, 1e-13
 """Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
 
 KEPT = 0.1
-"""Slopes serve for another step where the last one left no more than this share of the error."""
+"""The tangent is kept for another step if the last one left less than this share of the error."""
 SURE_GAIN = 0.5
-"""Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
+"""A tangent that is not exact is recomputed if its predicted gain is below this share of the squared error."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReachOptions:
-    """When a search for inputs ends."""
+    """Criteria to end a search for inputs."""
 
     tolerance_m: float = 1e-10
-    """A target is reached that is missed by less than this [m]."""
+    """Largest error of a reached target [m]."""
     max_iterations: int = 60
-    """Equilibria at most."""
+    """Maximum number of equilibria."""
     least_gain: float = 1e-9
-    """The search ends where the predicted gain of a step is below this share of the squared error."""
+    """The search ends if the predicted gain of a step is below this share of the squared error."""
     correct: bool = False
-    """Use the robot's empirical correction: markers are wanted where it has them."""
+    """Use the robot's empirical correction for the positions of markers."""
     damping: float = 1e-10
-    """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
+    """λ, relative to the largest eigenvalue of W_paᵀ W_pa; it distributes the effort over redundant actuators."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How much a single step is worth."""
+    """Size of a single step, and effort spent on it."""
 
     farthest: float = np.inf
-    """A step of one input moves no node farther than this share of the body's reach [1]."""
+    """Largest displacement of a node by one input in a step, relative to the body's reach [1]."""
     by_body: bool = False
-    """A step is as long as the farthest node moves; else as the points move, however far that moves the rest of the body."""
+    """Whether step lengths measure the displacement of the farthest node; else that of the controlled points."""
     sure_gain: float = SURE_GAIN
-    """Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
+    """A tangent that is not exact is recomputed if its predicted gain is below this share of the squared error."""
     faithful: float = np.inf
-    """Slopes serve for another step, too, where the last one took this share of what they had promised."""
+    """The tangent is also kept if the last step achieved this share of its predicted gain."""
     tolerance: float = COARSE
-    """Relative tolerance of the equilibrium after a step that gains more than the tolerance of the search."""
+    """Relative tolerance of the equilibrium after a step whose predicted gain exceeds the tolerance of the search."""
     least_m: float = 0.0
-    """The search ends where a step comes nearer by less than this [m]."""
+    """The search ends if a step is predicted to reduce the distance by less than this [m]."""
 
 
 class Search:
-    """Goes step by step to inputs: each step is taken if the error falls, else the trust region shrinks."""
+    """Trust-region iteration: a step is accepted if the error falls, otherwise the trust region shrinks."""
 
     def __init__(
         self,
@@ -85,28 +85,28 @@ class Search:
         *,
         pace: Pace | None = None,
     ) -> None:
-        """Begin at an equilibrium, within the limits of efforts; without one at rest."""
+        """Begin at an equilibrium within the limits of efforts; without `start` at rest."""
         self.pace = pace or Pace()
         self.body, self.goal, self.bounds, self.options = body, goal, bounds, options
         self.state = _begin(body, goal, bounds, start)
         self.before = self.state.segment_tensions
         self.count = 1
-        """Equilibria that were solved for this goal."""
+        """Number of equilibria solved for this goal."""
         self.status = "" if self.state.converged else STOPPED
-        """How it ended; empty while it goes on."""
+        """Result of the search; empty while it continues."""
         self.last, self.beyond = Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
         self._radius, self._settled = min(FIRST_RADIUS, self.pace.farthest), False
-        self._edge = np.inf  # steps grow no farther after one on which no equilibrium was found
-        self._slopes = lent_slopes(body, goal, self.state) if self.state.converged else None
+        self._edge = np.inf  # upper bound of the step after one that had no equilibrium
+        self._slopes = approximate_slopes(body, goal, self.state) if self.state.converged else None
         self._curvature: FloatArray = np.zeros((len(bounds.low),) * 2)
-        self._seen: tuple[Seen, FloatArray] | None = None  # and the positions there
+        self._seen: tuple[Seen, FloatArray] | None = None  # the last exact tangent, and the positions there
 
     def serves(self, goal: Goal) -> bool:
-        """Return whether a goal wants the same coordinates of the same points, though elsewhere."""
+        """Return whether a goal has the same coordinates of the same points, with any targets."""
         return self.goal.names == goal.names and np.array_equal(self.goal.directions, goal.directions)
 
     def aim(self, goal: Goal) -> None:
-        """Go on from here to where the same points are wanted now. What was learnt on the way stays."""
+        """Continue from the current state to new targets of the same points; tangent and curvature are kept."""
         moved = float(np.abs(goal.wanted - self.goal.wanted).max(initial=0.0))
         self.goal, self.count, self._settled = goal, 0, False
         self._edge = np.inf
@@ -117,7 +117,7 @@ class Search:
             self._seen = replace(seen, miss=goal.miss(positions)), positions
 
     def advance(self) -> None:
-        """Solve one more equilibrium, or find that this is the end."""
+        """Solve one more equilibrium, or end the search."""
         if self.status or self.count >= self.options.max_iterations:
             self.status = self.status or STOPPED
             return
@@ -153,19 +153,19 @@ class Search:
         return self.pace.tolerance if self._gained() > self.options.tolerance_m else COARSE
 
     def _gained(self) -> float:
-        """Return by how much the last step was to come nearer [m]."""
+        """Return the predicted reduction of the distance by the last step [m]."""
         miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
         return float(np.sqrt(miss2) - np.sqrt(max(miss2 - self.last.gain, 0.0)))
 
     def _serve(self, tried: Equilibrium) -> bool:
-        """Return whether the slopes are good for another step after this one."""
+        """Return whether to keep the tangent after this step."""
         before, after = (self.goal.miss(state.positions) for state in (self.state, tried))
         took = float((before**2).sum() - (after**2).sum())
         near = self.goal.error(tried.positions) <= KEPT * self.goal.error(self.state.positions)
         return near or took >= self.pace.faithful * self.last.gain
 
     def _plan(self, end: str, within: bool) -> tuple[Slopes, str]:
-        """Return the slopes that serve here, and how the search ends if it does; the step stands in `last`."""
+        """Return the tangent to use, and the result if the search ends; the planned step is stored in `last`."""
         miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
         if self._slopes is not None and not end:
             self._step(self._slopes)
@@ -182,7 +182,7 @@ class Search:
         return self._slopes, end
 
     def _exact(self) -> Slopes:
-        """Return the slopes at this state; what they show of the curvature is learnt."""
+        """Return the exact tangent at this state, and update the curvature."""
         slopes, self.state = exact_slopes(self.body, self.goal, self.state)
         seen = Seen(efforts_of(self.state), slopes.points, self.goal.miss(self.state.positions))
         if self._seen is not None:
@@ -197,7 +197,7 @@ class Search:
         )
 
     def _fall_back(self, tried: Equilibrium, within: bool) -> None:
-        """Shrink the trust region after a step that led nowhere, or end where none is left."""
+        """Shrink the trust region after a rejected step, or end the search if it is too small."""
         self.beyond = "" if tried.converged else tried.status
         if self.last.size >= (SMALLEST_STEP if tried.converged else EDGE):
             self._radius = 0.25 * min(self._radius, self.last.size)
@@ -210,17 +210,17 @@ class Search:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
-    """The answer of one quadratic problem."""
+    """The solution of one quadratic programme."""
 
     change: FloatArray
     """Of the efforts [N, Pa], shape (a + c,)."""
     size: float
-    """Largest change, in units of what would move the points by the body's reach [1]."""
+    """Largest change, in units of the effort that would move the points by the body's reach [1]."""
     gain: float
-    """By how much the squared error falls to first order [m²]."""
+    """Predicted decrease of the squared error [m²]."""
     active: tuple[tuple[float, int, str], ...] = ()
-    """Limits that hold it back: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"),
-    the largest first."""
+    """Active limits: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"), the largest
+    multiplier first."""
 
 
 def _best_step(
@@ -234,12 +234,12 @@ def _best_step(
     curvature: FloatArray,
     by_body: bool,
 ) -> Step:
-    """Return the best step of the linearised problem, with what is known of its curvature, in a trust region."""
+    """Return the step that minimises the quadratic model, with the estimated curvature, in the trust region."""
     u, miss = efforts_of(state), goal.miss(state.positions)
     J, W = slopes.points, slopes.wound
     moved = slopes.body if by_body else np.linalg.norm(J, axis=0)
     farthest = float(moved.max(initial=0.0))
-    if not farthest > 0.0:  # held points
+    if not farthest > 0.0:  # the points are clamped
         return Step(np.zeros(len(u)), 0.0, 0.0)
     unit = body.reach / np.maximum(moved, WEAKEST * farthest)
     scaled = J * unit
@@ -270,7 +270,7 @@ def _best_step(
 
 
 def _learned(body: BodyModel, goal: Goal, slopes: Slopes, state: Equilibrium, tried: Equilibrium) -> Slopes:
-    """Return what the way from one state to another shows of the slopes."""
+    """Return the tangent updated with the step between two states."""
     moved = goal.miss(state.positions) - goal.miss(tried.positions)
     return slopes.learned(efforts_of(tried) - efforts_of(state), moved, wound_up(body, tried) - wound_up(body, state))
 
@@ -281,7 +281,7 @@ def efforts_of(state: Equilibrium) -> FloatArray:
 
 
 def wound_up(body: BodyModel, state: Equilibrium) -> FloatArray:
-    """Return what each motor has wound up [m], shape (a,): the cable's shortening and its stretch."""
+    """Return the length wound up by each motor [m], shape (a,): the cable's shortening and its stretch."""
     stretch = [state.tension[cable.name] / cable.stretch_stiffness for cable in body.cables]
     return np.asarray(np.array(list(state.shortening.values())) + np.array(stretch))
 
@@ -297,8 +297,8 @@ def _solved(
     tried: bool = False,
 ) -> Equilibrium:
     """Return the equilibrium under efforts (a + c,);
-    `before` are the tensions along the cables before the robot began to move."""
-    a, fine, lent = len(body.cables), tolerance <= FINE, start is not None and may_be_lent(body, start)
+    `before` are the tensions along the cables before the motion, for friction."""
+    a, fine, lent = len(body.cables), tolerance <= FINE, start is not None and has_factorisation(body, start)
     return solve_equilibrium(
         body,
         tension=dict(zip(body.cable_names, effort[:a].tolist())),
@@ -317,15 +317,15 @@ def _solved(
 
 
 def _begin(body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | None) -> Equilibrium:
-    """Return the state to begin with, within the limits of efforts."""
+    """Return the initial state, within the limits of efforts."""
     effort = np.zeros(len(bounds.low)) if start is None else efforts_of(start)
     before = None if start is None else start.segment_tensions
     return _solved(body, goal, np.clip(effort, bounds.low, bounds.high), start, before)
 
 
 def _is_better(body: BodyModel, goal: Goal, bounds: Limits, tried: Equilibrium, state: Equilibrium) -> bool:
-    """Return whether a state is nearer, limits of length that are violated included (an exact penalty: the more is missed,
-    the more they count)."""
+    """Return whether a state has a smaller merit: squared error plus an exact penalty on violated length limits, proportional to
+    the current distance."""
     weight = PENALTY * float(np.linalg.norm(goal.miss(state.positions)))
 
     def merit(one: Equilibrium) -> float:

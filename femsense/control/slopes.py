@@ -1,4 +1,4 @@
-"""How wanted coordinates and what the motors wind up change with tensions and pressures, and what a step shows of that."""
+"""The tangent of the controlled coordinates and of the wound-up lengths by tensions and pressures, and its update by steps."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ class Slopes:
     """The linearised problem at a state."""
 
     points: FloatArray
-    """W_pa, the rows' change by unit efforts [m/N, m/Pa], shape (r, a + c)."""
+    """W_pa, derivative of the rows by the efforts [m/N, m/Pa], shape (r, a + c)."""
     wound: FloatArray
-    """W_aa, that of what the cables wind up, shape (a, a + c)."""
+    """W_aa, derivative of the lengths wound up by the motors, shape (a, a + c)."""
     body: FloatArray
-    """How far the farthest node moves by unit efforts [m/N, m/Pa], shape (a + c,)."""
+    """Displacement of the farthest node per unit of effort [m/N, m/Pa], shape (a + c,)."""
     exact: bool
-    """Whether they are of the exact tangent at this state."""
+    """Whether it is the exact tangent at this state."""
 
     def learned(self, change: FloatArray, moved: FloatArray, wound: FloatArray) -> Slopes:
-        """Return the slopes that a step shows, changed as little as possible otherwise (Broyden 1965).
+        """Return the tangent with Broyden's update (1965): the smallest change that reproduces a step.
 
         Arguments:
             change: step of the efforts [N, Pa], shape (a + c,).
-            moved: by how much the rows changed [m], shape (r,).
-            wound: by how much what the cables wind up changed [m], shape (a,).
+            moved: change of the rows [m], shape (r,).
+            wound: change of the lengths wound up by the motors [m], shape (a,).
         """
-        share = (self.points**2).sum(axis=0) * change  # efforts count by what they move, so that units drop out
+        share = (self.points**2).sum(axis=0) * change  # efforts are weighted by the motion they cause, which removes their units
         work = float(share @ change)
         if not work > 0.0:
             return replace(self, exact=False)
@@ -47,21 +47,23 @@ class Slopes:
 
 
 def exact_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[Slopes, Equilibrium]:
-    """Return the slopes of the exact tangent at a state, and the state with the factor of this tangent.
-    Raises FemsenseError where nothing holds the body."""
+    """Return the exact tangent at a state, and the state with its factorisation.
+    Raises FemsenseError if the body is not supported."""
     tangent = tangent_at(body, state)
     return _slopes(body, goal, state, tangent.factor, exact=True), replace(state, factor=tangent.factor)
 
 
-def lent_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> Slopes | None:
-    """Return the slopes by the factor that a state keeps, of a state near by; None where there is none that serves."""
+def approximate_slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> Slopes | None:
+    """Return the tangent by the factorisation that a state keeps from a neighbouring one; None if there is none or it is not usable."""
     return (
-        _slopes(body, goal, state, state.factor, exact=False) if state.factor is not None and may_be_lent(body, state) else None
+        _slopes(body, goal, state, state.factor, exact=False)
+        if state.factor is not None and has_factorisation(body, state)
+        else None
     )
 
 
-def may_be_lent(body: BodyModel, state: Equilibrium) -> bool:
-    """Return whether a state keeps a factor that leads downhill."""
+def has_factorisation(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether a state keeps a positive definite factorisation of matching size."""
     return state.factor is not None and state.factor.negative == 0 and state.factor.size == len(body.free_map.dofs)
 
 

@@ -1,4 +1,4 @@
-"""Inputs of the robot as they are sent, each with its own time, and their values at the time of a frame."""
+"""Inputs of the robot as they are received, with time stamps, interpolated to the times of frames."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from femsense.model.robot import Robot
 from femsense.xr.stream.readings import Readings, readings_of
 
 KEPT = 4096
-"""Values that are kept for frames that are still to come."""
+"""Number of values that are kept for later frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class ActuationLimits:
-    """How inputs are read."""
+    """Timing of the inputs."""
 
     delay_s: float = 0.0
-    """From a command to its effect: the inputs of a frame at time t are those of t − delay."""
+    """Delay from a command to its effect: a frame at time t has the inputs of t − delay."""
     late_s: float = 0.5
-    """Values older than this at the time of a frame are late."""
+    """Inputs older than this at the time of a frame are reported as late."""
 
 
 class Actuation(Protocol):
-    """Where inputs come from."""
+    """A source of inputs."""
 
     columns: tuple[str, ...]
     """Columns of frames.csv that it fills: `cable_<name>` and `chamber_<name>`."""
 
     def at(self, taken_s: float) -> FloatArray | None:
-        """Return the inputs at a time [s, monotonic clock], shape (columns,); None while none are known."""
+        """Return the inputs at a time [s, monotonic clock], shape (columns,); None before the first ones arrive."""
         ...
 
     def notices(self) -> dict[Notice, str]:
-        """Return what is wrong with it."""
+        """Return the current problems of the source."""
         ...
 
     def close(self) -> None: ...
@@ -57,17 +57,17 @@ def columns_of(robot: Robot) -> tuple[str, ...]:
 
 
 def make_actuation(text: str, robot: Robot, limits: ActuationLimits | None = None) -> Actuation:
-    """Return the inputs that a text names.
+    """Return the source of inputs that a text specifies.
 
     Arguments:
         text: `mqtt://HOST/TOPIC`, `udp://HOST:PORT`, `ws://HOST:PORT/…`, `serial:PORT?baud=…`, a CSV file that grows, or
-            `fixed:NAME=VALUE,…`. Messages are JSON objects, column → number, with `time_s` where the sender has a clock, or
-            numbers with commas between.
+            `fixed:NAME=VALUE,…`. Messages are JSON objects, column → number, with `time_s` if the sender has a clock, or
+            numbers separated by commas.
         robot: whose inputs they are.
-        limits: delay, and when values are late.
+        limits: delay, and the age at which inputs are late.
 
     Raises:
-        InputError: no such source, or an input that the robot does not have. MissingDependency.
+        InputError: an unknown source, or an input that the robot does not have. MissingDependency.
     """
     columns = columns_of(robot)
     if text.startswith("fixed"):
@@ -77,7 +77,7 @@ def make_actuation(text: str, robot: Robot, limits: ActuationLimits | None = Non
 
 
 class FixedActuation:
-    """Inputs that do not change."""
+    """Constant inputs."""
 
     def __init__(self, columns: tuple[str, ...], values: FloatArray) -> None:
         self.columns, self._values = columns, values
@@ -87,11 +87,11 @@ class FixedActuation:
         return self._values
 
     def notices(self) -> dict[Notice, str]:
-        """Return none."""
+        """Return no problems."""
         return {}
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resources are held."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -103,7 +103,7 @@ class _Timed:
 
 
 class ReadActuation:
-    """Inputs that another program sends; read in a thread, interpolated at the time of a frame."""
+    """Inputs that another program sends: read in a thread, interpolated at the time of a frame."""
 
     def __init__(
         self,
@@ -115,14 +115,14 @@ class ReadActuation:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start to read.
+        """Start reading.
 
         Arguments:
             columns: in the order of the values of `readings`.
             readings: times [s] on any clock, and values.
-            stop: ends them.
-            source: as people call it.
-            limits: delay, and when values are late.
+            stop: ends the readings.
+            source: its name in messages.
+            limits: delay, and the age at which inputs are late.
             clock: of this machine [s].
         """
         self.columns, self._readings, self._stop, self._source = columns, readings, stop, source
@@ -137,7 +137,7 @@ class ReadActuation:
         self._thread.start()
 
     def at(self, taken_s: float) -> FloatArray | None:
-        """Return the inputs that act at a time, linear between two values; the newest where none is newer, None before the first."""
+        """Return the inputs at a time, linear between two values; after the last one its value, None before the first arrives."""
         wanted = taken_s - self._limits.delay_s
         with self._lock:
             kept, self._asked_s = list(self._kept), wanted
@@ -152,7 +152,7 @@ class ReadActuation:
         return (1.0 - share) * before.values + share * after.values
 
     def notices(self) -> dict[Notice, str]:
-        """Return what is wrong: the source is away, its values are late, or its own clock stands still."""
+        """Return the problems: the source is unreachable, its values are late, or its clock does not advance."""
         found: dict[Notice, str] = {}
         with self._lock:
             newest = self._kept[-1].time_s if self._kept else None
@@ -161,14 +161,16 @@ class ReadActuation:
             found[Notice.ACTUATION_AWAY] = f"{self._source}: {trouble}; the last values hold"
         elif newest is not None and asked - newest > self._limits.late_s:
             found[Notice.ACTUATION_LATE] = (
-                f"{self._source}: the newest values are {asked - newest:.1f} s older than the frame; they hold until others come"
+                f"{self._source}: the newest values are {asked - newest:.1f} s older than the frame; they are used until others arrive"
             )
         if stands is not None and self._clock() - stands > self._limits.late_s:
-            found[Notice.ACTUATION_FROZEN] = f"{self._source}: messages come, but their time_s stands still: is the sender stuck?"
+            found[Notice.ACTUATION_FROZEN] = (
+                f"{self._source}: messages arrive, but their time_s does not advance: check the sender"
+            )
         return found
 
     def close(self) -> None:
-        """Stop to read."""
+        """Stop reading."""
         self._stop.set()
         self._thread.join(2.0)
 
@@ -177,7 +179,7 @@ class ReadActuation:
         for stamp, values in self._readings:
             held = np.where(np.isfinite(values), values, held)
             if stamp <= self._last_stamp:
-                if self._last_stamp - stamp > 1.0:  # the sender began anew
+                if self._last_stamp - stamp > 1.0:  # the sender restarted
                     self._times.restart()
                 else:
                     self._stands_since = self._stands_since or self._clock()
@@ -191,34 +193,34 @@ class ReadActuation:
 
 
 class FrameActuation:
-    """Inputs that come with the frames, as those of a recording do. It keeps nothing: frames are asked for from two threads."""
+    """Inputs that are part of the frames, as in a recording. Stateless, because two threads ask for frames."""
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
 
     def of(self, inputs: Mapping[str, float], where: str) -> FloatArray:
-        """Return the inputs that came with a frame, shape (columns,). Raises InputError where one is missing."""
+        """Return the inputs of a frame, shape (columns,). Raises InputError if one is missing."""
         missing = [name for name in self.columns if name not in inputs]
         if missing:
             raise InputError(
-                "the frames do not bring all inputs of the robot",
+                "the frames do not contain all inputs of the robot",
                 where=where,
                 found=", ".join(inputs) or "none",
                 expected=", ".join(missing),
-                hint="--actuation SOURCE, or the recording of this robot",
+                hint="--actuation SOURCE, or a recording of this robot",
             )
         return np.array([inputs[name] for name in self.columns])
 
     def notices(self) -> dict[Notice, str]:
-        """Return none: they come with the frames."""
+        """Return no problems: the inputs are part of the frames."""
         return {}
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resources are held."""
 
 
 def _fixed(text: str, columns: tuple[str, ...]) -> FloatArray:
-    """Return the values of `NAME=VALUE,…`; inputs that are not named are 0. A name may leave `cable_` or `chamber_` out."""
+    """Return the values of `NAME=VALUE,…`; other inputs are 0. The prefixes `cable_` and `chamber_` are optional."""
     values = dict.fromkeys(columns, 0.0)
     short = {column.partition("_")[2]: column for column in columns}
     for part in filter(None, (part.strip() for part in text.split(","))):

@@ -1,4 +1,4 @@
-"""Which frames a calibration on the fly still needs, and whether one suffices."""
+"""Coverage of the contact-free frames for a calibration during a session, and the test of its accuracy."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ DEGREE = np.pi / 180.0
 
 @dataclass(frozen=True, slots=True)
 class CoverageLimits:
-    """What the contact-free frames of a session have to show."""
+    """Requirements on the contact-free frames of a session."""
 
     frames: int = 12
-    """As many as calibration uses of clouds; four of them at least teach the error of the model."""
+    """The number of frames that calibration uses of clouds; the model error needs at least four of them."""
     apart: float = 0.1
-    """Two frames tell different things if an input differs by this share of its span."""
+    """Two frames are different if an input differs by this share of its range so far."""
     wait_s: float = 0.5
-    """Where the inputs rest, another frame of the same state is taken after this time: it tells noise."""
+    """Time after which a frame with unchanged inputs is kept too: repetitions show the noise."""
     patience: float = 2.0
-    """Inputs that never moved in this many times `frames` are taken for such that cannot."""
+    """After this multiple of `frames`, inputs that never moved are accepted as fixed."""
     position_m: float = 5e-4
     rotation_rad: float = 0.3 * DEGREE
-    """The camera's pose has to be known this well, one standard deviation."""
+    """Largest standard deviations of the camera pose."""
 
 
 class Coverage:
-    """Chooses contact-free frames by their inputs, and says what is missing."""
+    """Selects contact-free frames by their inputs, and states which are missing."""
 
     def __init__(self, columns: Sequence[str], largest: Sequence[float], limits: CoverageLimits | None = None) -> None:
         """Begin without frames.
 
         Arguments:
             columns: names of the inputs.
-            largest: what each may reach, as the robot declares it; inf: not declared.
-            limits: what is needed.
+            largest: the largest value of each input that the robot declares; inf: not declared.
+            limits: the requirements.
         """
         self.limits = limits or CoverageLimits()
         self.columns, self._largest = tuple(columns), np.asarray(largest, dtype=np.float64)
@@ -50,7 +50,7 @@ class Coverage:
         self.wanted = self.limits.frames
 
     def offer(self, time_s: float, values: FloatArray) -> bool:
-        """Return whether a contact-free frame with these inputs is one to keep."""
+        """Return whether to keep a contact-free frame with these inputs."""
         self._low, self._high = np.minimum(self._low, values), np.maximum(self._high, values)
         span = np.maximum(self._high - self._low, 1e-12)
         differs = all((np.abs(values - one) > self.limits.apart * span).any() for one in self._taken)
@@ -62,12 +62,12 @@ class Coverage:
 
     @property
     def count(self) -> int:
-        """Frames that were kept."""
+        """Number of frames that were kept."""
         return len(self._taken)
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """Inputs that have moved by less than `apart` of what they may reach, or not at all."""
+        """Inputs that have moved by less than `apart` of their largest value, or not at all."""
         if not self._taken:
             return self.columns
         span = self._high - self._low
@@ -76,17 +76,17 @@ class Coverage:
 
     @property
     def suffices(self) -> bool:
-        """Whether a calibration may be tried: enough frames, and every input moved, or was waited for in vain."""
+        """Whether to try a calibration: enough frames, and every input has moved or is accepted as fixed."""
         given_up = self.count >= self.limits.patience * self.wanted
         return self.count >= self.wanted and (not self.unmoved or given_up)
 
     def want_more(self, frames: int) -> None:
-        """Ask for more frames: the calibration did not suffice."""
+        """Require more frames, after a calibration that was not accurate enough."""
         self.wanted = self.count + frames
 
     @property
     def missing(self) -> str:
-        """What a person is to do, and how much is missing; empty where nothing is."""
+        """What is still missing, in words; empty if nothing is."""
         if self.suffices:
             return ""
         parts = [f"{max(0, self.wanted - self.count)} of {self.wanted} frames missing"] if self.count < self.wanted else []
@@ -96,7 +96,7 @@ class Coverage:
 
 
 def insufficiency(calibration: Calibration, limits: CoverageLimits | None = None) -> str:
-    """Return why a calibration does not suffice for sensing, in words; empty where it does."""
+    """Return why a calibration is not accurate enough for sensing, in words; empty if it is."""
     wanted = limits or CoverageLimits()
     if not calibration.settled:
         return calibration.status
@@ -105,7 +105,7 @@ def insufficiency(calibration: Calibration, limits: CoverageLimits | None = None
         if position > wanted.position_m or rotation > wanted.rotation_rad:
             camera = f"camera {name}" if name else "the camera"
             return (
-                f"{camera} is known to {1e3 * position:.2f} mm and {rotation / DEGREE:.2f}°, needed are"
+                f"{camera} pose: standard deviations of {1e3 * position:.2f} mm and {rotation / DEGREE:.2f}°, required are"
                 f" {1e3 * wanted.position_m:.2f} mm and {wanted.rotation_rad / DEGREE:.2f}°"
             )
     return ""

@@ -1,4 +1,4 @@
-"""The camera in a process of its own: drivers hang, crash and hold the interpreter's lock, and only a process can be ended."""
+"""The camera in its own process: drivers hang, crash and hold the interpreter lock, and only a process can be killed."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from femsense.live.sources import make_source
 from femsense.live.sources.source import FrameSource, Loss, Opening, SourceInfo, SourceLost
 
 POLL_S = 0.2
-"""How long a source may wait for a frame before the process looks whether it is to stop."""
+"""Longest wait of a source for a frame [s], after which the process checks for a stop request."""
 PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
 class RingPlace:
-    """Answer to an opened source: where its frames go."""
+    """Reply to an opened source: the shared memory for its frames."""
 
     name: str
     slot_bytes: int
 
 
 class Request(StrEnum):
-    """What the session asks of the process."""
+    """Requests of the session to the process."""
 
     NEXT = "next"
-    """One more frame, of a source that waits to be asked."""
+    """One more frame, from a source that waits for requests."""
     STOP = "stop"
 
 
@@ -47,18 +47,18 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The source cannot be used at all: wrong input, or a package that is missing."""
+    """The source is unusable: wrong input, or a missing package."""
 
     error: FemsenseError
 
 
 Report = SourceInfo | int | Lost | Failed
-"""What the process says: opened, the ticket of a frame, lost, failed."""
+"""Messages of the process: opened, the ticket of a frame, lost, failed."""
 
 
 def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: Opening) -> None:
-    """Open a source and write its frames into a ring until the session says stop or is gone; the target of the process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the session's
+    """Open a source and write its frames into a ring until the session requests a stop or ends; the target of the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C
     _end_with_parent()
     try:
         source = make_source(text, as_fast_as_possible=as_fast_as_possible)
@@ -81,7 +81,7 @@ def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: 
 
 
 def _stream(source: FrameSource, pipe: Connection, ring: Ring, *, asked: bool) -> None:
-    """Write frames until told to stop; with `asked` one for each request."""
+    """Write frames until a stop request; with `asked` one per request."""
     try:
         while True:
             if pipe.poll(None if asked else 0) and pipe.recv() is Request.STOP:
@@ -100,7 +100,7 @@ def _once(source: FrameSource, put: Callable[[bytes], None], *, until_one: bool)
 
 
 def _end_with_parent() -> None:
-    """Have Linux end this process with its parent, even while a driver hangs."""
+    """Ask Linux to kill this process when its parent ends, even if a driver hangs."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
 

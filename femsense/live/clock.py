@@ -1,17 +1,17 @@
-"""From stamps of devices to the clock of this machine."""
+"""Mapping from device time stamps to the clock of this machine."""
 
 from __future__ import annotations
 
 DRIFT = 1e-4
-"""Two quartz clocks drift apart by at most this share."""
+"""Largest relative drift between two quartz clocks."""
 
 
 class ClockMap:
-    """Maps stamps of another clock to the monotonic clock of this machine by the fastest arrivals.
+    """Maps stamps of another clock to the monotonic clock of this machine.
 
-    offset = min over messages of (arrival − stamp): transport can delay a message and never speed it up, so that the smallest
-    difference has the least delay in it. The minimum rises by DRIFT a second, so that it follows a clock that runs slower.
-    The shortest transport delay itself cannot be observed and stays in the offset.
+    offset = min over messages of (arrival − stamp): transport can delay a message but not advance it, so the minimum contains the
+    smallest delay. It rises by DRIFT per second to follow a slower clock. The smallest transport delay is not observable and
+    remains in the offset.
     """
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class ClockMap:
         self._at = 0.0
 
     def host_time(self, stamp_s: float, arrived_s: float) -> float:
-        """Return when a stamp was, on the monotonic clock [s], given when its message arrived [s]."""
+        """Return the time of a stamp on the monotonic clock [s], given the arrival time of its message [s]."""
         found = arrived_s - stamp_s
         if self._offset is None:
             self._offset = found
@@ -29,5 +29,5 @@ class ClockMap:
         return stamp_s + self._offset
 
     def restart(self) -> None:
-        """Forget the offset: the other clock was set anew."""
+        """Discard the offset, after the other clock was reset."""
         self._offset = None

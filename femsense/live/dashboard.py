@@ -1,4 +1,4 @@
-"""The terminal of a session: forces with their interval and age, rates, drops, and what a person is to do."""
+"""The terminal view of a session: forces with interval and age, rates, lost frames, and instructions."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 INTERVAL = 1.96
-"""Standard deviations of a 95 % interval."""
+"""Half width of a 95 % interval in standard deviations."""
 REDRAWN_HZ = 8.0
 FRESH_S = 0.5
-KEYS = {"t": "zero: the present state becomes the contact-free reference", "q": "end"}
+KEYS = {"t": "zero: use the present state as contact-free reference", "q": "end"}
 
 
 def draw(snapshot: Snapshot, now_s: float, url: str = "") -> RenderableType:
-    """Return what a terminal shows of a session at a time [s, monotonic clock]."""
+    """Return the terminal view of a session at a time [s, monotonic clock]."""
     from rich.console import Group
     from rich.panel import Panel
     from rich.table import Table
@@ -71,7 +71,7 @@ def _contacts(snapshot: Snapshot, now_s: float) -> RenderableType:
 
 
 def lines(before: Snapshot | None, now: Snapshot, now_s: float) -> Iterator[str]:
-    """Yield what has changed, for output that is no terminal."""
+    """Yield a line for each change, for output that is not a terminal."""
     if before is None or before.phase != now.phase:
         yield str(now.phase)
     if now.todo and (before is None or before.todo != now.todo):
@@ -90,12 +90,12 @@ def lines(before: Snapshot | None, now: Snapshot, now_s: float) -> Iterator[str]
 def shown(
     snapshot: Callable[[], Snapshot], on_key: Callable[[str], None], say: Callable[[str], None], url: str
 ) -> Iterator[None]:
-    """Show a session while the block works: drawn on a terminal, in lines elsewhere.
+    """Show a session during the block: redrawn on a terminal, as lines elsewhere.
 
     Arguments:
         snapshot: of the session.
         on_key: called with a key of KEYS.
-        say: takes a line where there is no terminal.
+        say: receives a line if there is no terminal.
         url: of the page.
     """
     stop = Event()
@@ -134,7 +134,7 @@ def _say_on(snapshot: Callable[[], Snapshot], stop: Event, _url: str, say: Calla
 
 
 def _read_keys(stop: Event, on_key: Callable[[str], None]) -> None:
-    """Read single keys; the terminal is as before at the end."""
+    """Read single keys; the terminal settings are restored at the end."""
     import select
 
     try:

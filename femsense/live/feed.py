@@ -1,4 +1,4 @@
-"""Frames of a camera in the process of the session: the newest one, every skipped one counted, the link kept up."""
+"""Frames of a camera in the process of the session: the newest frame, a count of skipped ones, and reconnection."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ EVENT_OF = {Loss.UNPLUGGED: LinkEvent.UNPLUGGED, Loss.REFUSED: LinkEvent.REFUSED
 
 @dataclass(frozen=True, slots=True)
 class FeedOptions:
-    """How a camera is read."""
+    """Options of reading a camera."""
 
     as_fast_as_possible: bool = False
     ring: str = ""
-    """How the names of its shared memory begin; empty: by the process."""
+    """Prefix of the names of its shared memory; empty: derived from the process."""
     link: LinkLimits = field(default_factory=LinkLimits)
     watch: WatchLimits = field(default_factory=WatchLimits)
 
 
 @dataclass(frozen=True, slots=True)
 class FeedCounts:
-    """Frames so far."""
+    """Number of frames so far."""
 
     received: int = 0
     skipped: int = 0
-    """Received and replaced by a newer one before anybody took them."""
+    """Received and replaced by a newer one before they were used."""
     dropped: int = 0
     """Counted by the device and never delivered."""
 
 
 class CameraFeed:
-    """A camera that is read in a process of its own; a context manager."""
+    """A camera that is read in its own process; a context manager."""
 
     def __init__(
         self, text: str, options: FeedOptions | None = None, *, on_skipped: Callable[[StampedFrame], None] = lambda _: None
@@ -58,13 +58,13 @@ class CameraFeed:
         Arguments:
             text: as `make_source` takes it.
             options: limits.
-            on_skipped: called in the feed's thread with every frame that nobody took.
+            on_skipped: called in the feed's thread with every frame that was not used.
         """
         self.text, self.options = text, options or FeedOptions()
         self.begun_s = time.monotonic()
         self.info: SourceInfo | None = None
         self.error: FemsenseError | None = None
-        """Why the source cannot be used at all."""
+        """Why the source is unusable."""
         self._on_skipped = on_skipped
         self._counts = FeedCounts()
         self._watch = FrameWatch(self.begun_s, self.options.watch, by_stamps=self.options.as_fast_as_possible)
@@ -74,7 +74,7 @@ class CameraFeed:
         self._stop = Event()
         self._last_number = -1
         self._asked = False
-        """Whether a frame was asked for that has not come yet."""
+        """Whether a requested frame has not arrived yet."""
         self._rings = 0
         self._ring: Ring | None = None
         self._process: BaseProcess | None = None
@@ -85,33 +85,33 @@ class CameraFeed:
 
     @property
     def status(self) -> LinkStatus:
-        """Where the link stands."""
+        """State of the link."""
         return self._link.status
 
     @property
     def losses(self) -> int:
-        """How often the stream was lost."""
+        """Number of times that the stream was lost."""
         return self._link.losses
 
     @property
     def counts(self) -> FeedCounts:
-        """Frames so far."""
+        """Number of frames so far."""
         return replace(self._counts, dropped=self._watch.dropped)
 
     @property
     def notices(self) -> dict[Notice, str]:
-        """What is wrong with the frames that come."""
+        """Current problems of the frames."""
         return dict(self._watch.notices)
 
     @property
     def is_over(self) -> bool:
-        """Whether no frame will come any more."""
+        """Whether no more frames will arrive."""
         return self.error is not None or (self.status.state in FINAL and self._newest is None)
 
     def take(self, timeout_s: float) -> StampedFrame | None:
-        """Return the newest frame that was not taken yet; None where none came in time or none will come.
+        """Return the newest frame that was not returned yet; None if none arrives in time or none will arrive.
 
-        Raises FemsenseError where the source cannot be used.
+        Raises FemsenseError if the source is unusable.
         """
         if self.options.as_fast_as_possible and self._newest is None and not self._asked and self._ring is not None:
             self._asked = True
@@ -124,7 +124,7 @@ class CameraFeed:
         return frame
 
     def close(self) -> None:
-        """Stop the camera and end its process, whatever it is doing."""
+        """Stop the camera and end its process, even if it hangs."""
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
@@ -164,7 +164,7 @@ class CameraFeed:
         except (EOFError, OSError):
             self._pipe = None
             if self.status.state not in FINAL and self.error is None:
-                self._link.feed(LinkEvent.DIED, time.monotonic(), "the driver of the camera crashed")
+                self._link.feed(LinkEvent.DIED, time.monotonic(), "the camera driver crashed")
 
     def _take_in(self, report: Report) -> None:
         now = time.monotonic()
@@ -227,7 +227,7 @@ class CameraFeed:
     def _send(self, message: object) -> None:
         pipe = self._pipe
         if pipe is not None:
-            with suppress(OSError):  # its end is seen when it is read
+            with suppress(OSError):  # a closed pipe is noticed when it is read
                 pipe.send(message)
 
     def _end_process(self, *, patience_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Rates and latencies of a session, over the frames of the last seconds."""
+"""Rates and latencies of a session, over the last seconds."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ WINDOW_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """From the exposure of a frame to its forces."""
+    """Time from the exposure of a frame to its forces."""
 
     p50_s: float = NAN
     p95_s: float = NAN
     p99_s: float = NAN
     rate_hz: float = NAN
-    """Frames sensed a second."""
+    """Processed frames per second."""
 
 
 class Stopwatch:
-    """Ages of answers when they came."""
+    """Ages of results at the time they are available."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_s = window_s
         self._kept: deque[tuple[float, float]] = deque()
 
     def add(self, now_s: float, age_s: float) -> None:
-        """Take in an answer of this age [s] at a time [s]."""
+        """Add a result of this age [s] at a time [s]."""
         self._kept.append((now_s, age_s))
         while self._kept[0][0] < now_s - self._window_s:
             self._kept.popleft()
 
     def latency(self) -> Latency:
-        """Return the percentiles and the rate of the last seconds; nan before the first answers."""
+        """Return the percentiles and the rate over the window; nan before the first results."""
         if not self._kept:
             return Latency()
         ages = np.array([age for _, age in self._kept])
@@ -53,23 +53,23 @@ class Stopwatch:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Snapshot:
-    """Everything that a session shows at one moment."""
+    """The displayed state of a session at one moment."""
 
     phase: str
     """One of `Phase`."""
     todo: str
-    """What a person is to do now; empty where nothing is."""
+    """The current instruction to the user; empty if there is none."""
     link: LinkStatus
     camera: str = ""
     link_speed: str = ""
     answer: Answer | None = None
-    """The last one; it stays while the camera is gone."""
+    """The last result; it remains while the camera is lost."""
     taken_s: float = NAN
-    """When its frame was exposed [s, monotonic clock]."""
+    """Exposure time of its frame [s, monotonic clock]."""
     latency: Latency = field(default_factory=Latency)
     counts: FeedCounts = field(default_factory=FeedCounts)
     used: int = 0
     lost: Lost = field(default_factory=Lost)
     notices: dict[Notice, str] = field(default_factory=dict)
     recording: str = ""
-    """Where it is recorded; empty: nowhere."""
+    """Folder of the recording; empty: not recorded."""

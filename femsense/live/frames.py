@@ -1,4 +1,4 @@
-"""A frame as a camera gives it: its images as files would hold them, its stamps, and what is known beside it."""
+"""A camera frame: encoded images, time stamps and metadata."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ NAN = float("nan")
 HEAD = struct.Struct("<4sI")
 MAGIC = b"FSF1"
 FAST_PNG = 1
-"""zlib level of images: three times faster than OpenCV's default and 10 % larger on depth images."""
+"""zlib level of images: three times faster than OpenCV's default, and 10 % larger files for depth images."""
 
 
 class ImageKind(StrEnum):
-    """What an image is; also the folder of a recording that holds it."""
+    """Kind of an image; also the folder of a recording that holds it."""
 
     DEPTH = "depth"
     COLOR = "color"
@@ -29,7 +29,7 @@ class ImageKind(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Image:
-    """One image or cloud of a frame, encoded as its file is."""
+    """One image or cloud of a frame, encoded as in its file."""
 
     kind: ImageKind
     data: bytes
@@ -41,7 +41,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Marker:
-    """A named marker as a camera sees it."""
+    """A named marker as measured by a camera."""
 
     name: str
     xyz_m: tuple[float, float, float]
@@ -51,36 +51,36 @@ class Marker:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RawFrame:
-    """A frame before anything is computed from it."""
+    """A frame before any processing."""
 
     number: int
-    """Counter of the device: a gap means that the device or its link dropped frames."""
+    """Counter of the device: a gap means that the device or its link lost frames."""
     stamp_s: float
     """Time of exposure on the clock of the device [s]."""
     images: tuple[Image, ...] = ()
     markers: tuple[Marker, ...] = ()
     arrived_s: float = NAN
-    """When it reached this machine [s, monotonic clock]."""
+    """Arrival on this machine [s, monotonic clock]."""
     view_stamps_s: tuple[float, ...] = ()
-    """Time of exposure of each camera where there are several [s]."""
+    """Exposure time of each camera if there are several [s]."""
     exposure_s: float = NAN
-    """Exposure time [s]; nan: the device does not report it."""
+    """Exposure duration [s]; nan: not reported by the device."""
     contact_free: bool | None = None
-    """Whether a recording declares the frame contact-free; None: nobody knows."""
+    """Whether a recording declares the frame contact-free; None: unknown."""
     inputs: tuple[tuple[str, float], ...] = ()
-    """Inputs that came with the frame: column of frames.csv (`cable_<name>`, `chamber_<name>`) and value [N], [m] or [Pa]."""
+    """Inputs of the frame: column of frames.csv (`cable_<name>`, `chamber_<name>`) and value [N], [m] or [Pa]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StampedFrame:
-    """A frame on the clock of the session, under a number of its own."""
+    """A frame on the clock of the session, with its session number."""
 
     number: int
-    """Number in the session; grows by one for each frame of the device, dropped ones included."""
+    """Number in the session; it counts all frames of the device, lost ones included."""
     time_s: float
     """Time of exposure since the session began [s]."""
     taken_s: float
-    """The same on the monotonic clock [s]: the age of an answer counts from here."""
+    """The same on the monotonic clock [s]; the age of a result is relative to it."""
     raw: RawFrame
 
 
@@ -104,7 +104,7 @@ def frame_bytes(frame: RawFrame) -> bytes:
 
 
 def read_frame(data: bytes) -> RawFrame:
-    """Return the frame in some bytes. Raises InputError where they are cut off."""
+    """Return the frame encoded in some bytes. Raises InputError if they are truncated."""
     magic, size = HEAD.unpack_from(data)
     if magic != MAGIC:
         raise InputError("not a frame", where="ring", found=repr(magic), expected=repr(MAGIC))
@@ -115,7 +115,7 @@ def read_frame(data: bytes) -> RawFrame:
         images.append(Image(ImageKind(told["kind"]), data[at : at + told["size"]], told["suffix"], told["view"]))
         at += told["size"]
     if at != len(data):
-        raise InputError("a frame that is cut off", where="ring", found=f"{len(data)} bytes", expected=f"{at} bytes")
+        raise InputError("a truncated frame", where="ring", found=f"{len(data)} bytes", expected=f"{at} bytes")
     markers = tuple(Marker(m["name"], tuple(m["xyz_m"]), m["view"]) for m in values.pop("markers"))
     stamps, inputs = tuple(values.pop("view_stamps_s")), tuple((name, value) for name, value in values.pop("inputs"))
     return RawFrame(**values, images=tuple(images), markers=markers, view_stamps_s=stamps, inputs=inputs)

@@ -1,4 +1,4 @@
-"""A recording that grows frame by frame, in memory; its images stand in a scratch folder until they are sensed."""
+"""A recording that grows frame by frame, in memory; its images are kept in a scratch folder until they are processed."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from femsense.model.recording_parts import About, Drives, MarkerRows, Timeline, 
 from femsense.model.robot import Robot
 
 MEMORY = Path("/dev/shm")
-"""Files here are memory: the disk of the session may be slow."""
+"""A file system in memory, because the disk may be slow."""
 PREFIX = "femsense-live-"
 
 
 def make_scratch() -> Path:
-    """Return a new folder for images that wait to be sensed, in memory where the system has such a place."""
+    """Return a new folder for images that wait for processing, in memory if the system supports it."""
     return Path(tempfile.mkdtemp(prefix=PREFIX, dir=MEMORY if MEMORY.is_dir() else None))
 
 
 def image_file(image: Image, number: int, names: Sequence[str]) -> str:
-    """Return where a recording has an image, relative to its folder."""
+    """Return the path of an image in a recording, relative to its folder."""
     view = names[image.view]
     return "/".join([image.kind, *([view] if view else []), f"{number:06d}{image.suffix}"])
 
@@ -40,11 +40,11 @@ def empty_recording(
     """Return a recording without frames.
 
     Arguments:
-        robot: gives cables and chambers.
-        info: of the camera.
+        robot: defines cables and chambers.
+        info: the camera.
         actuation, actuation_zero: as in recording.toml.
-        folder: what it is called by.
-        gravity: whether frames bring gravity.
+        folder: its name in messages.
+        gravity: whether frames contain gravity.
     """
     cables, chambers, views = robot.body.cable_names, robot.body.chamber_names, len(info.camera_names)
     poses = info.T_robot_camera or (None,) * views
@@ -58,7 +58,7 @@ def empty_recording(
 
 
 class GrowingRecording:
-    """Frames that are sensed, as the estimator wants them: a `Recording` that has one more each time."""
+    """A `Recording` to which frames are added as they are processed."""
 
     def __init__(self, empty: Recording, scratch: Path) -> None:
         """`empty`: of `empty_recording`; `scratch`: of `make_scratch`."""
@@ -69,7 +69,7 @@ class GrowingRecording:
         """Add a frame with its inputs and return its index.
 
         Arguments:
-            frame: its images are written to the scratch folder.
+            frame: the frame; its images are written to the scratch folder.
             columns: of the values, as in frames.csv.
             values: inputs [N], [m] or [Pa], and gravity [m/s²], shape (columns,).
             contact_free: whether it is declared contact-free.
@@ -98,7 +98,7 @@ class GrowingRecording:
         return k
 
     def forget(self, k: int) -> None:
-        """Remove the images of a frame that was sensed and teaches nothing any more."""
+        """Remove the images of a frame that is no longer needed."""
         for file in (*self.recording.cloud_files[k], *self.recording.color_files[k]):
             if file is not None:
                 file.unlink(missing_ok=True)
@@ -116,7 +116,7 @@ class GrowingRecording:
 
 
 def remove_scratch(scratch: Path) -> None:
-    """Remove a scratch folder, and shared memory whose name begins with the folder's."""
+    """Remove a scratch folder, and the shared memory whose names begin with the folder's."""
     shutil.rmtree(scratch, ignore_errors=True)
     for left in MEMORY.glob(f"{scratch.name}-*"):
         left.unlink(missing_ok=True)
@@ -127,7 +127,7 @@ def _appended(table: FloatArray, row: Sequence[float]) -> FloatArray:
 
 
 def _with_markers(r: Recording, markers: Sequence[Marker]) -> tuple[tuple[str, ...], list[int], list[int], FloatArray]:
-    """Return all names, and index, view and place of the markers of a frame."""
+    """Return all marker names, and index, view and position of the markers of a frame."""
     names = list(r.marker_names)
     names += [name for name in dict.fromkeys(one.name for one in markers) if name not in names]
     index = [names.index(one.name) for one in markers]

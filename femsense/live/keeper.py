@@ -1,4 +1,4 @@
-"""A process that outlives a session: when the session ends or is killed, it makes the run and tidies up.
+"""A process that outlives a session: when the session ends or is killed, it completes the run and removes temporary files.
 
     python -m femsense.live.keeper SCRATCH [SESSION]
 
@@ -16,14 +16,14 @@ from pathlib import Path
 
 
 def start_keeper(scratch: Path, session: Path | None) -> subprocess.Popen[bytes]:
-    """Start the process that looks after a session; closing its standard input ends it."""
+    """Start the process for a session; closing its standard input triggers it."""
     command = [sys.executable, "-m", "femsense.live.keeper", str(scratch), *([] if session is None else [str(session)])]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True, env=environment)
 
 
 def main(words: list[str]) -> None:
-    """Wait for the end of the session, then finish it."""
+    """Wait for the end of the session, then complete it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     with suppress(OSError):

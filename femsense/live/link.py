@@ -1,4 +1,4 @@
-"""The link to a camera as a state machine: what is the matter, what comes next, and what a person can do about it."""
+"""The link to a camera as a state machine, with the reason of each state and advice to the user."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from enum import StrEnum
 
 
 class LinkState(StrEnum):
-    """Where the link stands."""
+    """State of the link."""
 
     WARMING_UP = "warm-up"
     """Opened or being opened; no frame yet."""
     STREAMING = "streaming"
     TIMED_OUT = "time-out"
-    """No frame for longer than `LinkLimits.time_out_s`; the device is still there."""
+    """No frame for longer than `LinkLimits.time_out_s`; the device is still connected."""
     UNPLUGGED = "unplugged"
     REFUSED = "refused"
-    """The device is there and cannot be used."""
+    """The device is connected and cannot be used."""
     RECONNECTING = "reconnecting"
-    """Opened again after a loss."""
+    """Being opened again after a loss."""
     ENDED = "ended"
-    """A recording is over."""
+    """The recording has ended."""
     GAVE_UP = "gave up"
-    """All retries are used up."""
+    """All retries have failed."""
 
 
 class LinkEvent(StrEnum):
-    """What happens to a link."""
+    """Events of a link."""
 
     OPENED = "opened"
     FRAME = "frame"
@@ -34,17 +34,17 @@ class LinkEvent(StrEnum):
     REFUSED = "refused"
     ENDED = "ended"
     DIED = "died"
-    """The camera's process ended: its driver crashed."""
+    """The camera process ended: its driver crashed."""
 
 
 LOST = (LinkState.TIMED_OUT, LinkState.UNPLUGGED, LinkState.REFUSED, LinkState.RECONNECTING, LinkState.GAVE_UP)
-"""States in which an answer is older than it should be."""
+"""States in which a result is older than it should be."""
 FINAL = (LinkState.ENDED, LinkState.GAVE_UP)
 ADVICE = {
     LinkState.WARMING_UP: "the first frames are on their way",
     LinkState.STREAMING: "",
     LinkState.TIMED_OUT: "check cable and hub; the camera is restarted if none comes",
-    LinkState.UNPLUGGED: "plug the camera in again: the session goes on by itself",
+    LinkState.UNPLUGGED: "reconnect the camera: the session continues by itself",
     LinkState.REFUSED: "close other programs that use the camera",
     LinkState.RECONNECTING: "the camera is being reset and opened again",
     LinkState.ENDED: "",
@@ -54,33 +54,33 @@ ADVICE = {
 
 @dataclass(frozen=True, slots=True)
 class LinkLimits:
-    """When a link counts as lost, and how long it is tried."""
+    """Timing of loss detection and retries."""
 
     warm_up_s: float = 10.0
     """Cameras need up to 5 s for their first frame after a reset."""
     time_out_s: float = 1.0
     restart_s: float = 2.0
-    """After a time-out, a camera that gives nothing for this long is restarted in a new process."""
+    """A camera without frames for this long after a time-out is restarted in a new process."""
     first_retry_s: float = 0.5
     longest_retry_s: float = 5.0
-    """The wait doubles from retry to retry up to this."""
+    """The delay doubles from retry to retry up to this."""
     retries: int = 60
-    """Without a frame in between: about five minutes."""
+    """Maximum number of retries without a frame in between: about five minutes."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkStatus:
-    """A state, and why."""
+    """A state with its reason."""
 
     state: LinkState
     since_s: float
     """[s, monotonic clock]."""
     reason: str = ""
     attempts: int = 0
-    """Retries since the last frame."""
+    """Number of retries since the last frame."""
 
     def text(self, now_s: float) -> str:
-        """Return it in words: state, for how long, why, and what to do."""
+        """Return the status in words: state, duration, reason, and advice."""
         if self.state is LinkState.STREAMING:
             return self.state.value
         parts = [f"{self.state.value} for {now_s - self.since_s:.0f} s", self.reason, ADVICE[self.state]]
@@ -89,19 +89,19 @@ class LinkStatus:
 
 
 class Link:
-    """The state machine. It has no clock and no device: events and times come in, restarts come out."""
+    """The state machine. It has no clock and no device: events and times are its input, restarts its output."""
 
     def __init__(self, now_s: float, limits: LinkLimits | None = None) -> None:
         self.limits = limits or LinkLimits()
         self.status = LinkStatus(LinkState.WARMING_UP, now_s)
         self.losses = 0
-        """How often a stream was lost."""
+        """Number of times that a stream was lost."""
         self._last_frame_s = now_s
         self._started_s = now_s
         self._next_try_s = float("inf")
 
     def feed(self, event: LinkEvent, now_s: float, reason: str = "") -> None:
-        """Take in what happened."""
+        """Process an event."""
         state = self.status.state
         if state in FINAL:
             return
@@ -122,17 +122,17 @@ class Link:
             self._next_try_s = now_s + min(wait, self.limits.longest_retry_s)
 
     def rest(self, now_s: float) -> None:
-        """Let time pass in which nobody wanted a frame: it counts for nothing."""
+        """Exclude a time in which no frame was requested."""
         self._last_frame_s = self._started_s = now_s
 
     def tick(self, now_s: float) -> bool:
-        """Let time pass; return whether the camera is to be started anew now."""
+        """Advance the time; return whether to restart the camera now."""
         status, limits = self.status, self.limits
         if status.state is LinkState.STREAMING and now_s - self._last_frame_s > limits.time_out_s:
             self._count_loss()
             self._enter(LinkState.TIMED_OUT, now_s, f"no frame for {limits.time_out_s:g} s")
         elif status.state is LinkState.TIMED_OUT and now_s - status.since_s > limits.restart_s:
-            return self._retry(now_s, LinkState.RECONNECTING, "no frame came any more")
+            return self._retry(now_s, LinkState.RECONNECTING, "no more frames arrived")
         elif now_s >= self._next_try_s:
             return self._retry(now_s, status.state, status.reason)
         elif self._is_starting and now_s - self._started_s > limits.warm_up_s:
@@ -141,12 +141,12 @@ class Link:
 
     @property
     def _is_starting(self) -> bool:
-        """Whether the camera was started and has given nothing yet."""
+        """Whether the camera was started and has not delivered a frame yet."""
         waits = self._next_try_s < float("inf")
         return not waits and self.status.state not in (*FINAL, LinkState.STREAMING, LinkState.TIMED_OUT)
 
     def _retry(self, now_s: float, state: LinkState, reason: str) -> bool:
-        """Count a retry; there is an end to them."""
+        """Count a retry, and stop at the maximum."""
         attempts = self.status.attempts + 1
         self._next_try_s = float("inf")
         if attempts > self.limits.retries:

@@ -1,4 +1,4 @@
-"""Messages of a session as an MCAP file, JSON with a schema each: Foxglove shows them, `mcap recover` mends a file that was cut off."""
+"""Messages of a session as an MCAP file, JSON with a schema each: readable by Foxglove; `mcap recover` repairs a truncated file."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from femsense.xr.stream.hub import Message
 from femsense.xr.stream.payloads import split_topic
 
 WRITTEN = {"force", "wrench", "inputs", "live"}
-"""Kinds of messages that are JSON and change."""
+"""Kinds of messages that are written: JSON, and not constant."""
 
 
 class McapSink:
-    """A sink of a hub that writes to a file."""
+    """A hub sink that writes to a file."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file. Raises InputError where something stands there, MissingDependency."""
+        """Open a file. Raises InputError if it exists, MissingDependency."""
         try:
             from mcap.writer import Writer
         except ImportError:
@@ -34,7 +34,7 @@ class McapSink:
         self._lock = Lock()
 
     def send(self, messages: tuple[Message, ...]) -> None:
-        """Write what is JSON."""
+        """Write the JSON messages."""
         now = time.time_ns()
         with self._lock:
             for message in messages:

@@ -1,4 +1,4 @@
-"""What a session sends: poses and forces as `stream` has them, wrenches shaped like ROS messages, and the session's own state."""
+"""Messages of a session: poses and forces as in `stream`, wrenches as ROS messages, and the state of the session."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from femsense.xr.stream.publisher import Publisher, PublishOptions
 WRENCH, LIVE = "wrench", "live"
 BONES = 16
 PUSHES = 6
-"""Places at which the body is pushed in turn, so that the skin learns how it deforms."""
+"""Number of places where the body is pushed to generate deformations for the skin."""
 MOVED = 0.1
 """Size of these deformations, relative to the body's diagonal."""
 
 
 class Outlet:
-    """One robot that streams while it is sensed."""
+    """One robot that is streamed during sensing."""
 
     def __init__(self, hub: Hub, robot: Robot, calibration: Calibration | None = None) -> None:
-        """Announce the robot; its skin is fitted to deformations of the linear model, which takes seconds."""
+        """Announce the robot; its skin is fitted to deformations of the linearised model, which takes seconds."""
         self.hub, self.robot = hub, robot
         mesh = robot.body.mesh
         triangles = surface_triangles(mesh)
@@ -61,7 +61,7 @@ class Outlet:
         self._seq = 0
 
     def show(self, answer: Answer, taken_s: float) -> None:
-        """Send an answer; `taken_s`: when its frame was exposed [s, monotonic clock]."""
+        """Send a result; `taken_s`: exposure time of its frame [s, monotonic clock]."""
         self._poses = self._fit(answer.positions[self._used], start=self._poses)
         report = answer.report
         frame = TwinFrame(
@@ -81,18 +81,18 @@ class Outlet:
         self._seq += 1
 
     def tell(self, snapshot: Snapshot, now_s: float) -> None:
-        """Send the state of the session; while the camera gives nothing, the last answer again with its status and its age."""
+        """Send the state of the session; while the camera is lost, repeat the last result with its status and age."""
         if snapshot.answer is None:
             self.publisher.options = replace(self.publisher.options, waits_for=snapshot.todo or snapshot.phase)
         elif self._last is not None and _is_lost(snapshot):
             frame, taken_s = self._last
-            text = f"{snapshot.link.text(now_s)}; the last answer is {now_s - taken_s:.1f} s old"
+            text = f"{snapshot.link.text(now_s)}; the last result is {now_s - taken_s:.1f} s old"
             self.publisher.publish(replace(frame, status=text, read_at=taken_s))
         self.publisher.watch()
         self.hub.publish([Message(topic(self.robot.name, LIVE), live_bytes(snapshot, now_s))])
 
     def end(self) -> None:
-        """Say that nothing more comes."""
+        """Announce the end of the stream."""
         self.publisher.end()
 
 
@@ -107,7 +107,7 @@ def wrench_bytes(seq: int, stamp_s: float, answer: Answer) -> bytes:
 
 
 def live_document(snapshot: Snapshot, now_s: float) -> dict[str, object]:
-    """Return the state of a session as plain values; numbers that are not known are left out."""
+    """Return the state of a session as plain values; unknown numbers are left out."""
     latency, counts = snapshot.latency, snapshot.counts
     values: dict[str, object] = {
         "phase": str(snapshot.phase),
@@ -145,7 +145,7 @@ def _is_lost(snapshot: Snapshot) -> bool:
 
 
 def _typical_states(robot: Robot) -> FloatArray:
-    """Return deformations of the linear model [m], shape (k, n, 3): by each input, and by forces at places all over the surface."""
+    """Return deformations of the linearised model [m], shape (k, n, 3): by each input, and by forces at places spread over the surface."""
     body = robot.body
     state = solve_equilibrium(body)
     tangent = tangent_at(body, state)

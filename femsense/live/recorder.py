@@ -1,7 +1,7 @@
-"""Writes a session while it runs: a recording of the frames that were sensed, one of those that were skipped, and the answers.
+"""Writes a session while it runs: a recording of the processed frames, one of the skipped frames, and the results.
 
-An image stands whole under its name before its row is appended, and a row is appended in one write: killed at any moment, the
-session opens as a recording. Answers go to a journal, from which `finish_session` makes the run.
+An image file is complete before its row is appended, and a row is appended in one write, so that a session killed at any time
+opens as a recording. Results go to a journal, from which `finish_session` writes the run.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ CALIBRATION, DESCRIPTION = "calibration.json", "session.json"
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """Frames that the disk was too slow for."""
+    """Number of frames that were not written because the disk was too slow."""
 
     sensed: int = 0
-    """Without them a replay gives other numbers from there on."""
+    """Processed frames; without them a replay gives different results from there on."""
     skipped: int = 0
 
     @property
@@ -53,24 +53,24 @@ class Lost:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Job:
-    """One frame to be written, or a row of something else."""
+    """A pending write of a frame or of a row."""
 
     run: Callable[[], None]
     has_image: bool
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file beside and rename it."""
+    """Write a file under a temporary name and rename it."""
     part = path.with_name(f".{path.name}.part")
     part.write_bytes(data)
     os.replace(part, path)
 
 
 def check_session(folder: Path) -> None:
-    """Raise InputError where a session cannot be written: sessions are never replaced."""
+    """Raise InputError if a folder is not empty: sessions never replace files."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            "something stands there, and a session replaces nothing",
+            "the folder is not empty, and a session does not replace files",
             where=folder,
             found="a file" if folder.is_file() else ", ".join(sorted(item.name for item in folder.iterdir())[:3]),
             expected="a new folder",
@@ -79,7 +79,7 @@ def check_session(folder: Path) -> None:
 
 
 class Recorder:
-    """Writes one session in a thread of its own."""
+    """Writes one session in its own thread."""
 
     def __init__(
         self,
@@ -91,14 +91,14 @@ class Recorder:
         most_waiting: int = 256,
         write: Callable[[Path, bytes], None] = write_whole,
     ) -> None:
-        """Make the folder and start.
+        """Create the folder and start.
 
         Arguments:
             folder: new.
             empty: the recording without frames.
             columns: of the inputs of a frame, as in frames.csv.
-            about: what session.json says: robot, camera, …
-            most_waiting: frames that may wait for the disk; skipped ones give way at half of it.
+            about: content of session.json: robot, camera, …
+            most_waiting: maximum number of pending frames; skipped frames are dropped from half of it on.
             write: writes one file.
         """
         check_session(folder)
@@ -110,7 +110,7 @@ class Recorder:
         self._has_skipped = False
         self._views = empty.camera_names
         self.error = ""
-        """Why nothing is written any more; empty while all is well."""
+        """Why writing has stopped; empty while it works."""
         (folder / RUN).mkdir(parents=True)
         self._files: dict[str, BinaryIO] = {}
         self._document = recording_document(empty)
@@ -127,7 +127,7 @@ class Recorder:
         return self._lost
 
     def keep(self, frame: StampedFrame, values: FloatArray, *, contact_free: bool) -> bool:
-        """Record a frame that is sensed, with its inputs, shape (columns,); return whether there was room for it."""
+        """Record a processed frame with its inputs, shape (columns,); return whether it was accepted."""
         row = [frame.number, frame.time_s, *values.tolist(), int(contact_free)]
         if not self._put(_Job(lambda: self._frame(self.folder, frame, row), True), self._most):
             self._lost = replace(self._lost, sensed=self._lost.sensed + 1)
@@ -135,7 +135,7 @@ class Recorder:
         return True
 
     def skip(self, frame: StampedFrame, values: FloatArray | None) -> bool:
-        """Record a frame that is not sensed; its inputs where they are known. Return whether there was room for it."""
+        """Record a skipped frame with its inputs, if known; return whether it was accepted."""
         known = np.full(len(self._columns), np.nan) if values is None else values
         row = [frame.number, frame.time_s, *known.tolist()]
         if not self._has_skipped:
@@ -147,24 +147,24 @@ class Recorder:
         return True
 
     def answer(self, answer: Answer) -> None:
-        """Record what the estimator said of a frame."""
+        """Record the result of a frame."""
         contacts = [_plain(asdict(contact)) for contact in answer.contacts]
         line = json.dumps({"report": asdict(answer.report), "contacts": contacts}).encode() + b"\n"
         states = answer.positions.astype("<f4").tobytes()
         self._put(_Job(lambda: self._answer(line, states), False), self._most)
 
     def event(self, time_s: float, kind: str, text: str) -> None:
-        """Record what happened at a time of the session [s]."""
+        """Record an event at a time of the session [s]."""
         self._put(_Job(lambda: self._append(self.folder / EVENTS, [time_s, kind, text]), False), self._most)
 
     def copy(self, file: Path, name: str) -> None:
-        """Put a file into the session; it is there when this returns."""
+        """Copy a file into the session, synchronously."""
         part = self.folder / f".{name}.part"
         shutil.copyfile(file, part)
         os.replace(part, self.folder / name)
 
     def close(self) -> None:
-        """Write what waits, and make the run."""
+        """Complete pending writes and write the run."""
         self._jobs.put(None)
         self._thread.join()
         for file in self._files.values():
@@ -184,8 +184,8 @@ class Recorder:
             try:
                 if not self.error:
                     job.run()
-            except OSError as error:  # a full disk, a folder that is gone: sensing goes on
-                self.error = f"nothing is recorded any more: {error.strerror or error}"
+            except OSError as error:  # for example a full disk: sensing continues
+                self.error = f"recording has stopped: {error.strerror or error}"
             with self._lock:
                 self._waiting -= job.has_image
 
@@ -200,9 +200,9 @@ class Recorder:
             file.parent.mkdir(parents=True, exist_ok=True)
             self._write(file, image.data)
         if any(isinstance(value, float) and np.isnan(value) for value in row):
-            return  # its inputs are not known: an image without a row
+            return  # without inputs an image has no row
         self._append(folder / "frames.csv", row)
-        if frame.raw.markers:  # after the row: a marker of a frame that is not there would be an error
+        if frame.raw.markers:  # after the row: a marker of a missing frame would be an error
             named = self._views != ("",)
             if str(folder / "markers.csv") not in self._files:
                 self._append(folder / "markers.csv", ["frame", *(["camera"] if named else []), "marker", "x_m", "y_m", "z_m"])
@@ -220,7 +220,7 @@ class Recorder:
         self._file(path).write(text.getvalue().encode())
 
     def _file(self, path: Path) -> BinaryIO:
-        """Return an open file that writes each piece at once, whole."""
+        """Return an open file that writes each piece immediately and completely."""
         if str(path) not in self._files:
             self._files[str(path)] = path.open("ab", buffering=0)
         return self._files[str(path)]
@@ -230,9 +230,9 @@ class Recorder:
 
 
 def finish_session(folder: Path) -> bool:
-    """Make the run of a session from its journal, in the session itself and in those that a tare began; return whether there was one.
+    """Write the run of a session from its journal, and those of its tares; return whether there was one.
 
-    A session that was killed is finished like any other: what its journal holds whole counts.
+    Killed sessions are completed too, up to the last complete line of the journal.
     """
     from femsense.calib.files import read_calibration
     from femsense.sensing.run_files import run_inputs, write_run
@@ -244,7 +244,7 @@ def finish_session(folder: Path) -> bool:
     if not journal.is_file() or not states.is_file():
         return False
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # who runs a session was told
+        warnings.simplefilter("ignore")  # shown during the session
         robot = load_robot(json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["robot"])
         recording, calibration = load_recording(folder), read_calibration(folder / CALIBRATION)
     nodes = robot.body.mesh.nodes
@@ -272,7 +272,7 @@ def finish_session(folder: Path) -> bool:
 
 
 def session_run(folder: str | Path) -> Path:
-    """Return the folder of the run of a session, made where a killed session left only its journal; any other folder as it is."""
+    """Return the folder of a session's run, completing a killed session first; any other folder unchanged."""
     root = Path(folder).expanduser()
     if not (root / DESCRIPTION).is_file() or not (root / RUN).is_dir():
         return root

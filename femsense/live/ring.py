@@ -1,7 +1,7 @@
-"""Frames from one process to another through shared memory: the newest ones, and nobody waits for anybody.
+"""Frames from one process to another through shared memory, without locks; old frames are overwritten.
 
-Each slot has a counter that is odd while the slot is written. A reader copies the slot and keeps the copy only if the counter
-did not change and the checksum fits, so neither process needs a lock that the other could die with.
+Each slot has a counter that is odd during a write. A reader copies the slot and keeps the copy only if the counter
+is unchanged and the checksum matches, so that neither process waits for a lock that the other might hold when it dies.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ SLOTS = 8
 
 
 class Ring:
-    """A ring of frames in shared memory; one process writes, one reads."""
+    """A ring of frames in shared memory with one writer and one reader."""
 
     def __init__(self, slot_bytes: int, name: str, *, is_new: bool, slots: int = SLOTS) -> None:
-        """Make a ring, or attach to one that another process made.
+        """Create a ring, or attach to an existing one.
 
         Arguments:
-            slot_bytes: the largest frame that it takes [bytes].
-            name: by which both processes know it.
-            is_new: whether to make it.
-            slots: frames that it holds.
+            slot_bytes: size of the largest frame [bytes].
+            name: of the shared memory, known to both processes.
+            is_new: whether to create it.
+            slots: number of frames that it holds.
         """
         self.slot_bytes, self.slots, self.name = slot_bytes, slots, name
         self._is_own = is_new
@@ -35,7 +35,7 @@ class Ring:
         self._count = 0
 
     def write(self, data: bytes) -> int:
-        """Write a frame over the oldest one; return its ticket for `read`. Raises InputError where it is larger than a slot."""
+        """Overwrite the oldest frame; return the ticket for `read`. Raises InputError if the frame exceeds a slot."""
         if len(data) > self.slot_bytes:
             raise InputError(
                 "a frame is larger than the ring's slots",
@@ -52,7 +52,7 @@ class Ring:
         return ticket
 
     def read(self, ticket: int) -> bytes | None:
-        """Return the frame of a ticket; None where it has been overwritten."""
+        """Return the frame of a ticket; None if it was overwritten."""
         at = self._place(ticket)
         memory = self._buffer
         counter, size, checksum = SLOT.unpack_from(memory, at)
@@ -63,7 +63,7 @@ class Ring:
         return data if same and zlib.crc32(data) == checksum else None
 
     def close(self) -> None:
-        """Let go of the memory; who made the ring frees it."""
+        """Release the memory; its creator removes it."""
         self._memory.close()
         if self._is_own:
             self._memory.unlink()

@@ -1,4 +1,4 @@
-"""The one seam to the estimator: all of `live` asks it for a frame's contacts through `Senser`, and nothing else of it."""
+"""The interface to the estimator: all of `live` uses it through `Senser` only."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ NAN = float("nan")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """What the estimator says of one frame."""
+    """The estimator's result for one frame."""
 
     report: FrameReport
     contacts: tuple[ContactForce, ...]
     """With their tracks."""
     positions: FloatArray
-    """Nodes of the deformed body [m], shape (n, 3); of the frame before where there is no result."""
+    """Nodes of the deformed body [m], shape (n, 3); without a result, those of the last predicted state."""
 
     @property
     def is_ok(self) -> bool:
-        """Whether nothing is wrong with it."""
+        """Whether the status is ok."""
         return self.report.status == Status.OK.value
 
     @property
     def is_contact_free(self) -> bool:
-        """Whether it is a result without any contact."""
+        """Whether the status is ok and there is no contact."""
         return self.is_ok and not self.contacts
 
 
 class Senser:
-    """Senses the frames of a recording that grows, one after another, as `estimate` senses those of one that is complete.
+    """Processes the frames of a growing recording one after another, with the same results as `estimate` on the complete recording.
 
-    The contact-free frames of the recording that it is made with are those that teach noise, pose and model error. Frames that
-    are added later must not be declared contact-free, or `estimate` would learn more than was known here.
+    Noise, pose corrections and model error are estimated from the contact-free frames present at construction. Later frames must not be
+    declared contact-free, or `estimate` would use them too.
     """
 
     def __init__(self, robot: Robot, recording: Recording, calibration: Calibration) -> None:
-        """Learn from the contact-free frames of a recording. Raises as `estimate`."""
+        """Process the contact-free frames of a recording. Raises as `estimate`."""
         with one_blas_thread():
             self._model = learn(make_sensor(robot, recording, calibration))
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
@@ -66,11 +66,11 @@ class Senser:
         """Return contacts and forces of frame k.
 
         Arguments:
-            recording: up to this frame at least.
-            k: index 0 … F − 1; the frames before were sensed in their order.
+            recording: containing at least the frames up to k.
+            k: index 0 … F − 1; earlier frames must have been processed in order.
 
         Returns:
-            the answer; a frame without a result has a status that says why.
+            the result; without contacts and state, the status gives the reason.
         """
         robot = self._model.sensor.robot
         driven = DrivenRobot(robot, drive_of(robot, recording, initial=self._initial))
@@ -90,7 +90,7 @@ class Senser:
         return Answer(frame.report, contacts, self._positions)
 
     def _tracked(self, contact: ContactForce) -> ContactForce:
-        """Return a contact with a number of its own if it begins a track."""
+        """Return a contact with a new track number if it begins a track."""
         if contact.track >= 0:
             return contact
         self._tracks += 1

@@ -1,4 +1,4 @@
-"""A session: frames and inputs come in, a calibration is made on the fly, every newest frame is sensed."""
+"""A session: frames and inputs arrive, a calibration is made, and each newest frame is processed."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from femsense.model.robot import Robot
 
 POLL_S = 0.1
 MORE_FRAMES, MOST_CALIBRATIONS = 6, 4
-"""Frames that are asked for after a calibration that did not suffice, and how often one is tried."""
+"""Number of further frames after a calibration that was not accurate enough, and maximum number of calibrations."""
 
 
 class Phase(StrEnum):
-    """What a session is doing."""
+    """Activity of a session."""
 
     CONNECTING = "connecting"
     COLLECTING = "collecting contact-free frames"
@@ -51,25 +51,25 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """How a session runs."""
+    """Options of a session."""
 
     calibration: Path | None = None
-    """Made on the fly where none is given."""
+    """Calibration file; None: calibrate during the session."""
     folder: Path | None = None
-    """Where it is recorded; None: nowhere."""
+    """Folder of the recording; None: not recorded."""
     actuation: str = "tension"
-    """What the inputs are; a recording says it itself."""
+    """Kind of the inputs; ignored if the inputs come from a recording."""
     actuation_zero: str = "absolute"
     contact_free_frames: int = 8
-    """With a given calibration, and at a tare: frames that show noise and model error before forces are sensed."""
+    """Number of contact-free frames with a given calibration, and after a tare: they determine noise and model error before sensing."""
     most_waiting: int = 256
-    """Frames that may wait for the disk."""
+    """Maximum number of frames that wait for the disk."""
     coverage: CoverageLimits = field(default_factory=CoverageLimits)
     drift: DriftLimits = field(default_factory=DriftLimits)
 
 
 class Session:
-    """One camera, one robot, and everything between a frame and its forces."""
+    """One camera and one robot, from frames to forces."""
 
     def __init__(
         self,
@@ -81,15 +81,15 @@ class Session:
         options: SessionOptions | None = None,
         on_answer: Callable[[Answer, float], None] = lambda _answer, _taken: None,
     ) -> None:
-        """Prepare; `run` does the work.
+        """Prepare; `run` starts the work.
 
         Arguments:
-            robot: with a folder.
-            feed: of the camera; its skipped frames go to `skipped`.
-            scratch: for images that wait to be sensed.
-            actuation: None takes the inputs that come with the frames, as those of a recording do.
+            robot: loaded from a folder.
+            feed: of the camera; connect its skipped frames to `skipped`.
+            scratch: folder for images that wait for processing.
+            actuation: source of the inputs; None: inputs that are part of the frames, as in a recording.
             options: calibration, recording, limits.
-            on_answer: called with each answer and when its frame was exposed [s, monotonic clock].
+            on_answer: called with each result and the exposure time of its frame [s, monotonic clock].
         """
         self.robot, self.feed, self.options = robot, feed, options or SessionOptions()
         self._scratch, self._on_answer = scratch, on_answer
@@ -114,35 +114,35 @@ class Session:
     # For other threads
 
     def stop(self) -> None:
-        """End the session after the frame in hand."""
+        """End the session after the current frame."""
         self._stop.set()
 
     def tare(self) -> None:
-        """Take the present state as contact-free reference, from the next frame on."""
+        """Use the state from the next frame on as contact-free reference."""
         self._tare.set()
 
     def note(self, notice: Notice, text: str) -> None:
-        """Show something that is wrong outside of the session; empty: it is over."""
+        """Show a problem outside of the session; an empty text removes it."""
         if text:
             self._notices[notice] = text
         else:
             self._notices.pop(notice, None)
 
     def skipped(self, frame: StampedFrame) -> None:
-        """Record a frame that nobody took; called by the feed."""
+        """Record a frame that was not used; called by the feed."""
         recorder = self._recorder
         if recorder is not None:
             recorder.skip(frame, None if not self._columns else self._values(frame))
 
     def snapshot(self) -> Snapshot:
-        """Return what the session shows now."""
+        """Return the displayed state of the session."""
         feed, recorder = self.feed, self._recorder
         notices = {**feed.notices, **self._actuation.notices(), **self._notices}
         lost = None if recorder is None else recorder.lost
         if recorder is not None and (recorder.lost.count or recorder.error):
             text = recorder.error or f"{recorder.lost.count} frames: the disk is too slow"
             sensed = (
-                f"; {recorder.lost.sensed} of them were sensed: a replay differs from there on" if recorder.lost.sensed else ""
+                f"; {recorder.lost.sensed} of them were processed: a replay differs from there on" if recorder.lost.sensed else ""
             )
             notices[Notice.RECORDING_LOST] = text + sensed
         shown = Snapshot(
@@ -164,10 +164,10 @@ class Session:
     # In the thread of the session
 
     def run(self) -> None:
-        """Sense until the camera ends or `stop` is called. What was recorded is a recording and a run at the end.
+        """Process frames until the camera ends or `stop` is called. The folder is then a recording and a run.
 
         Raises:
-            FemsenseError: a source that cannot be used, or no calibration that suffices.
+            FemsenseError: an unusable source, or no calibration that is accurate enough.
         """
         try:
             while not self._stop.is_set() and not self.feed.is_over:
@@ -176,7 +176,7 @@ class Session:
             self.close()
 
     def step(self, timeout_s: float) -> Answer | None:
-        """Take the newest frame and do what is next with it; return its answer where it was sensed."""
+        """Process the newest frame according to the phase; return the result if it was sensed."""
         frame = self.feed.take(timeout_s)
         self._log()
         if frame is None or not (frame.raw.images or frame.raw.markers):
@@ -206,7 +206,7 @@ class Session:
         self._phase, self._todo = Phase.ENDED, ""
 
     def _values(self, frame: StampedFrame) -> FloatArray | None:
-        """Return inputs, and gravity where frames bring it, at the time of a frame, shape (columns,); None while unknown."""
+        """Return inputs, and gravity if frames contain it, at the time of a frame, shape (columns,); None while unknown."""
         told, source = dict(frame.raw.inputs), self._actuation
         if isinstance(source, FrameActuation):
             values: FloatArray | None = source.of(told, self.feed.text)
@@ -235,12 +235,12 @@ class Session:
         limits = options.coverage
         if self._calibration is not None:
             limits = replace(limits, frames=max(1, options.contact_free_frames), wait_s=0.0)
-        moving = () if self._calibration is not None else self._actuation.columns  # with a calibration the inputs may rest
+        moving = () if self._calibration is not None else self._actuation.columns  # with a calibration the inputs need not move
         self._coverage = Coverage(moving, _largest(self.robot)[: len(moving)], limits)
         self._phase = Phase.COLLECTING
 
     def _collect(self, frame: StampedFrame, values: FloatArray) -> None:
-        """Keep a frame that tells something, and go on once there are enough."""
+        """Keep a frame that adds coverage, and continue when the coverage suffices."""
         coverage, growing = self._coverage, self._growing
         assert coverage is not None and growing is not None
         known = self._calibration is not None
@@ -255,9 +255,9 @@ class Session:
             self._learn(growing)
 
     def _calibrate(self, recording: Recording, coverage: Coverage) -> bool:
-        """Calibrate from the frames so far; return whether it suffices, and ask for more frames where it does not.
+        """Calibrate with the frames so far; return whether the result is accurate enough, and require more frames if not.
 
-        Raises DataError where it never does.
+        Raises DataError after MOST_CALIBRATIONS attempts.
         """
         self._phase, self._todo = Phase.CALIBRATING, ""
         self._calibrations += 1
@@ -268,18 +268,18 @@ class Session:
             found, lacks = None, " ".join(str(error).split())
         if found is not None and not lacks:
             file = write_calibration(found, self._scratch / CALIBRATION)
-            self._calibration = read_calibration(file)  # as a replay will read it
+            self._calibration = read_calibration(file)  # with the digits that a replay reads
             self._note("calibration", repr(found))
             return True
         if self._calibrations >= MOST_CALIBRATIONS:
-            raise DataError(f"no calibration after {coverage.count} contact-free frames: {lacks}")
-        self._note("calibration", f"does not suffice: {lacks}")
+            raise DataError(f"no sufficient calibration after {coverage.count} contact-free frames: {lacks}")
+        self._note("calibration", f"not sufficient: {lacks}")
         coverage.want_more(MORE_FRAMES)
         self._phase = Phase.COLLECTING
         return False
 
     def _learn(self, growing: GrowingRecording) -> None:
-        """Let the contact-free frames teach, and sense them: a replay senses them, too."""
+        """Estimate noise and model error from the contact-free frames, and process these frames, as a replay does."""
         self._phase, self._todo = Phase.LEARNING, ""
         assert self._calibration is not None
         if self._recorder is not None:
@@ -290,7 +290,7 @@ class Session:
         self._phase = Phase.SENSING
 
     def _begin_tare(self, frame: StampedFrame) -> None:
-        """Begin a new part of the session, whose reference is the present state."""
+        """Begin a new part of the session, with the present state as reference."""
         self._tare.clear()
         self._tares += 1
         self._note("tare", f"reference {self._tares}")
@@ -339,14 +339,14 @@ class Session:
         if drift is not None:
             self.note(Notice.DRIFT, drift.text)
 
-    # What is said
+    # Events
 
     def _note(self, kind: str, text: str) -> None:
         if self._recorder is not None:
             self._recorder.event(time.monotonic() - self.feed.begun_s, kind, text)
 
     def _log(self) -> None:
-        """Record changes of the link and of the notices."""
+        """Record changes of the link and of the problems."""
         status = self.feed.status
         reason = f": {status.reason}" if status.reason and status.state is not LinkState.STREAMING else ""
         now = {"link": f"{status.state.value}{reason}", **{kind.value: text for kind, text in self.snapshot().notices.items()}}
@@ -359,13 +359,13 @@ class Session:
 
 
 def _actuation_of(info: SourceInfo, options: SessionOptions, *, own: bool) -> tuple[str, str]:
-    """Return what the inputs are and what their zero is: as the recording says whose inputs they are, else as asked for."""
+    """Return kind and zero of the inputs: of the recording that contains them, else of the options."""
     if own and info.actuation is not None:
         return info.actuation, info.actuation_zero
     return options.actuation, options.actuation_zero
 
 
 def _largest(robot: Robot) -> Sequence[float]:
-    """Return what each input may reach [N] or [Pa]; inf where nothing is declared."""
+    """Return the largest value of each input [N] or [Pa]; inf if none is declared."""
     cables = [cable.max_tension for cable in robot.body.cables]
     return [*cables, *(getattr(chamber, "max_pressure", np.inf) for chamber in robot.body.chambers)]

@@ -1,4 +1,4 @@
-"""What the stamps of frames reveal: drops, clocks that jump or run back, cameras out of step, exposure that hunts."""
+"""Checks of frame time stamps: lost frames, clocks that jump or run backwards, unsynchronised cameras, unstable exposure."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from femsense.live.clock import ClockMap
 from femsense.live.frames import RawFrame, StampedFrame
 
 TICK_S = 1e-6
-"""Times of a recording increase by at least this."""
+"""Smallest increase of time from frame to frame of a recording [s]."""
 
 
 class Notice(StrEnum):
-    """What is wrong while frames come, or with what goes with them."""
+    """Problems during a session, of frames, inputs, broker or recording."""
 
     DROPPED = "frames dropped"
     STAMPS_BACK = "stamps run back"
@@ -34,32 +34,32 @@ class Notice(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class WatchLimits:
-    """What is still normal."""
+    """Thresholds of the checks."""
 
     jump_s: float = 1.0
-    """Stamps that advance by this much more than the clock of the machine were set."""
+    """A device clock that advances by this much more than the clock of this machine was reset."""
     out_of_step_share: float = 0.5
-    """Of a frame period, by which exposures of two cameras may lie apart."""
+    """Largest offset between the exposures of two cameras, as a share of the frame period."""
     flicker: float = 0.1
-    """Relative standard deviation of the exposure time over `window` frames: auto-exposure that beats with lamps."""
+    """Largest relative standard deviation of the exposure time over `window` frames; beyond it auto-exposure interferes with lamps."""
     window: int = 30
 
 
 class FrameWatch:
-    """Numbers and times of frames on the session's clock, and what is wrong with them."""
+    """Assigns session numbers and times to frames, and reports problems."""
 
     def __init__(self, begun_s: float, limits: WatchLimits | None = None, *, by_stamps: bool = False) -> None:
         """Begin.
 
         Arguments:
-            begun_s: when the session began [s, monotonic clock].
-            limits: what is still normal.
-            by_stamps: times of frames are their stamps, whenever they come: a recording that is not replayed at its own speed.
+            begun_s: start of the session [s, monotonic clock].
+            limits: thresholds.
+            by_stamps: use the stamps as times, independent of arrival: for a recording that is not replayed at its own speed.
         """
         self.limits, self.by_stamps = limits or WatchLimits(), by_stamps
         self.begun_s = begun_s
         self.dropped = 0
-        """Frames that the device counted and never delivered."""
+        """Frames that the device counted and did not deliver."""
         self.notices: dict[Notice, str] = {}
         self._clock = ClockMap()
         self._number = -1
@@ -87,7 +87,7 @@ class FrameWatch:
         return StampedFrame(self._number, self._last_time_s, taken, raw)
 
     def reconnected(self) -> None:
-        """The device begins to count and to stamp anew."""
+        """Reset, because the device restarts its counter and its clock."""
         self._clock.restart()
         self._last = None
 
@@ -95,11 +95,11 @@ class FrameWatch:
         step, waited = raw.stamp_s - last.stamp_s, raw.arrived_s - last.arrived_s
         if step <= 0.0:
             self.notices[Notice.STAMPS_BACK] = (
-                f"from {last.stamp_s:.3f} s to {raw.stamp_s:.3f} s: the device was reset or its clock set; times are mapped anew"
+                f"from {last.stamp_s:.3f} s to {raw.stamp_s:.3f} s: the device or its clock was reset; the time mapping restarts"
             )
             self._clock.restart()
         elif step > waited + self.limits.jump_s:
-            self.notices[Notice.STAMPS_JUMP] = f"by {step:.1f} s within {waited:.2f} s: times are mapped anew"
+            self.notices[Notice.STAMPS_JUMP] = f"by {step:.1f} s within {waited:.2f} s: the time mapping restarts"
             self._clock.restart()
         else:
             self._periods.append(step / max(1, raw.number - last.number))
@@ -109,7 +109,9 @@ class FrameWatch:
             return
         offset, period = float(np.ptp(raw.view_stamps_s)), float(np.median(self._periods))
         if offset > self.limits.out_of_step_share * period:
-            self.notices[Notice.OUT_OF_STEP] = f"{1e3 * offset:.0f} ms of {1e3 * period:.0f} ms: connect their sync cables"
+            self.notices[Notice.OUT_OF_STEP] = (
+                f"{1e3 * offset:.0f} ms of a period of {1e3 * period:.0f} ms: connect their sync cables"
+            )
         else:
             self.notices.pop(Notice.OUT_OF_STEP, None)
 
@@ -120,7 +122,7 @@ class FrameWatch:
         values = np.array(self._exposures)
         if len(values) == self.limits.window and values.std() > self.limits.flicker * values.mean():
             self.notices[Notice.FLICKER] = (
-                f"exposure between {1e3 * values.min():.1f} and {1e3 * values.max():.1f} ms: fix it, or light without flicker"
+                f"exposure between {1e3 * values.min():.1f} and {1e3 * values.max():.1f} ms: fix it, or use light without flicker"
             )
         else:
             self.notices.pop(Notice.FLICKER, None)

@@ -27,7 +27,7 @@ LOOP_FORMAT = "femsense-loop-1"
 
 
 def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], **options: Any) -> dict[str, Any]:
-    """Return what a closed loop is made from; see `run_inputs`."""
+    """Return the inputs of a closed loop as a table; see `run_inputs`."""
     return {
         "robot": robot_input(robot),
         "recordings": [recording_input(recording) for recording in recordings],
@@ -40,7 +40,7 @@ def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Seque
 
 
 def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any] | None = None) -> Path:
-    """Write the improved robot and at last loop.json; return the folder.
+    """Write the improved robot, then loop.json; return the folder.
 
     Raises:
         InputError: see `check_loop_folder`.
@@ -48,20 +48,20 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     check_loop_folder(folder, loop.declared)
     with results_folder(folder, "loop.json") as part:
         declared = (loop.declared.document or {}).get("effects", [])
-        handed_back = replace(loop.declared, name=loop.robot.name, correction=loop.robot.correction)
-        save_robot(handed_back, part, effects=[*declared, *loop.entries])
+        improved = replace(loop.declared, name=loop.robot.name, correction=loop.robot.correction)
+        save_robot(improved, part, effects=[*declared, *loop.entries])
         write_json(part / "loop.json", {**loop.document(), "inputs": inputs or {}, "versions": versions()})
     return Path(folder)
 
 
 def check_loop_folder(folder: str | Path, robot: Robot | None = None) -> None:
-    """Raise InputError where a loop cannot be written.
+    """Raise InputError if a loop cannot be written to a folder.
 
-    That is in a recording, a run or a robot that no loop wrote, at a file, or where other files have its names.
+    Refused are a recording, a run, a robot that no loop wrote, a file, and a folder whose own files have the names of the results.
 
     Arguments:
-        folder: the place.
-        robot: that it begins with: its own folder is none to write into, and no other mesh of its name is replaced.
+        folder: where the loop is to be written.
+        robot: the declared robot; its own folder is refused, and another mesh of the same name is not replaced.
     """
     root = Path(folder).expanduser()
     own = (root / "loop.json").is_file()
@@ -84,11 +84,11 @@ def check_loop_folder(folder: str | Path, robot: Robot | None = None) -> None:
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:
-    """Return the content of loop.json (or of the one in a folder). Raises InputError."""
+    """Return the content of loop.json, or of the one in a folder. Raises InputError."""
     file = Path(path).expanduser()
     return read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)
 
 
 def saved_loop(document: Mapping[str, Any], file: str | Path = "loop.json") -> SavedLoop:
-    """Return the content of loop.json as its types. Raises InputError, with the key and what was found, where it is broken."""
+    """Return the content of loop.json as its type. Raises InputError, with the key and the value, if it is malformed."""
     return validated(SavedLoop, document, Path(file))

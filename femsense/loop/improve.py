@@ -1,6 +1,6 @@
-"""Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data, hand back a better model.
+"""Close the loop: screen all effects, refit the best candidates jointly, accept on held-out data, and return an improved robot.
 
-docs/method/closing-the-loop.md says what follows what, and why.
+The steps and their reasons are in docs/method/closing-the-loop.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.element_order import linear_suffice, need_quadratic, seeks_with_quadratic, with_quadratic
-from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
+from femsense.loop.search.search import distinguishes_effects, new_search, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
 from femsense.loop.search.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
@@ -39,35 +39,35 @@ from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot
 
 ELSE = "record other states than these: more levels of each input, several inputs together, and the way back"
-"""What is said where nothing else is."""
+"""The advice if no better experiment is known."""
 MOST_STEPS = 3
-"""So many things to do next are said where an error is left."""
+"""Number of proposed next steps while an error remains."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImproveOptions:
-    """What the loop tries beside the effects of the list, what it uses of a recording, and how it computes."""
+    """Options of `improve`: further effects, which measurements are used, and how the work is done."""
 
     user_effects: Sequence[str | Path] = ()
-    """Python files of effects that are tried too (docs/effects/own.md); they belong to "all"."""
+    """Python files with user-defined effects (docs/effects/own.md); "all" includes them."""
     measured: str = "auto"
-    """"markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none."""
+    """Which measurements are fitted: "markers", "clouds" or "both"; "auto": the markers of a recording, or its clouds if it has no markers."""
     correct: bool = False
-    """Also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect."""
+    """Also learn an empirical correction of the remaining residual, judged on held-out data. It is neither a cause nor an effect."""
     references: Sequence[Recording] = ()
-    """The same inputs without what is asked for, a weight, say: what the model misses there is taken off all other recordings
-    (`femsense/calib/reference.py`)."""
+    """Recordings of the same inputs without the load of interest (a weight, for example). Their residuals are subtracted from all other
+    recordings (`femsense/calib/reference.py`)."""
     seed: int = 0
-    """Of the permutation test and the bootstrap."""
+    """Seed of the permutation tests and the bootstrap."""
     thresholds: Thresholds = DEFAULTS
-    """What decides; other values than these are for experiments with the loop itself."""
+    """Decision thresholds; values other than the defaults are for studies of the loop itself."""
     effort: Effort = EFFORT
-    """How much is tried."""
+    """Limits of the computational effort."""
     spread: Spread | None = None
-    """Runs what is asked of each of many recordings (`femsense.many.engines.spread`); None: this process does, one after the other."""
+    """Maps a function over many recordings (`femsense.many.engines.spread`); None: in this process, one recording after the other."""
     keep: tuple[str | Path, Mapping[str, Any]] | None = None
-    """A file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
-    something else is not used. It is removed at the end."""
+    """A checkpoint file and the inputs that it must match: an interrupted search resumes from it, and a file with other inputs is ignored. It is
+    removed at the end."""
 
 
 @one_blas_thread()
@@ -86,38 +86,38 @@ def improve(
     Arguments:
         robot: the declared robot.
         recordings: data to fit: markers, clouds or depth images.
-        validation: data to judge on; by default whole sweeps of the recordings are held out.
+        validation: data for the held-out error; by default whole sweeps of `recordings` are held out.
         effects: names to try; by default all.
         without: names to leave out.
-        progress: told what is going on, how much of the work is done, and about how long the rest takes; again every few seconds, perhaps
-            by another thread.
-        options: effects of one's own, what is used of a recording, and how it is computed.
+        progress: called with a text that names the step, the share of the work that is done and the remaining time; repeated every few
+            seconds, possibly from another thread.
+        options: user-defined effects, which measurements are used, computation.
 
     Raises:
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
-    say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
+    work, options = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     searched: Sequence[Recording]
-    searched, others = _split(recordings, validation, how)
-    names, forms = _asked(robot, searched, effects, without, how, apart=not others)
-    searched, validation = _less_references(robot, searched, validation, how, say)
-    rng = np.random.default_rng(how.seed)
-    with Checkpoint(how.keep, forms) as checkpoint, say.watching():
-        data, search = _search(robot, searched, validation, (names, forms), how, checkpoint, say)
+    searched, others = _split(recordings, validation, options)
+    names, forms = _asked(robot, searched, effects, without, options, apart=not others)
+    searched, validation = _less_references(robot, searched, validation, options, work)
+    rng = np.random.default_rng(options.seed)
+    with Checkpoint(options.keep, forms) as checkpoint, work.watching():
+        data, search = _search(robot, searched, validation, (names, forms), options, checkpoint, work)
         if others:
-            search = in_all_recordings(data, search, others, names, _ask(how, forms), say)
-        say.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
-        say("testing what is left")
-        result = conclude(data, search, rng, correct=how.correct)
+            search = in_all_recordings(data, search, others, names, _ask(options, forms), work)
+        work.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
+        work("testing the remaining residual")
+        result = conclude(data, search, rng, correct=options.correct)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t) or ELSE
-    result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed))
+    result = replace(result, next_experiment=record, data=replace(result.data, seed=options.seed))
     if distinguishes_effects(data):
         return result
-    only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"
+    only = "record another state (other inputs, load or direction of gravity): these data repeat too few states to distinguish effects"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
@@ -131,38 +131,38 @@ def search_recordings(
     without: Sequence[str] | None = None,
     options: ImproveOptions | None = None,
 ) -> tuple[Data, Search]:
-    """Return the data with what a search finds in them, before anything is concluded (`conclude`); arguments and errors as of `improve`."""
-    how = options or ImproveOptions()
-    names, forms = _asked(robot, recordings, effects, without, how)
-    recordings, validation = _less_references(robot, recordings, validation, how, lambda text: None)
-    with Checkpoint(how.keep, forms) as checkpoint:
-        return _search(robot, recordings, validation, (names, forms), how, checkpoint, WorkPlan(lambda text: None))
+    """Return the data and the completed search, without the conclusion that `conclude` draws; arguments and errors as of `improve`."""
+    options = options or ImproveOptions()
+    names, forms = _asked(robot, recordings, effects, without, options)
+    recordings, validation = _less_references(robot, recordings, validation, options, lambda text: None)
+    with Checkpoint(options.keep, forms) as checkpoint:
+        return _search(robot, recordings, validation, (names, forms), options, checkpoint, WorkPlan(lambda text: None))
 
 
 def _split(
-    recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions
+    recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions
 ) -> tuple[list[Recording], list[Recording]]:
-    """Return the recordings in which effects are sought, and the others: none where one is judged on, or compared with references."""
-    if validation or how.references or how.measured not in ("auto", "markers"):
+    """Return the recordings that are searched for effects, and the others; none of the latter with `validation` or `references`."""
+    if validation or options.references or options.measured not in ("auto", "markers"):
         return list(recordings), []
-    return recordings_to_search(recordings, how.effort.recordings)
+    return recordings_to_search(recordings, options.effort.recordings)
 
 
-def _ask(how: ImproveOptions, forms: Sequence[Effect]) -> Ask:
-    if how.spread is None:
+def _ask(options: ImproveOptions, forms: Sequence[Effect]) -> Ask:
+    if options.spread is None:
         return asked_here(forms)
-    folder = Path(tempfile.gettempdir()) if how.keep is None else Path(how.keep[0]).parent
-    return asked_elsewhere(how.spread, forms, how.user_effects, folder)
+    folder = Path(tempfile.gettempdir()) if options.keep is None else Path(options.keep[0]).parent
+    return asked_elsewhere(options.spread, forms, options.user_effects, folder)
 
 
 def _less_references(
-    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], how: ImproveOptions, say: Progress
+    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions, work: Progress
 ) -> tuple[Sequence[Recording], Sequence[Recording]]:
-    """Return the recordings less what the model misses of references; as they are where there is none."""
-    if not how.references:
+    """Return the recordings with the residuals of the references subtracted; unchanged if there are none."""
+    if not options.references:
         return recordings, validation
-    say("comparing with the reference")
-    every = less_reference(robot, [*recordings, *validation], how.references)
+    work("comparing with the reference")
+    every = less_reference(robot, [*recordings, *validation], options.references)
     return every[: len(recordings)], every[len(recordings) :]
 
 
@@ -171,18 +171,18 @@ def _asked(
     recordings: Sequence[Recording],
     effects: Sequence[str] | None,
     without: Sequence[str] | None,
-    how: ImproveOptions,
+    options: ImproveOptions,
     *,
     apart: bool = True,
 ) -> tuple[list[str], tuple[Effect, ...]]:
-    """Return the names of the effects that are tried, and all their forms, with those that differ between recordings if `apart`. Raises InputError."""
-    own = tuple(load_own_effect(file) for file in how.user_effects)
+    """Return the names of the effects to try, and all their forms, with one value per recording too if `apart`. Raises InputError."""
+    own = tuple(load_own_effect(file) for file in options.user_effects)
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
     names = (
-        [name for name in names if name != MESH.name] if how.references else names
-    )  # what they leave holds for the declared mesh
+        [name for name in names if name != MESH.name] if options.references else names
+    )  # references cancel the discretisation error of the declared mesh only
     if not names:
         raise InputError(
             "no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists"
@@ -196,89 +196,94 @@ def _search(
     recordings: Sequence[Recording],
     validation: Sequence[Recording],
     asked: tuple[list[str], tuple[Effect, ...]],
-    how: ImproveOptions,
+    options: ImproveOptions,
     checkpoint: Checkpoint,
-    say: WorkPlan,
+    work: WorkPlan,
 ) -> tuple[Data, Search]:
     names, forms = asked
 
-    def begun(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    def calibrated_search(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
         with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
-            data, before, start = calibrated(data, say)
+            data, before, start = calibrated(data, work)
             finer_is_made()
-        data = with_discretisation_error(data, start[-1][1], names, say)
-        say.next_stage()
-        return search_begun((data, before, start), names, refits, quadratic=quadratic)
+        data = with_discretisation_error(data, start[-1][1], names, work)
+        work.next_stage()
+        return new_search((data, before, start), names, refits, quadratic=quadratic)
 
-    def prepared(body: Robot) -> Data:
-        say("reading and calibrating")
-        every = prepare(body, recordings, validation, how.measured)
+    def prepare_data(body: Robot) -> Data:
+        work("reading and calibrating")
+        every = prepare(body, recordings, validation, options.measured)
         return replace(
-            every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort, relative=bool(how.references)
+            every,
+            forms=forms,
+            declared=robot,
+            thresholds=options.thresholds,
+            effort=options.effort,
+            relative=bool(options.references),
         )
 
-    def ready(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    def prepare_search(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
         elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)
         some = some_states(every)
-        with contextlib.suppress(FemsenseError):  # what has no equilibrium in all states is sought in all of them
+        with contextlib.suppress(FemsenseError):  # if an effect has no equilibrium in some state, the search runs in all states
             if some is not None:
-                say.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
-                course = begun(some, names, quadratic, refits)
-                search = search_effects(course, Checkpoint(None), say)[1]
-                say.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
-                course = in_all_states(every, course, search, say)
-                say.next_stage()
-                return course
-        say.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
-        return begun(every, names, quadratic, refits)
+                work.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
+                state = calibrated_search(some, names, quadratic, refits)
+                search = search_effects(state, Checkpoint(None), work)[1]
+                work.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
+                state = in_all_states(every, state, search, work)
+                work.next_stage()
+                return state
+        work.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
+        return calibrated_search(every, names, quadratic, refits)
 
-    return _searched(robot, names, prepared, ready, checkpoint, say)
+    return _searched(robot, names, prepare_data, prepare_search, checkpoint, work)
 
 
 def _searched(
     robot: Robot,
     names: list[str],
-    prepared: Callable[[Robot], Data],
-    ready: Callable[..., SearchProgress],
+    prepare_data: Callable[[Robot], Data],
+    prepare_search: Callable[..., SearchProgress],
     checkpoint: Checkpoint,
-    say: WorkPlan,
+    work: WorkPlan,
 ) -> tuple[Data, Search]:
-    """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
-    is declared. One that was killed goes on where it was."""
+    """Return the data and the search: on quadratic elements if the robot declares linear ones and the data need quadratic ones, else on the declared
+    mesh. An interrupted search resumes."""
     refits: list[RefitRecord] = []
     asks = seeks_with_quadratic(robot, names)
     kept = checkpoint.kept(SearchProgress)
     if kept is not None:
-        say(f"going on where it stopped (effects found: {kept.found})")
+        work(f"resuming the search (effects found: {kept.found})")
     if asks and kept is None:
-        data = prepared(robot)
-        say.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
-        say("asking whether linear elements suffice")
+        data = prepare_data(robot)
+        work.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
+        work("testing whether linear elements suffice")
         record = linear_suffice(data)
         if record is not None:
             names = [name for name in names if name != MESH.name]
-            course = ready(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
-            return search_effects(course, checkpoint, say)
+            state = prepare_search(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
+            return search_effects(state, checkpoint, work)
     if asks and (kept is None or kept.quadratic):
-        with contextlib.suppress(FemsenseError):  # linear elements lock, and converge where quadratic ones fold
-            course = kept or ready(prepared(with_quadratic(robot)), names, quadratic=True, refits=[])
-            data, search = search_effects(course, checkpoint, say)
-            say("asking whether quadratic elements are needed")
+        with contextlib.suppress(FemsenseError):  # linear elements lock, and converge in states where quadratic ones fold
+            state = kept or prepare_search(prepare_data(with_quadratic(robot)), names, quadratic=True, refits=[])
+            data, search = search_effects(state, checkpoint, work)
+            work("testing whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
             if needed:
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
         kept = None
-    return search_effects(kept or ready(prepared(robot), names, quadratic=False, refits=refits), checkpoint, say)
+    return search_effects(kept or prepare_search(prepare_data(robot), names, quadratic=False, refits=refits), checkpoint, work)
 
 
 def states_of(data: Data) -> int:
-    """Return how many different states are fitted."""
+    """Return the number of distinct states that are fitted."""
     return len({state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames})
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:
-    """Begin what takes seconds and waits for nothing: the finer mesh, and loading Open3D, whose rays say what the next experiment's camera sees."""
+    """Start slow independent work early: make the finer mesh, and import Open3D, which casts the rays of the camera of the next experiment."""
     make_finer(robot, names)
     importlib.import_module("open3d")
 
@@ -293,7 +298,7 @@ def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Se
 
 
 def _require_one_that_acts(names: Sequence[str], own: Sequence[Effect], robot: Robot, recordings: Sequence[Recording]) -> None:
-    """Raise InputError where none of the effects that are asked for can act in the recordings: nothing would be tried then."""
+    """Raise InputError if none of the requested effects can act in the recordings."""
     asked = [effect for effect in (*EFFECTS, *own) if effect.name in names]
     drives = sorted({r.actuation for r in recordings})
     if asked and not any(effect.discrete or effect.parameters(robot, control) for effect in asked for control in drives):

@@ -1,7 +1,7 @@
-"""Every number that decides in the loop, in one type that all steps are given with the data (`Data.thresholds`).
+"""The decision thresholds of the loop, in one type that travels with the data (`Data.thresholds`).
 
-A rule is switched off by a value: 0, −inf or inf, as its line says. `benchmarks/ablation.py` does so for one after the other, and
-docs/results/closing-the-loop-ablation.md says what each is worth.
+A rule is disabled by the value that its line names: 0, −inf or inf. `benchmarks/ablation.py` disables one after the other;
+docs/results/closing-the-loop-ablation.md shows the effect of each.
 """
 
 from __future__ import annotations
@@ -11,99 +11,102 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """What decides. dBIC and χ² have no unit; a share is one of what the line names."""
+    """Decision thresholds. dBIC and χ² are dimensionless."""
 
     # --- acceptance of an effect -----------------------------------------------------------------------------------------------
     evidence: float = 10.0
-    """dBIC that an effect needs, to first order to be refitted and then to be named, and by which what is as good as another may be behind."""
+    """Minimum dBIC of an effect: of its linear score to be refitted, of its refit to be accepted. Alternatives within this dBIC of the best count as
+    equally good."""
     sweeps_for: float = 0.5
-    """Standard errors by which sweeps that are left out must be predicted better; −inf: not asked."""
+    """Minimum gain in the log predictive density of left-out sweeps, in its standard errors; −inf: no criterion."""
     held_gain: float = 0.25
-    """Share of the decrease of χ², a row, that must show on held-out rows; −1e9: not asked."""
+    """Minimum decrease of χ² per held-out row, as a share of the decrease per fitted row; −1e9: no criterion."""
     above_mesh: float = 0.5
-    """An effect or input offsets must move the markers by this share of the discretisation error beyond what calibration absorbs; 0: not asked."""
+    """Minimum displacement of the markers by an effect or by input offsets, relative to the discretisation error beyond calibration; 0: no criterion."""
     plainly_worse: float = 1.25
-    """No effect may leave so many times the plain error where fitted; inf: not asked."""
+    """An effect is rejected if it multiplies the unweighted fitted rms by more than this and the held-out rms grows too; inf: no criterion."""
 
     # --- screening and refits --------------------------------------------------------------------------------------------------
     testable: float = 0.1
-    """An effect of which calibration leaves less than this share cannot be tested."""
+    """An effect is testable if calibration leaves at least this share ρ of its field."""
     hinted: float = 0.5
-    """What fields of the model before predict is looked into where it is this share of the gain that is needed; inf: fields are computed anew only then."""
+    """Share of the required gain that a cheap linear prediction must reach before it is followed up: before the fields of the previous model are
+    recomputed, and before a form with more parameters is fitted; inf: never."""
 
     # --- places, swaps and ties --------------------------------------------------------------------------------------------------
     swap: float = 2.0
-    """dBIC by which an alternative must be better to take the place of an effect or of the input offsets, and decrease of χ² for which a place or a time is
-    moved, for each of its numbers; inf: nothing is swapped or moved."""
+    """Minimum dBIC by which an alternative must be ahead to replace an effect or the input offsets, and minimum decrease of χ², per number, to move a
+    place or a time; inf: nothing is replaced or moved."""
 
     # --- discretisation ----------------------------------------------------------------------------------------------------------
     mesh_share: float = 0.7
-    """Standard deviation of the share of the discretisation error that a body shows in all sweeps …"""
+    """Standard deviation of the share of the discretisation error that is common to all sweeps …"""
     mesh_varies: float = 0.25
-    """… of what each sweep adds to it …"""
+    """… of the share that each sweep adds …"""
     mesh_varies_held: float = 0.12
-    """… where cables are held …"""
+    """… of the same if cables are held at a displacement …"""
     mesh_turns: float = 0.07
-    """… and of the entries of a matrix that turns and stretches it."""
+    """… and of the entries of a matrix that rotates and stretches the error."""
 
-    # --- what calibration may move ---------------------------------------------------------------------------------------------
+    # --- values that calibration fits --------------------------------------------------------------------------------------------
     significant: float = 3.0
-    """Standard deviations by which a value must be away from what is declared to be named; and median offsets of markers by which one stands apart."""
+    """Number of standard deviations from the declared value to be reported; and ratio to the median marker offset to count as a single outlier."""
     relevant: float = 0.02
-    """… and share of it, or of a cable's range; 0: not asked."""
+    """… and minimum deviation, as a share of the value or of a cable's range; 0: no criterion."""
 
     # --- verdict -----------------------------------------------------------------------------------------------------------------
     explained: float = 0.8
-    """Share of the excess over the noise that effects must take away where structure is left."""
+    """Minimum share of the mean square beyond the noise that effects must remove if the residual still has structure."""
     structure: float = 0.01
-    """Probability, over all tests together, of calling mere noise structure."""
+    """Level of the structure tests, for all of them together."""
     lacks: float = 2.0
-    """A model that is handed back may leave so many times the mean square that calibration of all nuisances leaves, and one on quadratic elements so many
-    times that on the declared linear ones; inf: not asked."""
+    """Largest ratio of mean squares between the returned model and the model with all nuisance parameters, and between quadratic elements and the
+    declared linear ones; inf: no criterion."""
     resolved: float = 0.01
-    """Share of the body's reach to which cameras and places are believed: noise that nothing tells is no more, and a place may lie so far outside."""
+    """Resolution of the measurements as a share of the body's reach: upper limit of a noise that was not measured, and of the distance of a fitted
+    place from the body."""
     not_worse: float = 1.02
-    """What is handed back may not have a larger held-out error than the declared model but for this factor …"""
+    """Largest ratio of the held-out error of the returned model to that of the declared one …"""
     noisy: float = 1.15
-    """… or, of calibration alone, for this one where χ² says that noise hides a better model."""
+    """… and of calibration alone, if χ² shows that noise hides the improvement."""
 
     # --- what cannot be distinguished ----------------------------------------------------------------------------------------------
     alike: float = 0.95
-    """Fields that agree by this share are said to be alike, and places with such fields count as one; inf: none."""
+    """Two fields with at least this cosine count as collinear, and two places with such fields as the same place; inf: none."""
 
     # --- data ----------------------------------------------------------------------------------------------------------------------
     outlying: float = 4.0
-    """An outlier is off by so many times what nine in ten are off by; inf: there are none …"""
+    """A measurement is an outlier beyond this multiple of the 90 % quantile; inf: no outliers …"""
     far_off: float = 0.05
-    """… and by more than this share of the body's reach."""
+    """… and beyond this share of the body's reach."""
     rare: float = 0.02
-    """Where more than this share is, it is no accident."""
+    """If more than this share of the measurements would be outliers, none is removed: such a deviation is systematic."""
     states: int = 5
-    """So many different states can distinguish effects though what is held out only repeats them."""
+    """Minimum number of distinct fitted states to distinguish effects if held-out states only repeat them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is tried: sizes for speed, which decide nothing where there is time."""
+    """Limits of the computational effort; they affect the speed, not the criteria."""
 
     effects: int = 3
-    """Effects that are added at most."""
+    """Maximum number of effects that are added."""
     refits: int = 6
-    """Candidates that are refitted at the first step; half as many later."""
+    """Number of candidates that are refitted in the first step; half as many later."""
     starts: int = 3
-    """So many seeds of an effect, the best, are improved …"""
+    """Number of seeds of an effect that are improved, the best ones …"""
     rounds: int = 4
-    """… and so often moved to a neighbour that explains more."""
+    """… and maximum number of moves of each to a better neighbour."""
     alternatives: int = 2
-    """So many alternatives to an effect are tried."""
+    """Number of alternatives to an effect that are tried."""
     matchings: int = 6
-    """Times that the rows of clouds are made again, at most."""
+    """Maximum number of times that the rows of clouds are recomputed."""
     recordings: int = 8
-    """Recordings in which effects are sought; where there are more, what is found is fitted to all of them (`search/all_recordings.py`)."""
+    """Number of recordings that are searched for effects; the result is fitted to all of them (`search/all_recordings.py`)."""
     work: int = 20_000
-    """Tetrahedra × states of a recording that are looked at as they are; where there are more, some states speak for all …"""
+    """Tetrahedra × states of a recording that are searched in full; larger ones are searched in representative states."""
 
 
 DEFAULTS = Thresholds()
-"""Those that `femsense improve` uses."""
+"""The defaults of `femsense improve`."""
 EFFORT = Effort()

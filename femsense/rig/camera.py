@@ -1,4 +1,4 @@
-"""A depth camera that looks at triangles: rays, shading, and files. What its depths are off by: `rig/depth_noise.py`."""
+"""A depth camera that looks at triangles: rays, shading, and files. `rig/depth_noise.py` adds its errors."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from femsense.rig.depth_noise import Sight, disturbed
 from femsense.rig.lens import pixel_rays, pixels_of
 
 AMBIENT = 0.35
-"""Share of the light that comes from everywhere."""
+"""Share of the ambient light."""
 COLOR_NOISE = 0.012
 """Standard deviation of a colour channel [1]."""
 TRUE_DEPTH = Observation()
 HIDDEN = 2e-3
-"""A marker is hidden where the ray towards it ends more than this before it [m]."""
+"""A marker is hidden if the ray towards it ends more than this before it [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,25 +40,25 @@ class Shape:
     color: FloatArray
     """Red, green, blue in [0, 1], shape (3,)."""
     albedo: float = 0.6
-    """What it sends back of infrared light [1]."""
+    """Diffuse reflectance in the infrared [1]."""
     gloss: float = 0.0
-    """How likely a depth is lost where it gleams [1]."""
+    """Probability that a depth is lost at a specular reflection [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DepthImage:
-    """What a camera saw."""
+    """The images of a camera."""
 
     depth: FloatArray
-    """Along the optical axis [m], shape (H, W); 0 where nothing was measured."""
+    """Along the optical axis [m], shape (H, W); 0: no measurement."""
     color: npt.NDArray[np.uint8]
     """Red, green, blue, shape (H, W, 3)."""
     shape: IntArray
-    """Index of the shape in each pixel, shape (H, W); −1 where there is none."""
+    """Index of the shape in each pixel, shape (H, W); −1: none."""
 
 
 def camera_of(view: ViewTable, name: str = "", *, noise: CameraNoise | None = None) -> Camera:
-    """Return the lens of a view."""
+    """Return the intrinsics of a view."""
     fy = view.fx if view.fy is None else view.fy
     cx = (view.width - 1) / 2 if view.cx is None else view.cx
     cy = (view.height - 1) / 2 if view.cy is None else view.cy
@@ -78,13 +78,13 @@ def look_at(eye: Sequence[float], target: Sequence[float], *, roll: float = 0.0)
     """Return T_robot_camera of a camera at `eye` [m] that looks at `target` [m], upright (z up), then turned by `roll` [rad].
 
     Raises:
-        InputError: where eye and target are one.
+        InputError: eye and target coincide.
     """
     forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     distance = np.linalg.norm(forward)
     if distance < 1e-9:
         raise InputError(
-            "a camera cannot look at where it stands",
+            "the target of a camera coincides with its position",
             where="camera.target_m",
             found=list(target),
             expected="another place than eye_m",
@@ -106,15 +106,15 @@ def render(
     observation: Observation = TRUE_DEPTH,
     rng: np.random.Generator | None = None,
 ) -> DepthImage:
-    """Return what a camera sees.
+    """Return the images of a camera.
 
     Arguments:
-        camera: the lens.
-        T_robot_camera: where it stands, shape (4, 4).
-        shapes: what there is, robot frame.
-        noise: of the depth; without it depth is exact and without gaps.
+        camera: the intrinsics.
+        T_robot_camera: its pose, shape (4, 4).
+        shapes: the scene, robot frame.
+        noise: of the depth; None: exact depth without gaps.
         observation: measured distance along the ray = depth_scale × true distance + depth_offset.
-        rng: source of the noise; needed where `noise` is given.
+        rng: random numbers of the noise; required with `noise`.
     """
     sight = look(camera, T_robot_camera, shapes)
     color = _shade(shapes, sight.shape, sight.facing, rng)
@@ -128,7 +128,7 @@ def render(
 
 
 def look(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape]) -> Sight:
-    """Return what the rays of a camera at T_robot_camera (4, 4) meet."""
+    """Return the hits of the rays of a camera at T_robot_camera (4, 4)."""
     rays = pixel_rays(camera)
     depth, shape, facing, normal = _cast(rays, T_robot_camera, shapes)
     albedo, gloss = np.array([[s.albedo, s.gloss] for s in shapes] + [[0.0, 0.0]])[shape].transpose(2, 0, 1)
@@ -145,7 +145,7 @@ def cloud_of(image: DepthImage, camera: Camera, which: npt.ArrayLike | None = No
 
 
 def thinned(cloud: PointCloud, size: float) -> PointCloud:
-    """Return one point of each cube of a size [m]: the one that comes first."""
+    """Return the first point in each cube of an edge length [m]."""
     cubes = np.floor(cloud.points / size).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)
     return cloud.select(np.sort(first))
@@ -162,7 +162,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 
 def write_images(depth_file: Path, color_file: Path, image: DepthImage, camera: Camera) -> None:
-    """Write depth as 16-bit and colour as 8-bit PNG. Raises InputError where a depth does not fit into 16 bits."""
+    """Write depth as 16-bit and colour as 8-bit PNG. Raises InputError if a depth exceeds 16 bits."""
     import cv2
 
     units = np.rint(image.depth / camera.depth_unit)
@@ -178,7 +178,7 @@ def write_images(depth_file: Path, color_file: Path, image: DepthImage, camera: 
 
 
 def visible_points(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape], points: FloatArray) -> BoolArray:
-    """Return which points (p, 3) [m], robot frame, are inside the image and not behind anything."""
+    """Return which points (p, 3) [m], robot frame, are inside the image and not occluded."""
     local = transform_points(invert_pose(T_robot_camera), points)
     ahead = local[:, 2] > 1e-6
     safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
@@ -191,7 +191,7 @@ def visible_points(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[
 
 
 def measured_points(T_robot_camera: FloatArray, points: FloatArray, observation: Observation) -> FloatArray:
-    """Return points (p, 3) [m] of the robot frame as the camera measures them without noise, camera frame."""
+    """Return points (p, 3) [m] of the robot frame as the camera measures them, without noise, camera frame."""
     local = transform_points(invert_pose(T_robot_camera), points)
     distance = np.linalg.norm(local, axis=1, keepdims=True)
     return np.asarray(local * (observation.depth_scale + observation.depth_offset / distance))
@@ -203,7 +203,7 @@ def measured_points(T_robot_camera: FloatArray, points: FloatArray, observation:
 def _cast(
     rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Return depth [m] (inf: nothing), index of the shape (−1: nothing), cosine to the normal, shape (…,),
+    """Return depth [m] (inf: no hit), index of the shape (−1: no hit), cosine between ray and normal, shape (…,),
     and the normal towards the camera (…, 3)."""
     import open3d as o3d
 
@@ -232,7 +232,7 @@ def _cast(
 
 
 def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return where rays (k, 3) meet the planes of their triangles, in double precision, as a multiple of the direction."""
+    """Return the intersections of rays (k, 3) with the planes of their triangles, in double precision, as multiples of the direction."""
     a, b, c = (shape.points[shape.triangles[triangle.astype(np.int64), i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     return np.asarray(np.einsum("kc,kc->k", a - start, normal) / np.einsum("kc,kc->k", direction, normal))
@@ -241,7 +241,7 @@ def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, di
 def _shade(
     shapes: Sequence[Shape], shape: IntArray, facing: FloatArray, rng: np.random.Generator | None
 ) -> npt.NDArray[np.uint8]:
-    """Return the colours with a lamp at the camera, shape (H, W, 3)."""
+    """Return the colours under a lamp at the camera, shape (H, W, 3)."""
     palette = np.vstack([np.zeros((1, 3)), *(s.color[None] for s in shapes)])
     color = palette[shape + 1] * (AMBIENT + (1.0 - AMBIENT) * facing)[..., None]
     if rng is not None:

@@ -1,4 +1,4 @@
-"""The cameras of a script: lens, place, and what their depths are off by."""
+"""The cameras of a script: intrinsics, pose, and depth errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIKE: dict[str, dict[str, Any]] = {
         "shiny_deg": 6.0,
     }
 }
-"""Keys that stand for a camera; what a script says itself goes before them."""
+"""Keys that a camera's name sets; explicit keys take precedence."""
 STEREO = {
     *("like", "subpixel_px", "baseline_m", "focal_px", "correlated_share", "correlation_px", "grazing_deg", "flying_share"),
     *("disparity_step_px", "bleeding_px", "shadows", "dark_signal", "shiny_deg"),
@@ -36,44 +36,49 @@ BOTH = {"edge_dropout", "quantum_m"}
 
 
 class NoiseTable(Schema):
-    """What depths are off by: active stereo, time of flight, or nothing."""
+    """Errors of the depth: active stereo, time of flight, or none."""
 
     kind: Literal["stereo", "time-of-flight", "perfect"] = Field("stereo", description='"stereo", "time-of-flight" or "perfect"')
     like: Literal["D415"] | None = Field(
-        None, description='stereo: "D415" sets what stands below as that camera has it, and its pixels and lens'
+        None, description='stereo: "D415" sets the values of that camera for the keys below, and its pixels and lens'
     )
     subpixel_px: NotNegative = Field(0.08, description="stereo: error of the disparity [px], ≥ 0")
     baseline_m: Positive = Field(0.055, description="stereo: distance of the two imagers [m], > 0")
     focal_px: Positive | None = Field(None, description="stereo: focal length of the imagers [px]; by default fx")
     correlated_share: Share = Field(
-        0.5, description="stereo: share of the variance that neighbouring pixels have in common, 0 … 1"
+        0.5, description="stereo: share of the variance that is correlated between neighbouring pixels, 0 … 1"
     )
-    correlation_px: Positive = Field(2.0, description="stereo: width of that common part [px], > 0")
-    disparity_step_px: NotNegative = Field(0.0, description="stereo: disparities come in such steps [px]; 0: any")
-    bleeding_px: NotNegative = Field(0.0, description="stereo: what is near grows over what is behind it by up to this [px]")
-    shadows: bool = Field(False, description="stereo: true: no depth where one of the two imagers does not see")
+    correlation_px: Positive = Field(2.0, description="stereo: width of the correlation [px], > 0")
+    disparity_step_px: NotNegative = Field(0.0, description="stereo: quantisation of the disparity [px]; 0: none")
+    bleeding_px: NotNegative = Field(
+        0.0, description="stereo: maximum width by which the foreground bleeds over the background [px]"
+    )
+    shadows: bool = Field(False, description="stereo: true: no depth where one of the two imagers is occluded")
     dark_signal: NotNegative = Field(
-        0.0, description="stereo: half of the surfaces that send back so little (albedo × cosine) give no depth; 0: all give"
+        0.0, description="stereo: signal (albedo × cosine) at which half of the pixels have no depth; 0: all have one"
     )
     shiny_deg: NotNegative = Field(
-        0.0, description="stereo: surfaces that gleam give no depth within this angle of facing the camera [°]"
+        0.0, description="stereo: angle to the line of sight within which specular surfaces have no depth [°]"
     )
     grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(
-        82.0, description="stereo: surfaces seen more obliquely than this give no depth [°]"
+        82.0, description="stereo: angle of incidence above which surfaces have no depth [°]"
     )
-    edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges that give no depth, 0 … 1")
+    edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges without depth, 0 … 1")
     flying_share: Share = Field(
-        0.05, description="stereo: share of the pixels at depth edges that fall between front and back, 0 … 1"
+        0.05, description="stereo: share of flying pixels at depth edges (depth between foreground and background), 0 … 1"
     )
     amplitude_std_m: NotNegative = Field(
-        0.0005, description="time of flight: noise at 1 m, facing, albedo 1 [m]; it grows as one over the amplitude"
+        0.0005,
+        description="time of flight: standard deviation at 1 m, normal incidence and albedo 1 [m]; proportional to 1 / amplitude",
     )
-    multipath: NotNegative = Field(1.0, description="time of flight: light of one more bounce; 1: as much as there is, 0: none")
-    mixing_px: NotNegative = Field(0.7, description="time of flight: width of what a pixel mixes [px]")
+    multipath: NotNegative = Field(
+        1.0, description="time of flight: factor on the light of second reflections; 1: physical, 0: none"
+    )
+    mixing_px: NotNegative = Field(0.7, description="time of flight: width of the averaging of a pixel [px]")
     least_signal: NotNegative = Field(
-        0.05, description="time of flight: less light than this (1: facing, albedo 1, 1 m) gives no depth"
+        0.05, description="time of flight: minimum amplitude of a depth (1: normal incidence, albedo 1, 1 m)"
     )
-    quantum_m: NotNegative = Field(0.0, description="step of the depth values [m]; 0: the camera's depth_unit_m")
+    quantum_m: NotNegative = Field(0.0, description="quantisation of depth values [m]; 0: the camera's depth_unit_m")
 
     @model_validator(mode="before")
     @classmethod
@@ -91,15 +96,15 @@ class NoiseTable(Schema):
 
 
 class ViewTable(Schema):
-    """A camera and where it stands."""
+    """A camera and its pose."""
 
     like: Literal["D415"] | None = Field(
-        None, description='"D415" sets width, height, fx and noise as that camera has them; keys that are given go before these'
+        None, description='"D415" sets width, height, fx and noise of that camera; explicit keys take precedence'
     )
     width: Annotated[int, Field(gt=0)] = Field(424, description="pixels, > 0")
     height: Annotated[int, Field(gt=0)] = Field(240, description="pixels, > 0")
     fx: Positive = Field(306.0, description="focal length in pixels, > 0")
-    fy: Positive | None = Field(None, description="focal length in pixels, > 0; by default fx")
+    fy: Positive | None = Field(None, description="focal length in pixels, > 0; default: fx")
     cx: float | None = Field(None, description="pixels; by default the middle")
     cy: float | None = Field(None, description="pixels; by default the middle")
     distortion: Annotated[list[float], Field(min_length=4, max_length=8)] = Field(
@@ -109,18 +114,18 @@ class ViewTable(Schema):
         "brown_conrady", description='"brown_conrady", "inverse_brown_conrady" or "kannala_brandt"'
     )
     depth_unit_m: Positive = Field(1e-4, description="metres in one unit of a depth image, > 0")
-    T_robot_camera: Matrix | None = Field(None, description="4 rows of 4 numbers, in place of eye_m and target_m")
-    eye_m: Vector | None = Field(None, description="where the camera stands, robot frame [m]")
-    target_m: Vector | None = Field(None, description="what it looks at, robot frame [m]")
-    roll_deg: float = Field(0.0, description="turn about the line of sight [°]")
-    declare_pose: bool = Field(False, description="true: the recording says where the camera stands")
-    declare_noise: bool = Field(False, description="true: the recording says how large the noise of a depth is")
+    T_robot_camera: Matrix | None = Field(None, description="4 rows of 4 numbers, instead of eye_m and target_m")
+    eye_m: Vector | None = Field(None, description="position of the camera, robot frame [m]")
+    target_m: Vector | None = Field(None, description="point on the optical axis, robot frame [m]")
+    roll_deg: float = Field(0.0, description="rotation about the optical axis [°]")
+    declare_pose: bool = Field(False, description="true: the recording declares the camera pose")
+    declare_noise: bool = Field(False, description="true: the recording declares the depth noise")
     noise: NoiseTable | None = Field(None, description="a table [camera.noise]; without it depth is exact")
 
     @model_validator(mode="before")
     @classmethod
     def _as_that_camera(cls, given: Any) -> Any:
-        """Fill in what `like` stands for: of the camera also where only its noise names it."""
+        """Fill in the keys that `like` sets, of the camera too if only its noise has the name."""
         if not isinstance(given, dict):
             return given
         noise = given.get("noise")

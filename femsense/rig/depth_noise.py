@@ -1,14 +1,15 @@
-"""What a depth camera makes of what it looks at.
+"""Error models of depth cameras.
 
 Stereo. Depth z [m] comes from a disparity d = f b / z,
 so that its standard deviation grows as z² · subpixel / (f · baseline), and disparities come in steps (Grunnet-Jepsen, Sweetser
 and Woodfill, "Tuning depth cameras for best performance", Intel: a well tuned camera shows a subpixel error below 0.1; the D415
-has a baseline of 55 mm and 65° of view). Disparities are matched over windows: neighbours err together, and what is near grows
-over what is behind it. What only one imager sees has no depth. Little light, or a gleam, gives no match.
+has a baseline of 55 mm and 65° of view). Disparities are matched over windows, so that errors of neighbours are correlated and the
+foreground bleeds over the background. Points that only one imager sees have no depth. Low signal and specular reflections
+give no match.
 
-Time of flight. The depth of a pixel is the mean over the light that comes back, weighted by its amplitude:
-over the edge of two surfaces it lies between them, and in a corner light of a second bounce comes later. Noise goes as one over
-the amplitude (Frank et al. 2009, Optical Engineering 48:013602).
+Time of flight. The depth of a pixel is the amplitude-weighted mean over the returning light: mixed pixels at the edge of two surfaces
+lie between them, and in a corner light with a second bounce arrives later. Noise is inversely proportional to the amplitude (Frank
+et al. 2009, Optical Engineering 48:013602).
 """
 
 from __future__ import annotations
@@ -22,39 +23,39 @@ from femsense.model.camera import Camera
 from femsense.rig.camera_tables import NoiseTable
 
 EDGE = 0.01
-"""Neighbouring depths that differ by more than this are an edge [m]."""
+"""Neighbouring depths that differ by more than this form an edge [m]."""
 STEEP = 4.0
-"""Power with which dropouts set in below `dark_signal`."""
+"""Exponent of the dropout probability below `dark_signal`."""
 BLOB_PX = 3.0
-"""Width of the patches in which a matcher loses dark or shiny surfaces [px]."""
+"""Width of the patches in which a stereo matcher loses dark or shiny surfaces [px]."""
 BOUNCES = 300
-"""Places from which light of a second bounce comes."""
+"""Number of source points of second bounces."""
 BATCH = 4096
-"""Pixels whose second bounces are summed at once."""
+"""Number of pixels whose second bounces are summed at once."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sight:
-    """What the rays of a camera meet."""
+    """The hits of the rays of a camera."""
 
     rays: FloatArray
     """With z = 1, camera frame, shape (H, W, 3)."""
     depth: FloatArray
-    """[m], shape (H, W); inf where there is nothing."""
+    """[m], shape (H, W); inf: no hit."""
     shape: IntArray
-    """Index of the shape, shape (H, W); −1 where there is none."""
+    """Index of the shape, shape (H, W); −1: no hit."""
     normal: FloatArray
     """Unit normals towards the camera, camera frame, shape (H, W, 3)."""
     facing: FloatArray
-    """Cosine between ray and normal, shape (H, W); 0 where there is nothing."""
+    """Cosine between ray and normal, shape (H, W); 0: no hit."""
     albedo: FloatArray
-    """In the infrared [1], shape (H, W)."""
+    """Diffuse reflectance in the infrared [1], shape (H, W)."""
     gloss: FloatArray
-    """How likely a gleam is lost [1], shape (H, W)."""
+    """Probability that a depth is lost at a specular reflection [1], shape (H, W)."""
 
 
 def disturbed(sight: Sight, noise: NoiseTable, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    """Return depths as a camera gives them [m], shape (H, W); 0 where it gives none."""
+    """Return depths with the errors of a camera [m], shape (H, W); 0: no measurement."""
     if noise.kind == "perfect":
         return np.where(sight.shape >= 0, sight.depth, 0.0)
     depth = _stereo(sight, noise, camera, rng) if noise.kind == "stereo" else _time_of_flight(sight, noise, rng)
@@ -63,7 +64,7 @@ def disturbed(sight: Sight, noise: NoiseTable, camera: Camera, rng: np.random.Ge
 
 
 def depth_std(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArray:
-    """Return one standard deviation of depths of a stereo camera [m]: z² · subpixel / (f · baseline)."""
+    """Return the standard deviation of depths of a stereo camera [m], σ_z = z² σ_d / (f b)."""
     focal = camera.fx if noise.focal_px is None else noise.focal_px
     return np.asarray(depth**2 * noise.subpixel_px / (focal * noise.baseline_m))
 
@@ -72,7 +73,7 @@ def depth_std(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArra
 
 
 def _stereo(sight: Sight, noise: NoiseTable, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    """Return depths with noise, steps and gaps."""
+    """Return depths with noise, disparity steps and gaps."""
     depth = np.where(sight.shape >= 0, sight.depth, 0.0)
     common = _smooth_noise(depth.shape, noise.correlation_px, rng)
     own = rng.standard_normal(depth.shape)
@@ -95,10 +96,10 @@ def _stereo(sight: Sight, noise: NoiseTable, camera: Camera, rng: np.random.Gene
 
 
 def shadowed(depth: FloatArray, focal_times_baseline: float) -> BoolArray:
-    """Return which pixels of the left imager the right one does not see, shape (H, W).
+    """Return which pixels of the left imager are occluded for the right one, shape (H, W).
 
-    Column u falls on column u − d of the right imager, d = f b / z;
-    it is hidden where a column farther right falls on it or left of it.
+    Column u maps to column u − d of the right imager, d = f b / z;
+    it is hidden if a column farther right maps to it or to the left of it.
     """
     disparity = np.divide(focal_times_baseline, depth, out=np.zeros_like(depth), where=depth > 0)
     column = np.arange(depth.shape[1]) - disparity
@@ -109,7 +110,7 @@ def shadowed(depth: FloatArray, focal_times_baseline: float) -> BoolArray:
 
 
 def _bled(depth: FloatArray, reach: float, rng: np.random.Generator) -> FloatArray:
-    """Return depths in which what is near has grown over what is behind it, here more and there less, by up to `reach` pixels."""
+    """Return depths with depth bleeding: foreground extended over the background by up to `reach` pixels, varying smoothly."""
     from scipy.ndimage import minimum_filter
 
     extent = reach * _uniform(_smooth_noise(depth.shape, BLOB_PX, rng))
@@ -123,15 +124,15 @@ def _bled(depth: FloatArray, reach: float, rng: np.random.Generator) -> FloatArr
 
 
 def _stepped(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArray:
-    """Return depths whose disparities are whole steps."""
+    """Return depths with quantised disparities."""
     unit = (camera.fx if noise.focal_px is None else noise.focal_px) * noise.baseline_m / noise.disparity_step_px
     steps = np.rint(np.divide(unit, depth, out=np.zeros_like(depth), where=depth > 0))
     return np.asarray(np.divide(unit, steps, out=np.zeros_like(depth), where=steps > 0))
 
 
 def _unmatched(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -> BoolArray:
-    """Return where too little light comes back for a match, or a gleam drowns the pattern, shape (H, W): in patches,
-    not in single pixels."""
+    """Return the pixels without a stereo match, shape (H, W): too little signal, or a specular reflection that saturates the pattern; in
+    patches, not in single pixels."""
     chance = _uniform(_smooth_noise(sight.facing.shape, BLOB_PX, rng))
     signal = np.maximum(sight.albedo * sight.facing, 1e-9)
     dark = 1.0 / (1.0 + (signal / noise.dark_signal) ** STEEP) if noise.dark_signal else np.zeros_like(signal)
@@ -143,7 +144,7 @@ def _unmatched(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -> Boo
 
 
 def _time_of_flight(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -> FloatArray:
-    """Return depths with noise, mixed pixels, light of a second bounce and gaps."""
+    """Return depths with noise, mixed pixels, second bounces and gaps."""
     from scipy.ndimage import gaussian_filter
 
     seen = sight.shape >= 0
@@ -162,18 +163,18 @@ def _time_of_flight(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -
 
 
 def second_bounce(sight: Sight, signal: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return by how much light of one more bounce moves the distance along each ray [m], shape (H, W).
+    """Return the increase of the distance along each ray by light with one more bounce [m], shape (H, W).
 
-    Light goes camera → q → p → camera; surfaces are diffuse, and what stands between p and q is not looked for.
-    For the small delays of near surfaces the phase is the mean delay weighted by amplitude.
+    The light path is camera → q → p → camera; surfaces are diffuse, and occlusion between p and q is ignored.
+    For the short delays of near surfaces, the phase is the amplitude-weighted mean delay.
     With the irradiance E_q = cos_q / |q|² at q,
 
-        a_p = albedo_q · E_q · cos_pq cos_qp / (π |p − q|²) · A_q  beside  E_p,       delay = (|q| + |p − q| − |p|) / 2.
+        a_p = albedo_q · E_q · cos_pq cos_qp / (π |p − q|²) · A_q  relative to  E_p,       delay = (|q| + |p − q| − |p|) / 2.
 
     Arguments:
-        sight: what the rays meet.
+        sight: the hits of the rays.
         signal: amplitude of the first bounce, albedo · cos / |p|² [1/m²], shape (H, W).
-        rng: chooses the places q.
+        rng: selects the points q.
     """
     seen = np.flatnonzero(sight.shape >= 0)
     if not len(seen):
@@ -197,8 +198,7 @@ def second_bounce(sight: Sight, signal: FloatArray, rng: np.random.Generator) ->
 def _delay_of(
     p: FloatArray, n: FloatArray, facing: FloatArray, q: FloatArray, m: FloatArray, sent: FloatArray, area: FloatArray
 ) -> FloatArray:
-    """Return the mean delay of points p (k, 3) with normals n by light that places q (j, 3) with normals m send on [m],
-    shape (k,)."""
+    """Return the mean delay at points p (k, 3) with normals n by light from points q (j, 3) with normals m [m], shape (k,)."""
     way = q[None] - p[:, None]
     squared = (way**2).sum(axis=2)
     length = np.sqrt(np.maximum(squared, 1e-18))
@@ -215,7 +215,7 @@ def _delay_of(
 
 
 def _smooth_noise(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> FloatArray:
-    """Return noise of unit variance that neighbours share, shape (H, W)."""
+    """Return spatially correlated noise of unit variance, shape (H, W)."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros((8 * int(np.ceil(width)) + 1,) * 2)
@@ -225,14 +225,14 @@ def _smooth_noise(shape: tuple[int, ...], width: float, rng: np.random.Generator
 
 
 def _uniform(normal: FloatArray) -> FloatArray:
-    """Return what is uniform in [0, 1] of what is normal."""
+    """Return uniform numbers in [0, 1] from standard normal ones, by their distribution function."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(normal))
 
 
 def _edges(depth: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return where depth jumps, and the nearest and farthest depth of each pixel and its neighbours, shape (H, W)."""
+    """Return the pixels at depth edges, and the nearest and farthest depth among each pixel and its neighbours, shape (H, W)."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     front, back = minimum_filter(depth, 3), maximum_filter(depth, 3)

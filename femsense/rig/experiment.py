@@ -1,4 +1,4 @@
-"""A virtual experiment before it is written: its truth, and what its cameras are."""
+"""A virtual experiment before it is written: its true states and its cameras."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from femsense.rig.script import ScriptTable
 from femsense.rig.true_path import TrueFrame
 
 STREAMS = {"placement": 1, "markers": 2, "inputs": 3, "rest": 4, "clouds": 5, "sensors": 6}
-"""Each kind of noise has its own stream of random numbers, so that switching one off leaves the others alone. (7:
+"""Each kind of noise has its own stream of random numbers, so that disabling one does not change the others. (7:
 the motors, `rig/plan.py`.)"""
 DIGITS = 9
-"""Places are written to the nanometre, so that the last bits of a solver do not change a file."""
+"""Decimals of written positions: nanometres, so that rounding errors of a solver do not change a file."""
 MATT = 0.5
-"""Albedo times cosine of what is looked at on the whole: for the noise that a recording declares of a time-of-flight camera."""
+"""Typical albedo times cosine of the scene, for the noise that a recording declares of a time-of-flight camera."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,7 +30,7 @@ class View:
     """A camera of an experiment."""
 
     name: str
-    """"" where there is one."""
+    """"" if there is only one."""
     table: ViewTable
     camera: Camera
     T_robot_camera: FloatArray
@@ -43,28 +43,28 @@ class Experiment:
 
     script: ScriptTable
     plan: Plan
-    """Of the frames that settled."""
+    """Of the converged frames."""
     numbers: IntArray
-    """Which frames of the script these are, shape (F,)."""
+    """Numbers of these frames in the script, shape (F,)."""
     skipped: tuple[tuple[int, str], ...]
-    """Frames of the script that did not settle, and why."""
+    """Frames of the script that did not converge, with the reason."""
     declared: Robot
-    """The robot as the estimator knows it."""
+    """The robot that the estimator is given."""
     robot: Robot
-    """The robot as it is, its markers where they really sit."""
+    """The true robot, with its markers at their true places."""
     views: tuple[View, ...]
     """Its cameras."""
     frames: tuple[TrueFrame, ...]
     marker_positions: FloatArray
     """True positions of the markers [m], shape (F, k, 3), robot frame."""
     visible: BoolArray
-    """Markers that the cameras see, shape (V, F, k)."""
+    """Which markers each camera sees, shape (V, F, k)."""
     folder: Path
-    """Where meshes of objects stand."""
+    """Folder of the object meshes."""
 
 
 def views_of(script: ScriptTable, robot: Robot) -> tuple[View, ...]:
-    """Return the cameras of a script, their noise declared where the script says so. Raises InputError."""
+    """Return the cameras of a script, with declared noise if the script requests it. Raises InputError."""
     result = []
     for name, table in script.views.items():
         T = pose_of(table)
@@ -74,12 +74,12 @@ def views_of(script: ScriptTable, robot: Robot) -> tuple[View, ...]:
 
 
 def rng_of(script: ScriptTable, stream: str, *more: int) -> np.random.Generator:
-    """Return the random numbers of one kind of noise."""
+    """Return the random number generator of one kind of noise."""
     return np.random.default_rng([script.seed, STREAMS[stream], *more])
 
 
 def cloud_frames(script: ScriptTable, plan: Plan) -> list[int]:
-    """Return the indices of the frames that get a cloud, `extra_frames` aside."""
+    """Return the indices of the frames with a cloud, without `extra_frames`."""
     if script.clouds.kind == "none":
         return []
     if script.clouds.frames == "all":
@@ -91,7 +91,7 @@ def cloud_frames(script: ScriptTable, plan: Plan) -> list[int]:
 
 
 def noise_of(table: ViewTable, T_robot_camera: FloatArray, robot: Robot) -> CameraNoise | None:
-    """Return what the recording says of the noise; of time of flight the size at the distance of the body."""
+    """Return the noise that the recording declares; for time of flight its size at the distance of the body."""
     noise = table.noise
     if noise is None or noise.kind == "perfect":
         return None

@@ -1,14 +1,12 @@
-"""Which forces at which places a camera and a robot can resolve, before anyone builds it:
-a bound of Cramér and Rao over the surface.
+"""The forces that a camera can resolve on a robot, before it is built: a Cramér–Rao bound over the surface.
 
-Each point that a camera would measure is a row: the displacement of the surface along its normal there,
-with the noise of the depth along the ray times the cosine of incidence. A force f at a place moves the rows by A f (compliance
-times rows); what is not known beside it moves them by N: camera poses and the modulus, with prior standard deviations.
-The covariance of f is
+Each measured point is a row: the displacement of the surface along its normal, with the noise of the depth along the ray
+times the cosine of incidence. A force f at a place moves the rows by A f (compliance times rows); the nuisance parameters,
+camera poses and modulus, move them by N times their prior standard deviations. The covariance of f is
 
-    (Aᵀ Q A + P)⁻¹,   Q = I − N (Nᵀ N + I)⁻¹ Nᵀ   in whitened rows, P the prior of the force,
+    (Aᵀ Q A + P)⁻¹,   Q = I − N (Nᵀ N + I)⁻¹ Nᵀ,   rows whitened, P the prior of the force.
 
-and the standard deviation of a small force along the normal is the map, in newtons.
+The map shows the standard deviation of a small force along the normal [N].
 """
 
 from __future__ import annotations
@@ -39,24 +37,24 @@ from femsense.rig.scene import body_shape, floor_shape
 from femsense.rig.script import ScriptTable
 
 BATCH = 20
-"""Places whose compliance is solved for at once."""
+"""Number of places whose compliance is solved for at once."""
 RADIUS = 0.02
-"""Radius of the patch of a force, over the diagonal of the body."""
+"""Radius of the patch of a force, relative to the diagonal of the body."""
 
 CLEAR = 1e-4
-"""A place is looked for so far outside of the surface [m]."""
+"""Distance outside of the surface at which the visibility of a place is tested [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unknowns:
-    """What is not known beside the force, and what is expected of it, as standard deviations."""
+    """Prior standard deviations of the nuisance parameters and of the force."""
 
     places: int = 150
-    """At how many places of the surface the bound is computed; between them it is interpolated."""
+    """Number of places of the surface at which the bound is computed; it is interpolated between them."""
     turn_rad: float = 1e-3
-    """Of the pose of each camera, about each axis [rad]."""
+    """Of each camera pose, about each axis [rad]."""
     shift_m: float = 2e-4
-    """Of the pose of each camera, along each axis [m]."""
+    """Of each camera pose, along each axis [m]."""
     modulus: float = 0.03
     """Of the modulus, relative."""
     force_n: float = 2.0
@@ -65,14 +63,14 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Measured:
-    """What cameras measure of a state, to first order about it; r rows, n nodes, v cameras."""
+    """The rows that cameras measure in a state, to first order; r rows, n nodes, v cameras."""
 
     operator: sp.csr_array
     """Maps displacements of the nodes to the rows, shape (r, 3 n)."""
     by_pose: FloatArray
-    """How the rows move with (rotation about the body's middle [rad], shift [m]) of each camera, shape (r, 6 v)."""
+    """Derivative of the rows by (rotation about the body's centre [rad], translation [m]) of each camera, shape (r, 6 v)."""
     std: FloatArray
-    """Standard deviation of each row; rows that err together are counted as fewer [m], shape (r,)."""
+    """Standard deviation of each row, enlarged for the correlation between neighbours [m], shape (r,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,15 +84,15 @@ class ForceMap:
     nodes: IntArray
     """Nodes at which the bound is computed, shape (p,)."""
     rest: FloatArray
-    """Where these are at rest [m], shape (p, 3)."""
+    """Their positions at rest [m], shape (p, 3)."""
     normal_std: FloatArray
     """Of a force along the normal [N], shape (p,)."""
     tangent_std: FloatArray
-    """Of a force along the surface, in the worse direction [N], shape (p,)."""
+    """Of a force along the surface, in the less favourable direction [N], shape (p,)."""
     visible: BoolArray
     """Whether a camera sees the place, shape (p,)."""
     points: int
-    """Points of the robot that the cameras measure in a frame."""
+    """Number of points of the robot that the cameras measure per frame."""
 
     def over_nodes(self) -> FloatArray:
         """Return the standard deviation along the normal at every node [N], interpolated in its logarithm, shape (n,)."""
@@ -109,14 +107,14 @@ class ForceMap:
 def force_map(
     robot: Robot, script: ScriptTable, where: Path = Path("script"), *, frame: int = 0, unknowns: Unknowns | None = None
 ) -> ForceMap:
-    """Return which forces the cameras of a script resolve on the declared robot.
+    """Return the forces that the cameras of a script resolve on the declared robot.
 
     Arguments:
-        robot: the declared robot; effects, mesh and law of the script's truth count for nothing.
+        robot: the declared robot; effects, mesh and law of the script's truth are ignored.
         script: its inputs and cameras are used.
-        where: what messages name.
-        frame: the frame whose inputs hold.
-        unknowns: what is not known beside the force.
+        where: for error messages.
+        frame: the frame whose inputs are used.
+        unknowns: prior standard deviations.
 
     Raises:
         InputError: the script does not fit. DataError: no equilibrium, or no camera sees the robot.
@@ -140,15 +138,15 @@ def force_map(
 def force_bound(
     robot: Robot, state: Equilibrium, measured: Measured, nodes: IntArray, visible: BoolArray, *, unknowns: Unknowns
 ) -> ForceMap:
-    """Return the bound (see the equation at the top of this file) for forces at some nodes of a state.
+    """Return the bound (equation in the module docstring) for forces at some nodes of a state.
 
     Arguments:
         robot: whose body it is.
-        state: about which a small force acts.
+        state: the linearisation point.
         measured: the rows.
-        nodes: surface nodes at which a force may act, shape (p,).
+        nodes: surface nodes of the forces, shape (p,).
         visible: whether a camera sees each of them, shape (p,).
-        unknowns: prior standard deviations of what is estimated with the force.
+        unknowns: prior standard deviations of the parameters estimated with the force.
     """
     surface, count = body_surface(robot.body.mesh), len(state.positions)
     normals = vertex_normals(state.positions, surface.triangles)[nodes]
@@ -183,9 +181,9 @@ def force_bound(
 
 
 def neighbours(noise: NoiseTable | None) -> float:
-    """Return how many pixels count as one, since neighbours err together: the sum of their correlations.
+    """Return the number of pixels that count as one because their errors are correlated: the sum of their correlations.
 
-    A stereo camera's common part is white noise smoothed with a Gaussian of width w; its correlation at a distance r is
+    The correlated part of a stereo camera is white noise smoothed with a Gaussian of width w; its correlation at a distance r is
     exp(−r²/4w²), which sums to 4πw².
     """
     if noise is None or noise.kind != "stereo":
@@ -210,8 +208,8 @@ def _state(robot: Robot, script: ScriptTable, where: Path, frame: int) -> Equili
 
 
 def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equilibrium) -> tuple[RayRows, FloatArray]:
-    """Return the rows of the points that the cameras would measure, and the standard deviation of each,
-    neighbours counted [m], shape (r,)."""
+    """Return the rows of the measured points, and the standard deviation of each with the correlation of neighbours [m],
+    shape (r,)."""
     shapes = [body_shape(robot, state.positions, script.scene)]
     if script.scene.floor_z_m is not None:
         shapes.append(floor_shape(script.scene.floor_z_m, np.array(script.scene.floor_rgb), script.scene.floor_albedo))
@@ -234,13 +232,13 @@ def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equ
 
 
 def _noise_of(view: View, robot: Robot) -> CameraNoise:
-    """Return the noise of a depth; of a perfect camera that of its steps."""
+    """Return the noise of a depth; for a perfect camera that of its quantisation."""
     known = noise_of(view.table, view.T_robot_camera, robot)
     return CameraNoise("tof", floor=view.camera.depth_unit / np.sqrt(12.0)) if known is None else known
 
 
 def _nuisance(robot: Robot, measured: Measured, tangent: Tangent, state: Equilibrium, how: Unknowns) -> FloatArray:
-    """Return how the rows move with one standard deviation of each pose and of the modulus [m], shape (r, 6 v + 1)."""
+    """Return the displacement of the rows by one standard deviation of each pose and of the modulus [m], shape (r, 6 v + 1)."""
     views = measured.by_pose.shape[1] // 6
     pose = measured.by_pose * np.tile(np.repeat([how.turn_rad, how.shift_m], 3), views)
     sag = tangent.respond(internal(robot.body, state.positions, tangent=False).forces[None])

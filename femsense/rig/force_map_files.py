@@ -1,4 +1,4 @@
-"""A map of forces as words, as a picture, as a coloured mesh and as a table."""
+"""A force map as text, picture, coloured mesh and table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from femsense.io.own_files import FORCE_MAP, check_files
 from femsense.rig.force_map import ForceMap
 
 LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Forces of which the table says over how much of the surface they are resolved [N]."""
+"""Forces for which the table states the share of the surface that resolves them [N]."""
 COLORS = "viridis_r"
 
 
@@ -35,11 +35,11 @@ def force_document(found: ForceMap) -> dict[str, Any]:
 
 
 def force_text(found: ForceMap) -> str:
-    """Return the map in words."""
+    """Return the map as text."""
     document = force_document(found)
     lines = [
         (
-            f"Forces: one standard deviation of a small force at a known place, from {found.points} points a frame, at "
+            f"Forces: standard deviation of a small force at a known place, from {found.points} points a frame, at "
             f"{len(found.nodes)} places."
         ),
         "",
@@ -61,7 +61,7 @@ def force_text(found: ForceMap) -> str:
 
 
 def check_force_map(folder: str | Path) -> None:
-    """Raise InputError where a map of forces cannot be written: at a file, or where other files have its names."""
+    """Raise InputError if a force map cannot be written: at a file, or where other files have its names."""
     check_target(folder, folder=True)
     check_files(followed(folder), FORCE_MAP)
 
@@ -94,7 +94,7 @@ def _group(found: ForceMap, which: BoolArray) -> dict[str, Any]:
 
 
 def _scaled(found: ForceMap) -> FloatArray:
-    """Return the logarithm of the standard deviation at every node between the best and the worst place, 0 … 1, shape (n,)."""
+    """Return the logarithm of the standard deviation at every node, scaled to 0 … 1 between best and worst place, shape (n,)."""
     low, high = np.log(found.normal_std.min()), np.log(found.normal_std.max())
     return np.asarray(np.clip((np.log(found.over_nodes()) - low) / max(high - low, 1e-12), 0.0, 1.0))
 

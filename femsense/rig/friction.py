@@ -1,8 +1,8 @@
-"""Friction of a cable at its bends, in rate form: what each bend remembers is the logarithm of its tension ratio.
+"""Friction of a cable at its bends, in rate form: the state of each bend is the logarithm of its tension ratio.
 
-Behind a bend of angle θ the tension is t_out = t_in e^φ with |φ| ≤ μθ. As long as the cable sticks there, t_out stays, so
-that φ falls as ln t_in rises; where φ would leave its interval the cable slides and φ stays at the end (capstan with
-stick). This is the estimator's rule in other variables, written apart from it so that truth and estimate share no code.
+Behind a bend of angle θ the tension is t_out = t_in e^φ with |φ| ≤ μθ. While the cable sticks, t_out is constant, so that
+φ falls as ln t_in rises; at the ends of its interval the cable slides and φ stays (capstan with stick). This is the
+estimator's rule in other variables, implemented independently so that truth and estimate share no code.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from femsense.core.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Grip:
-    """What the bends of a cable remember, from the motor outwards."""
+    """The friction state of the bends of a cable, from the motor outwards."""
 
     ratio: FloatArray
     """φ = ln(t_out / t_in) of each bend [1], shape (b,)."""
     inner: FloatArray
-    """Tension before each bend when that was [N], shape (b,)."""
+    """Tension before each bend in that state [N], shape (b,)."""
 
 
 def new_grip(bends: int) -> Grip:
-    """Return the memory of a cable that has never been pulled."""
+    """Return the state of a cable that was never pulled."""
     return Grip(np.zeros(bends), np.zeros(bends))
 
 
@@ -33,13 +33,13 @@ def pull(grip: Grip, motor_tension: float, bends: FloatArray, coefficient: float
     """Pull a cable at its motor.
 
     Arguments:
-        grip: what the bends remember.
+        grip: the friction state.
         motor_tension: [N], ≥ 0.
         bends: angles from the motor outwards [rad], shape (b,).
         coefficient: μ [1].
 
     Returns:
-        the tension behind each bend from the motor outwards [N], shape (b,), and what the bends remember then.
+        the tension behind each bend from the motor outwards [N], shape (b,), and the new friction state.
     """
     ratio, inner, behind = np.zeros(len(bends)), np.zeros(len(bends)), np.zeros(len(bends))
     tension = float(motor_tension)
@@ -53,7 +53,7 @@ def pull(grip: Grip, motor_tension: float, bends: FloatArray, coefficient: float
 
 
 def _log_growth(before: float, after: float) -> float:
-    """Return ln(after / before); a cable that comes from rest slides outwards, one that goes to rest slides back."""
+    """Return ln(after / before): −∞ or ∞ if one of them is zero, so that the cable slides; 0 if both are."""
     if before > 0 and after > 0:
         return float(np.log(after / before))
     return 0.0 if before == after else float(np.copysign(np.inf, after - before))

@@ -1,5 +1,5 @@
-"""Lenses of the rig: from pixels to rays and back, by OpenCV's own functions,
-so that they share nothing with what reads depth images."""
+"""Camera models of the rig: from pixels to rays and back, by OpenCV's functions, independent of the code that reads
+depth images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from femsense.core.arrays import FloatArray
 from femsense.model.camera import Camera
 
 STEPS = 60
-"""Steps of inverses; at the distortions of depth cameras twenty reach double precision."""
+"""Iterations of the inverses; twenty reach double precision at the distortions of depth cameras."""
 
 
 def pixel_rays(camera: Camera) -> FloatArray:
@@ -21,13 +21,13 @@ def pixel_rays(camera: Camera) -> FloatArray:
 
 
 def pixels_of(camera: Camera, local: FloatArray) -> FloatArray:
-    """Return where points (p, 3) [m] before the camera fall on the image, shape (p, 2)."""
+    """Return the pixels of points (p, 3) [m] in front of the camera, shape (p, 2)."""
     bent = _bent(local[:, :2] / local[:, 2:], camera)
     return np.asarray(bent * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
 
 def _straight(bent: FloatArray, camera: Camera) -> FloatArray:
-    """Return straight rays (n, 2) of those that the lens has bent."""
+    """Return the undistorted rays (n, 2) of distorted ones."""
     k = camera.distortion
     if not np.any(k != 0.0) or not len(bent):
         return bent
@@ -39,7 +39,7 @@ def _straight(bent: FloatArray, camera: Camera) -> FloatArray:
 
 
 def _bent(straight: FloatArray, camera: Camera) -> FloatArray:
-    """Return rays (n, 2) as the lens bends them."""
+    """Return the distorted rays (n, 2) of undistorted ones."""
     k = camera.distortion
     if not np.any(k != 0.0) or not len(straight):
         return straight
@@ -58,7 +58,7 @@ def _polynomial(rays: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def _solved(rays: FloatArray, k: FloatArray) -> FloatArray:
-    """Return the rays that the polynomial takes to these, by fixed-point steps."""
+    """Return the rays that the polynomial maps to these, by fixed-point iteration."""
     found = rays.copy()
     for _ in range(STEPS):
         error = _polynomial(found, k) - rays

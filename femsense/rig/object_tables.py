@@ -1,4 +1,4 @@
-"""What touches the body in a script: objects, and contacts that follow a path."""
+"""Contacts in a script: objects, and contacts that follow a path."""
 
 from __future__ import annotations
 
@@ -22,30 +22,28 @@ KEYS: dict[str, set[str]] = {
     "mesh": {"mesh", "unit"},
     "weight": {"radius_m", "stick_m", "mass_kg"},
 }
-"""What each kind says of its form."""
+"""Keys of the shape of each kind."""
 NEEDED = {"plate": {"size_m"}, "box": {"size_m"}, "mesh": {"mesh", "unit"}, "weight": {"mass_kg"}}
 
 
 class ObjectTable(Schema):
-    """Something that can touch the body. Where it touches is its lowest point; its own z axis points away from the body."""
+    """An object that can touch the body. Its contact point is its lowest point; its z axis points away from the body."""
 
-    name: Annotated[str, Field(min_length=1, description="a name, each object its own")]
+    name: Annotated[str, Field(min_length=1, description="a unique name")]
     kind: Literal["ball", "rod", "plate", "box", "mesh", "weight"] = Field(
-        description=(
-            '"ball" or "plate" on a stick, "rod" that lies across, "box", "mesh", or "weight" on a stick that stands on the body'
-        )
+        description=('"ball" or "plate" on a stick, transverse "rod", "box", "mesh", or "weight" on a stick on the body')
     )
     radius_m: Positive = Field(0.008, description="of a ball, of a rod, or of the tip of a weight's stick [m], > 0")
     length_m: Positive = Field(0.15, description="of a rod [m], > 0")
-    size_m: Vector | None = Field(None, description="of a plate or box: along its x, its y, and its thickness [m]")
+    size_m: Vector | None = Field(None, description="of a plate or box: extent along x and y, and thickness [m]")
     stick_m: NotNegative = Field(0.12, description="length of the stick of a ball, plate or weight [m]; 0: none")
-    mesh: str | None = Field(None, description="of a mesh: a closed surface in a file beside the script")
+    mesh: str | None = Field(None, description="of a mesh: file with a closed surface, relative to the script")
     unit: Literal["m", "cm", "mm"] | None = Field(None, description='of a mesh: "m", "cm" or "mm"')
     mass_kg: Positive | None = Field(None, description="of a weight [kg], > 0")
     color_rgb: Color = Field([0.85, 0.30, 0.12], description=COLOR)
-    albedo: Share = Field(0.5, description="what it sends back of infrared light, 0 … 1; black foam 0.03, white paper 0.9")
-    gloss: Share = Field(0.0, description="how likely a depth is lost where it gleams, 0 … 1")
-    declared: bool = Field(False, description="true: it stands in [[tools]] of the recording (ball, rod or mesh)")
+    albedo: Share = Field(0.5, description="infrared albedo, 0 … 1; black foam 0.03, white paper 0.9")
+    gloss: Share = Field(0.0, description="probability of a missing depth at specular reflections, 0 … 1")
+    declared: bool = Field(False, description="true: declared in [[tools]] of the recording (ball, rod or mesh)")
 
     @model_validator(mode="after")
     def _form_fits_kind(self) -> ObjectTable:
@@ -62,38 +60,36 @@ class ObjectTable(Schema):
 
 
 class ContactTable(Schema):
-    """Something that presses on the body and is not declared in the recording."""
+    """An undeclared contact on the body."""
 
     sweep: str = Field(description="label of the sweep in which it acts")
     point_m: Vector | None = Field(None, description=PLACE)
     path_m: Annotated[list[Vector], Field(min_length=2)] | None = Field(
-        None, description="in place of point_m: places along which it slides, evenly over the frames of the sweep [m]"
+        None, description="instead of point_m: path of a sliding contact, at constant speed over the frames of the sweep [m]"
     )
     force_n: NotNegative | list[NotNegative] | None = Field(
         None,
-        description="newton, one number or one a frame of the sweep, ≥ 0; at 0 it does not touch; by default the weight of a weight",
+        description="normal force [N], one number or one per frame of the sweep, ≥ 0; 0: no contact; default of a weight: its own weight",
     )
-    direction: Vector | None = Field(None, description="direction of the force; by default into the surface, as it turns")
+    direction: Vector | None = Field(
+        None, description="direction of the force; default: into the surface, following its rotation"
+    )
     tangent: NotNegative | list[NotNegative] = Field(
-        0.0, description="force along the surface over force into it, one number or one a frame of the sweep, ≥ 0"
+        0.0, description="ratio of tangential to normal force, one number or one per frame of the sweep, ≥ 0"
     )
-    tangent_direction: Vector | None = Field(
-        None, description="where the force along the surface points; by default along path_m"
-    )
+    tangent_direction: Vector | None = Field(None, description="direction of the tangential force; default: along path_m")
     radius_m: Positive | None = Field(
         None,
-        description="the force is spread over the surface within this distance [m], > 0; by default as the object presses, else 0.006",
+        description="radius of the loaded surface [m], > 0; default: computed from the object, without one 0.006",
     )
-    object: str | None = Field(None, description="name of what touches, one of [[objects]]; else a probe")
-    along: Vector | None = Field(
-        None, description="where the object's x axis points (a rod lies along it); by default along path_m"
-    )
+    object: str | None = Field(None, description="name of the object, one of [[objects]]; default: a probe")
+    along: Vector | None = Field(None, description="direction of the object's x axis (the axis of a rod); default: along path_m")
     away_m: NotNegative | list[NotNegative] | None = Field(
         None,
-        description="distance from the surface in frames without force [m], one number or one a frame; by default it is gone",
+        description="distance from the surface in frames without force [m], one number or one per frame; default: the object is absent",
     )
-    shown: bool = Field(True, description="false: the camera does not see what touches")
-    probe: Literal["sphere", "cylinder"] = Field("sphere", description='what the camera sees: "sphere" or "cylinder"')
+    shown: bool = Field(True, description="false: the object is invisible to the camera")
+    probe: Literal["sphere", "cylinder"] = Field("sphere", description='shape of the probe: "sphere" or "cylinder"')
     probe_radius_m: Positive = Field(0.006, description="[m], > 0")
 
     @model_validator(mode="after")

@@ -1,6 +1,6 @@
-"""Objects that touch the body: their form, how they lie against it, and what the camera sees of them.
+"""Objects that touch the body: their shape, their pose on the body, and their appearance.
 
-An object's own frame: where it touches is the origin, its body lies along +z, its length along x.
+Frame of an object: the origin is its contact point, it extends along +z, and its length is along x.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ BRASS = 8500.0
 """Density of a weight [kg/m³]."""
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 FAR = 1.0
-"""Rays that look for the lower side of a mesh begin so far below [m]."""
+"""Distance below a mesh at which the rays that sample its lower side start [m]."""
 Surface = tuple[FloatArray, IntArray]
 
 
 def object_surface(item: ObjectTable, folder: Path) -> Surface:
     """Return points [m] and outward triangles of an object in its own frame.
 
-    Raises InputError where its file is missing or broken.
+    Raises InputError if its file is missing or malformed.
     """
     if item.kind == "mesh":
         return _mesh(folder / str(item.mesh), str(item.unit))
@@ -46,18 +46,18 @@ def object_surface(item: ObjectTable, folder: Path) -> Surface:
 
 
 def object_shape(item: ObjectTable, surface: Surface, T_robot_object: FloatArray) -> Shape:
-    """Return what the camera sees of an object where it stands."""
+    """Return the shape of an object at its pose, for the camera."""
     color = np.asarray(item.color_rgb, dtype=float)
     return Shape(transform_points(T_robot_object, surface[0]), surface[1], color, item.albedo, item.gloss)
 
 
 def pressing(item: ObjectTable, surface: Surface, place: FloatArray, normal: FloatArray, along: FloatArray) -> Pressing:
-    """Return how an object lies against the surface at rest.
+    """Return the contact geometry of an object on the surface at rest.
 
     Arguments:
         item, surface: the object and its surface.
         place, normal: of the body's surface, shape (3,) each.
-        along: where its x axis points, shape (3,).
+        along: direction of its x axis, shape (3,).
     """
     x = along_surface(along, normal)
     r = item.radius_m
@@ -77,7 +77,7 @@ def pressing(item: ObjectTable, surface: Surface, place: FloatArray, normal: Flo
 
 
 def along_surface(direction: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the part of a direction along a surface, unit, shape (3,); any where it has none."""
+    """Return the tangential part of a direction, normalised, shape (3,); an arbitrary tangent if it has none."""
     for tried in (direction, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])):
         part = tried - (tried @ normal) * normal
         if np.linalg.norm(part) > 1e-3 * max(float(np.linalg.norm(tried)), 1e-12):
@@ -88,14 +88,14 @@ def along_surface(direction: FloatArray, normal: FloatArray) -> FloatArray:
 def object_pose(
     how: Pressing, patch: LoadPatch, rest: FloatArray, positions: FloatArray, *, upright: FloatArray | None
 ) -> FloatArray:
-    """Return T_robot_object, shape (4, 4), of an object that lies against its patch on the deformed body.
+    """Return T_robot_object, shape (4, 4), of an object in contact with its patch on the deformed body.
 
-    Its lower side passes through the pressed places on average, weighted by pressure.
+    Its lower side passes through the pressed points on average, weighted by pressure.
 
     Arguments:
-        how, patch: as it was pressed.
+        how, patch: its contact geometry and patch.
         rest, positions: nodes of the truth [m], shape (n, 3).
-        upright: where its z axis points; None: along the normal.
+        upright: direction of its z axis; None: along the normal.
     """
     center, normal = patch.place(positions), patch.normal(positions)
     z = normal if upright is None else upright / np.linalg.norm(upright)
@@ -114,7 +114,7 @@ def object_pose(
 
 
 def tool_of(item: ObjectTable, folder: Path) -> Tool:
-    """Return an object as [[tools]] of a recording says it."""
+    """Return an object as an entry of [[tools]]."""
     if item.kind == "ball":
         return Tool(item.name, "ball", item.radius_m)
     if item.kind == "rod":
@@ -127,7 +127,7 @@ def tool_of(item: ObjectTable, folder: Path) -> Tool:
 
 
 def _parts(item: ObjectTable) -> list[tuple[str, FloatArray, float]]:
-    """Return solids as (form, its extent, its height over the origin)."""
+    """Return solids as (shape, extent, height above the origin)."""
     r, stick = item.radius_m, item.stick_m
     if item.kind == "ball":
         return [("sphere", np.array([r]), r), *_stick(1.8 * r, stick)]
@@ -178,7 +178,7 @@ def _mesh(file: Path, unit: str) -> Surface:
 
 
 def _bowl(squared: FloatArray, radius: float) -> FloatArray:
-    """Return the height of a ball's or a rod's lower side where it is so far from its lowest point or line, squared [m²]."""
+    """Return the height of the lower side of a ball or rod, given the squared distance from its lowest point or line [m²]."""
     inside = squared < radius**2
     return np.where(inside, radius - np.sqrt(np.where(inside, radius**2 - squared, 0.0)), np.inf)
 
@@ -188,7 +188,7 @@ def _face(xy: FloatArray, half: FloatArray) -> FloatArray:
 
 
 def _lower_side(surface: Surface) -> Callable[[FloatArray], FloatArray]:
-    """Return the height of a mesh's lower side at places (k, 2)."""
+    """Return a function for the height of a mesh's lower side at places (k, 2)."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)

@@ -15,32 +15,32 @@ FOUNDATION = 1.70
 """Stiffness of a foundation that gives a ball the contact of Hertz, in E* over the radius of the contact (Johnson, Contact
 Mechanics, 1985, section 4.3)."""
 FINEST = 8
-"""A side of a triangle is divided into so many parts at most."""
+"""Maximum number of subdivisions of a triangle's side."""
 SAMPLES = 0.3
-"""Distance of the places that carry pressure, over the radius of the contact."""
+"""Spacing of the points that carry pressure, relative to the contact radius."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadPatch:
-    """A part of the surface that a probe presses on."""
+    """A part of the surface that carries a contact force."""
 
     triangles: IntArray
     """Node indices, shape (t, 3)."""
     share: FloatArray
-    """Part of the force that each carries [1], shape (t,)."""
+    """Share of the force on each triangle [1], shape (t,)."""
     corners: FloatArray | None = None
-    """Barycentric coordinates of where each is pressed, shape (t, 3); None: in its middle."""
+    """Barycentric coordinates of the loaded point of each triangle, shape (t, 3); None: its centre."""
     radius: float = 0.0
-    """Of a circle with the same area [m]."""
+    """Radius of a circle with the same area [m]."""
 
     @property
     def weights(self) -> FloatArray:
-        """What each corner of each triangle carries [1], shape (t, 3)."""
+        """Share of the force on each corner of each triangle [1], shape (t, 3)."""
         corners = np.full((len(self.share), 3), 1.0 / 3.0) if self.corners is None else self.corners
         return np.asarray(self.share[:, None] * corners)
 
     def points(self, positions: FloatArray) -> FloatArray:
-        """Return where it is pressed [m], shape (t, 3)."""
+        """Return the loaded points [m], shape (t, 3)."""
         if self.corners is None:
             return np.asarray(positions[self.triangles].mean(axis=1))
         return np.asarray(np.einsum("tk,tkc->tc", self.corners, positions[self.triangles]))
@@ -62,7 +62,7 @@ class LoadPatch:
         return forces
 
     def turned(self, rest: FloatArray, positions: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return where a direction along the surface at rest points on the deformed one, unit, shape (3,)."""
+        """Return a direction along the surface at rest, rotated with the deformed surface, unit, shape (3,)."""
         a, b, c = self.triangles[int(self.share.argmax())]
         edges = np.stack([rest[b] - rest[a], rest[c] - rest[a]], axis=1)
         along = np.linalg.lstsq(edges, direction, rcond=None)[0]
@@ -73,7 +73,7 @@ class LoadPatch:
 
 
 def contact_patch(mesh: TetMesh, point: Sequence[float] | FloatArray, radius: float) -> LoadPatch:
-    """Return the surface triangles around a place at rest; the pressure falls to nothing at the radius.
+    """Return the surface triangles around a place at rest; the pressure falls to zero at the radius.
 
     Arguments:
         mesh: of the truth.
@@ -94,30 +94,30 @@ def contact_patch(mesh: TetMesh, point: Sequence[float] | FloatArray, radius: fl
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pressing:
-    """How an object lies against the surface at rest."""
+    """Contact geometry of an object on the surface at rest."""
 
     place: FloatArray
-    """Where it touches first [m], shape (3,)."""
+    """Place of the first contact [m], shape (3,)."""
     normal: FloatArray
-    """Outward there, shape (3,)."""
+    """Outward normal there, shape (3,)."""
     along: FloatArray
     """Its x axis, unit, along the surface, shape (3,)."""
     reach: float
-    """No part of its lower side is farther from where it touches [m]."""
+    """Radius of its lower side about the contact point [m]."""
     scale: float
-    """About the smallest radius that it presses with [m]."""
+    """Approximate smallest contact radius [m]."""
     height: Callable[[FloatArray], FloatArray]
-    """Height of its lower side over its lowest point [m], shape (k,), at places (k, 2) along x and y; inf where it is not."""
+    """Height of its lower side above its lowest point [m], shape (k,), at places (k, 2) along x and y; inf outside of it."""
 
 
 def pressed_patch(mesh: TetMesh, how: Pressing, force: float, modulus: float) -> LoadPatch:
-    """Return the patch of an object that is pressed on with a force, by an elastic foundation.
+    """Return the patch of an object under a contact force, by an elastic foundation.
 
-        p = 1.70 E*/a (δ − g)  where the gap g is smaller than the approach δ;  a = √(area / π),  Σ p A = force.
+        p = 1.70 E*/a (δ − g)  where the gap g is below the approach δ;  a = √(area / π),  Σ p A = force.
 
     Arguments:
-        mesh: of the truth.
-        how: where and with which form.
+        mesh: the true mesh.
+        how: the contact geometry.
         force: [N], > 0.
         modulus: E* = E / (1 − ν²) [Pa].
     """
@@ -134,7 +134,7 @@ def pressed_patch(mesh: TetMesh, how: Pressing, force: float, modulus: float) ->
 
 
 def nearest_place(mesh: TetMesh, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the point of the surface at rest that is closest to a place, and its outward normal, shape (3,) each."""
+    """Return the surface point at rest closest to a place, and its outward normal, shape (3,) each."""
     triangles = surface_triangles(mesh)
     middles = mesh.nodes[triangles].mean(axis=1)
     near = np.argsort(np.linalg.norm(middles - point, axis=1))[:40]
@@ -149,7 +149,7 @@ def nearest_place(mesh: TetMesh, point: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _samples(mesh: TetMesh, how: Pressing) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return places that may carry pressure: triangles (s, 3), barycentric coordinates (s, 3) and areas [m²] (s,)."""
+    """Return the points that may carry pressure: triangles (s, 3), barycentric coordinates (s, 3) and areas [m²] (s,)."""
     triangles = surface_triangles(mesh)
     corners = mesh.nodes[triangles]
     sizes = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -168,7 +168,7 @@ def _samples(mesh: TetMesh, how: Pressing) -> tuple[IntArray, FloatArray, FloatA
 
 
 def _middles(parts: int) -> FloatArray:
-    """Return the barycentric middles of a triangle divided into parts² equal ones, shape (parts², 3)."""
+    """Return the barycentric centres of a triangle divided into parts² equal ones, shape (parts², 3)."""
     up = [(i + 1 / 3, j + 1 / 3) for i in range(parts) for j in range(parts - i)]
     down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
     b, c = np.array(up + down).T / parts

@@ -17,12 +17,12 @@ from femsense.rig.script import ScriptTable, SweepTable, script_problem
 
 __all__ = ["Plan", "PlannedContact", "plan_script"]
 MOTORS = 7
-"""Stream of random numbers of the motors, beside those of `rig/experiment.py`."""
+"""Stream of random numbers of the motors, in addition to those of `rig/experiment.py`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
-    """A script frame by frame, for the cables of one robot."""
+    """A script frame by frame, for one robot."""
 
     control: str
     """"tension" or "displacement"."""
@@ -32,7 +32,7 @@ class Plan:
     free: BoolArray
     """Shape (F,)."""
     commanded: FloatArray
-    """Inputs counted from the initial ones [N] or [m], shape (F, a), in the order of the body's cables."""
+    """Inputs relative to the initial ones [N] or [m], shape (F, a), in the order of the body's cables."""
     initial: FloatArray
     """True inputs before the first sweep [N] or [m], shape (a,)."""
     pressures: FloatArray
@@ -47,12 +47,12 @@ class Plan:
     """[N], shape (L, 3)."""
     contacts: tuple[PlannedContact, ...]
     motor_scale: FloatArray | None = None
-    """True input over recorded one of each cable [1], shape (a,); None: 1."""
+    """Ratio of true to recorded input of each cable [1], shape (a,); None: 1."""
     backlash: float = 0.0
-    """Play of the motors [N] or [m]."""
+    """Backlash of the motors [N] or [m]."""
 
     def pick(self, frames: IntArray) -> Plan:
-        """Return the plan of some of its frames."""
+        """Return the plan restricted to some of its frames."""
         kept = np.isin(self.load_frame, frames)
         return replace(
             self,
@@ -74,12 +74,12 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
 
     Arguments:
         script: the script.
-        robot: whose cables and markers it names.
-        where: what messages name.
+        robot: defines cables and markers.
+        where: for error messages.
 
     Raises:
-        InputError: unknown cables or markers, negative tensions, lists of another length than their sweep,
-            frames that are not there.
+        InputError: unknown cables or markers, negative tensions, lists that differ in length from their sweep,
+                    missing frames.
     """
     names, chambers = robot.body.cable_names, robot.body.chamber_names
     _check_names(script, robot, where)
@@ -99,7 +99,7 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
     _check_pressures(pressures, robot, where)
     if script.actuation == "tension" and (commanded + initial < -1e-12).any():
         raise InputError(
-            "a tension below zero",
+            "a negative tension",
             where=f"{where}: sweeps",
             found=f"{(commanded + initial).min():g} N",
             expected="initial + sweep ≥ 0 N",
@@ -140,7 +140,7 @@ def _check_pressures(pressures: FloatArray, robot: Robot, where: Path) -> None:
         if column.max() > chamber.max_pressure * (1 + 1e-9):
             found, limit = f"{column.max():g} Pa", f"at most max_pressure_pa = {chamber.max_pressure:g} Pa"
             raise InputError(
-                "more pressure than the chamber bears",
+                "pressure above the chamber's maximum",
                 where=f"{where}: sweeps, chamber {chamber.name}",
                 found=found,
                 expected=limit,

@@ -1,4 +1,4 @@
-"""A contact of a script frame by frame: with which force it presses, where, and how far away it is when it does not."""
+"""A contact of a script frame by frame: its force, its place, and its distance from the surface between contacts."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from femsense.rig.script import ContactTable, ObjectTable, ScriptTable, script_p
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlannedContact:
-    """A contact along the frames."""
+    """A contact over the frames."""
 
     table: ContactTable
     force: FloatArray
-    """[N], shape (F,); 0 where it does not touch."""
+    """[N], shape (F,); 0: no contact."""
     path: FloatArray | None = None
-    """Where it is on the surface at rest [m], shape (F, 3); None: at the point of its table."""
+    """Its place on the surface at rest [m], shape (F, 3); None: the point of its table."""
     tangent: FloatArray | None = None
-    """Force along the surface over force into it [1], shape (F,); None: none."""
+    """Ratio of tangential to normal force [1], shape (F,); None: no tangential force."""
     away: FloatArray | None = None
-    """How far it is from the surface where it does not press [m], shape (F,), nan where it is gone; None: gone."""
+    """Distance from the surface without contact [m], shape (F,), nan while absent; None: always absent."""
     item: ObjectTable | None = None
-    """What touches; None: a probe."""
+    """The object; None: a probe."""
 
     def place(self, k: int) -> FloatArray:
-        """Return where it is in frame k on the surface at rest [m], shape (3,)."""
+        """Return its place in frame k on the surface at rest [m], shape (3,)."""
         if self.path is not None:
             return np.array(self.path[k], dtype=np.float64)
         return np.asarray(self.table.point_m, dtype=np.float64)
 
     @property
     def way(self) -> FloatArray:
-        """Where the force along the surface points, or the path; shape (3,)."""
+        """Direction of the tangential force, or of the path; shape (3,)."""
         for given in (self.table.tangent_direction, self.table.along):
             if given is not None:
                 return np.asarray(given, dtype=float)
@@ -46,7 +46,7 @@ class PlannedContact:
 
     @property
     def along(self) -> FloatArray:
-        """Where the x axis of what touches points, shape (3,)."""
+        """Direction of the object's x axis, shape (3,)."""
         return self.way if self.table.along is None else np.asarray(self.table.along, dtype=float)
 
     def pick(self, frames: IntArray) -> PlannedContact:
@@ -62,13 +62,13 @@ def planned_contact(
 
     Arguments:
         script: the script.
-        i: which contact.
-        frames: the first frame of its sweep, how many that has, and how many there are in all.
+        i: index of the contact.
+        frames: first frame of its sweep, number of frames of the sweep, and number of all frames.
         gravity: of the body [m/s²], shape (3,).
-        where: what messages name.
+        where: for error messages.
 
     Raises:
-        InputError: lists of another length than the sweep; a weight without gravity.
+        InputError: lists that differ in length from the sweep; a weight without gravity.
     """
     table = script.contacts[i]
     item = next((item for item in script.objects if item.name == table.object), None)
@@ -96,7 +96,7 @@ def planned_contact(
 
 
 def _hung(table: ContactTable, item: ObjectTable, gravity: FloatArray, i: int, where: Path) -> ContactTable:
-    """Return the contact of a weight: along gravity, by its mass where no force is said."""
+    """Return the contact of a weight: along gravity, with its weight as the default force."""
     size = float(np.linalg.norm(gravity))
     if not size:
         raise script_problem(
@@ -107,7 +107,7 @@ def _hung(table: ContactTable, item: ObjectTable, gravity: FloatArray, i: int, w
 
 
 def _walked(corners: FloatArray, frames: tuple[int, int, int]) -> FloatArray:
-    """Return the places of a path, evenly over the frames of its sweep, shape (F, 3)."""
+    """Return the places along a path, evenly spaced over the frames of its sweep, shape (F, 3)."""
     first, count, total = frames
     at = np.clip(np.arange(total) - first, 0, count - 1) / max(count - 1, 1) * (len(corners) - 1)
     return np.stack([np.interp(at, np.arange(len(corners)), column) for column in corners.T], axis=1)

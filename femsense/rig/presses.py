@@ -1,4 +1,4 @@
-"""What presses on the body in a frame: the patch of each contact, where its force points, and where what touches stands."""
+"""Contacts in a frame: the patch of each, the direction of its force, and the pose of its object."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from femsense.rig.plan import Plan
 from femsense.rig.planned_contact import PlannedContact
 
 PROBE_M = 0.006
-"""Radius over which a force is spread where neither contact nor object says it [m]."""
+"""Default radius of a contact patch [m]."""
 HOVER_N = 1e-3
-"""Force with which the patch under something that does not touch is computed [N]."""
+"""Force for which the patch of an object without contact is computed [N]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -25,14 +25,14 @@ class Press:
     """One contact at one moment."""
 
     contact: int
-    """Which of the script's contacts."""
+    """Index of the script's contact."""
     patch: LoadPatch
     force: float
     """[N]."""
     ratio: float
-    """Force along the surface over force into it [1]."""
+    """Ratio of tangential to normal force [1]."""
     pressing: Pressing | None
-    """How its object lies against the surface; None: a probe."""
+    """Contact geometry of its object; None: a probe."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,7 +40,7 @@ class TrueContact:
     """A contact in one frame."""
 
     contact: int
-    """Which of the script's contacts."""
+    """Index of the script's contact."""
     place: FloatArray
     """Centre of the contact patch on the deformed body [m], shape (3,)."""
     normal: FloatArray
@@ -50,14 +50,14 @@ class TrueContact:
     rest: FloatArray | None = None
     """Centre of the contact patch at rest [m], shape (3,)."""
     radius: float = 0.0
-    """Of a circle with the area of the contact patch [m]."""
+    """Radius of a circle with the area of the contact patch [m]."""
     T_robot_object: FloatArray | None = None
-    """Where its object stands, shape (4, 4); None: a probe."""
+    """Pose of its object, shape (4, 4); None: a probe."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Hovering:
-    """An object that is there and does not touch."""
+    """An object that is present without contact."""
 
     contact: int
     T_robot_object: FloatArray
@@ -65,7 +65,7 @@ class Hovering:
 
 
 class Presses:
-    """The contacts of a plan on a body; patches that stay the same are the same object."""
+    """The contacts of a plan on a body; unchanged patches are the same objects."""
 
     def __init__(self, body: BodyModel, plan: Plan, folder: Path) -> None:
         self.mesh, self.plan = body.mesh, plan
@@ -78,7 +78,7 @@ class Presses:
         self.made: dict[tuple[object, ...], tuple[LoadPatch, Pressing | None]] = {}
 
     def at(self, k: int) -> tuple[Press, ...]:
-        """Return what presses in frame k."""
+        """Return the contacts with a force in frame k."""
         result = []
         for i, contact in enumerate(self.plan.contacts):
             force = float(contact.force[k])
@@ -88,7 +88,7 @@ class Presses:
         return tuple(result)
 
     def direction(self, press: Press, positions: FloatArray) -> FloatArray:
-        """Return where a force points on the deformed body, unit, shape (3,)."""
+        """Return the direction of a force on the deformed body, unit, shape (3,)."""
         contact = self.plan.contacts[press.contact]
         if contact.table.direction is not None:
             given = np.array(contact.table.direction)
@@ -100,7 +100,7 @@ class Presses:
         return np.asarray((press.ratio * along - normal) / np.hypot(1.0, press.ratio))
 
     def total(self, presses: tuple[Press, ...], positions: FloatArray) -> FloatArray:
-        """Return the nodal forces of what presses [N], shape (n, 3)."""
+        """Return the nodal forces of the contacts [N], shape (n, 3)."""
         n = len(self.mesh.nodes)
         total = np.zeros((n, 3))
         for press in presses:
@@ -108,7 +108,7 @@ class Presses:
         return total
 
     def contacts(self, presses: tuple[Press, ...], positions: FloatArray) -> tuple[TrueContact, ...]:
-        """Return the contacts as they stand on the deformed body."""
+        """Return the contacts on the deformed body."""
         return tuple(
             TrueContact(
                 p.contact,
@@ -124,7 +124,7 @@ class Presses:
         )
 
     def hovering(self, k: int, positions: FloatArray) -> tuple[Hovering, ...]:
-        """Return the objects that are there in frame k and do not touch."""
+        """Return the objects that are present in frame k without contact."""
         result = []
         for i, contact in enumerate(self.plan.contacts):
             if contact.item is None or contact.away is None or contact.force[k] > 0 or not np.isfinite(contact.away[k]):
@@ -162,8 +162,8 @@ class Presses:
 
 
 def between(before: tuple[Press, ...], after: tuple[Press, ...], part: float) -> tuple[Press, ...]:
-    """Return what presses a part of the way from one frame to the next: on a patch of both the force moves,
-    on others it comes and goes."""
+    """Return the contacts between two frames: forces on a common patch are interpolated, others grow from
+    or fall to zero."""
     later = {(p.contact, id(p.patch)): p for p in after}
     result = []
     for p in before:

@@ -1,4 +1,4 @@
-"""What the recording of an experiment holds beside its clouds: inputs, markers with noise, known loads, tools."""
+"""The recording of an experiment without its clouds: inputs, markers with noise, known loads, tools."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from femsense.rig.script import ScriptTable
 
 
 def recording_of(experiment: Experiment) -> Recording:
-    """Return what the recording holds beside its clouds: inputs, markers with noise, known loads."""
+    """Return the recording without its clouds: inputs, markers with noise, known loads, tools."""
     script, plan, views = experiment.script, experiment.plan, experiment.views
     recorded = plan.commanded + (plan.initial if script.actuation_zero == "absolute" else 0.0)
     recorded = recorded + script.input_std * rng_of(script, "inputs").standard_normal(recorded.shape)
@@ -50,7 +50,7 @@ def recording_of(experiment: Experiment) -> Recording:
 
 
 def with_placement(robot: Robot, script: ScriptTable) -> Robot:
-    """Return the robot with its markers where they were glued."""
+    """Return the robot with its markers at their true places."""
     std = script.markers.placement_std_m
     if not std:
         return robot
@@ -59,7 +59,7 @@ def with_placement(robot: Robot, script: ScriptTable) -> Robot:
 
 
 def chosen_markers(robot: Robot, script: ScriptTable) -> BoolArray:
-    """Return which markers there are, shape (k,)."""
+    """Return the mask of the existing markers, shape (k,)."""
     names = script.markers.names
     return np.array([names is None or name in names for name in robot.marker_names], dtype=bool)
 

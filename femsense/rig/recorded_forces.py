@@ -1,7 +1,7 @@
 """Which forces the camera of a recording can resolve at a few places of a robot: the bound of `force_map` with the points
 that were measured in place of points that would be.
 
-The rows are those of one frame: of its clouds, or of its markers where there is no cloud. The standard deviation of a depth
+The rows are those of one frame: of its clouds, or of its markers without a cloud. The standard deviation of a depth
 is the one that the recording declares, or else the scatter of the clouds of contact-free frames.
 """
 
@@ -35,11 +35,11 @@ from femsense.rig.camera_tables import NoiseTable
 from femsense.rig.force_map import CLEAR, ForceMap, Measured, Unknowns, force_bound, neighbours
 
 SEEN, HIDDEN = 4, 2
-"""Places at which a recording's resolution is stated: that a camera sees, and that none does."""
+"""Number of places for which a recording's resolution is stated: visible ones, and hidden ones."""
 CANDIDATES = 120
-"""They are chosen from this many, evenly spread."""
+"""Number of evenly spread candidates for them."""
 FACING = 0.2
-"""A place whose normal has a smaller cosine with the ray to the camera is seen too obliquely to be measured."""
+"""Smallest cosine between normal and ray to the camera of a place that is measured."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,7 +50,7 @@ class RecordedForces:
     frame: int
     """Its number in frames.csv."""
     from_clouds: bool
-    """Whether clouds were measured; else markers."""
+    """Whether it is from clouds; else from markers."""
     noise_m: float
     """Median standard deviation of a depth along its ray, or of a marker's coordinate [m]."""
     declared: bool
@@ -58,7 +58,7 @@ class RecordedForces:
 
 
 def recorded_forces(robot: Robot, recording: Recording, calibration: Calibration) -> RecordedForces:
-    """Return which forces a recording resolves at a few places, in its first contact-free frame that was measured.
+    """Return the forces that a recording resolves at a few places, in its first measured contact-free frame.
 
     Arguments:
         robot, recording: as loaded.
@@ -68,7 +68,7 @@ def recorded_forces(robot: Robot, recording: Recording, calibration: Calibration
         InputError: the recording does not fit the robot. DataError: nothing was measured, or no equilibrium.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whoever reads the recording has shown them
+        warnings.simplefilter("ignore")  # shown when the recording was read
         recording = check_against(robot, recording)
     robot = with_initial_pressures(robot.in_recording(recording.label), calibration.chamber_pressure_pa)
     initial = None if recording.actuation_zero == "absolute" else calibrated_inputs(robot, recording, calibration)
@@ -91,9 +91,9 @@ def recorded_forces(robot: Robot, recording: Recording, calibration: Calibration
 
 
 def _frame(recording: Recording, measured: BoolArray) -> int:
-    """Return the first contact-free frame that was measured, else the first that was, as an index."""
+    """Return the index of the first measured contact-free frame, or else of the first measured frame."""
     if not measured.any():
-        raise DataError("neither clouds nor markers with names: nothing was measured")
+        raise DataError("the recording has neither clouds nor markers with names")
     free = measured if recording.free is None else measured & recording.free
     return int(np.flatnonzero(free if free.any() else measured)[0])
 
@@ -112,7 +112,7 @@ def _cloud_rows(
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     rows = None if scan is None else ray_rows(scan, surface, calibration.poses, noises, reach=REACH * size)
     if rows is None or not len(rows.residual):
-        raise DataError(f"no point of frame {recording.frame_numbers[k]} lies on the robot where the calibration has it")
+        raise DataError(f"no point of frame {recording.frame_numbers[k]} lies on the robot at its calibrated pose")
     together = np.array([_together(noise, recording, view) for view, noise in enumerate(noises)])[rows.view]
     by_pose = rows.by_pose(robot.body.mesh.nodes.mean(axis=0), len(noises))
     measured = Measured(rows.operator(len(state.positions)), by_pose, np.asarray(rows.std * np.sqrt(together)))
@@ -120,26 +120,26 @@ def _cloud_rows(
 
 
 def _together(noise: CameraNoise, recording: Recording, view: int) -> float:
-    """Return how many points of a camera count as one: pixels of a stereo depth image err together (see `neighbours`).
+    """Return the number of points of a camera that count as one: errors of neighbouring stereo pixels are correlated (see `neighbours`).
 
-    Points of a cloud file were mostly thinned, and count one each.
+    Points of a cloud file are usually thinned, and count one each.
     """
     images = any(file is not None and file.suffix.lower() == ".png" for file in (files[view] for files in recording.cloud_files))
     return neighbours(NoiseTable.model_validate({"kind": "stereo"})) if noise.kind == "stereo" and images else 1.0
 
 
 def _marker_rows(robot: Robot, recording: Recording, k: int, calibration: Calibration) -> tuple[Measured, float]:
-    """Return three rows for each marker that was seen in a frame, and the standard deviation of a coordinate [m]."""
+    """Return three rows for each marker in a frame, and the standard deviation of a coordinate [m]."""
     known = {name: i for i, name in enumerate(robot.marker_names)}
     mine = np.flatnonzero(recording.marker_frame == k)
     markers = np.array([known.get(recording.marker_names[i], -1) for i in recording.marker_index[mine]], dtype=np.int64)
     mine, markers = mine[markers >= 0], markers[markers >= 0]
     if not len(mine):
-        raise DataError(f"no marker of the robot is seen in frame {recording.frame_numbers[k]}")
+        raise DataError(f"frame {recording.frame_numbers[k]} has no marker of the robot")
     guesses = (recording.marker_noise_m, calibration.noise_m / np.sqrt(3.0), calibration.rms_m / np.sqrt(3.0))
     noise = next((float(value) for value in guesses if value is not None and np.isfinite(value) and value > 0), 0.0)
     if not noise:
-        raise DataError("the noise of the markers is not known: declare marker_noise_m in recording.toml")
+        raise DataError("the noise of the markers is unknown: declare marker_noise_m in recording.toml")
     ties = robot.markers[markers]
     unit = sp.csr_array(ties.matrix(len(robot.body.mesh.nodes)))
     operator = sp.csr_array(sp.kron(unit, sp.eye_array(3)))
@@ -152,7 +152,7 @@ def _marker_rows(robot: Robot, recording: Recording, k: int, calibration: Calibr
 
 
 def _places(robot: Robot, calibration: Calibration, state: Equilibrium) -> tuple[IntArray, BoolArray]:
-    """Return nodes at which the resolution is stated, and whether a camera sees each, shape (p,)."""
+    """Return the nodes at which the resolution is stated, and whether a camera sees each, shape (p,)."""
     surface = body_surface(robot.body.mesh)
     flat = np.setdiff1d(flat_nodes(surface, robot.body.mesh.nodes), robot.body.clamped)
     nodes = spread_features(robot.body, CANDIDATES, among=flat if len(flat) else None)
@@ -164,7 +164,7 @@ def _places(robot: Robot, calibration: Calibration, state: Equilibrium) -> tuple
 
 
 def _seen(calibration: Calibration, state: Equilibrium, triangles: IntArray, nodes: IntArray) -> BoolArray:
-    """Return which nodes a camera sees: they face it, and no other part of the body lies between, shape (p,)."""
+    """Return which nodes a camera sees: facing it and not occluded by the body, shape (p,)."""
     normals = vertex_normals(state.positions, triangles)[nodes]
     size = float(np.linalg.norm(np.ptp(state.positions, axis=0)))
     places = state.positions[nodes] + CLEAR * normals
@@ -179,7 +179,7 @@ def _seen(calibration: Calibration, state: Equilibrium, triangles: IntArray, nod
     return freeze(seen, bool)
 
 
-# In words and as tables
+# Texts and tables
 
 
 def resolution_document(recorded: RecordedForces) -> dict[str, Any]:
@@ -199,7 +199,7 @@ def resolution_document(recorded: RecordedForces) -> dict[str, Any]:
 
 
 def resolution_text(recorded: RecordedForces) -> str:
-    """Return the resolution in words: one line a place, and the force from which on a size is determined."""
+    """Return the resolution as text: one line per place, and the smallest force whose size is determined."""
     found, mm = recorded.found, 1e3 * recorded.noise_m
     if recorded.from_clouds:
         source = f"{found.points} points of the robot, noise of a depth {mm:.2g} mm"
@@ -217,6 +217,6 @@ def resolution_text(recorded: RecordedForces) -> str:
     low, high = 3.0 * found.normal_std.min(), 3.0 * found.normal_std.max()
     lines.append(
         f"  the size of a force is determined from three σ on: {low:.2g} to {high:.2g} N at these places; "
-        "an unknown place or an error of the model costs more"
+        "an unknown place or a model error enlarges σ"
     )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What stands before the cameras in a frame: the deformed body, what touches it or is near, the floor."""
+"""The scene of a frame: the deformed body, objects in contact or close to it, and the floor."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ PLAIN_RGB = (0.6, 0.6, 0.6)
 FLOOR_HALF = 1.0
 """Half the side of the floor [m]."""
 ROD_LENGTH = 0.12
-"""Length of what holds a probe [m]."""
+"""Length of the rod that holds a probe [m]."""
 
 
 def frame_shapes(experiment: Experiment, k: int) -> list[Shape]:
-    """Return what the cameras see in the k-th frame of an experiment: the body first, then what touches it or is near,
+    """Return the shapes in the k-th frame of an experiment: the body first, then objects in contact or close to it,
     then the floor."""
     robot, frame, scene = experiment.robot, experiment.frames[k], experiment.script.scene
     shapes = [body_shape(robot, frame.state.positions, scene)]

@@ -1,7 +1,7 @@
-"""What a script puts where it cannot be: a floor or an object that cuts the robot, a contact that is far from the surface.
+"""Geometric checks of a script: a floor or an object that intersects the robot, a contact far from the surface.
 
-The rig computes with all of these; the camera then sees a robot that is partly hidden, or a force acts elsewhere than it
-seems to. So each is a warning with the distance.
+The rig simulates all of these; the camera then sees a robot that is partly hidden, or a force acts away from its
+stated place. Each is therefore a warning with the distance.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from femsense.rig.script import ScriptTable
 OFF_SURFACE = 0.01
 """A contact farther from the surface at rest than this share of the body's diagonal is reported."""
 CUT = 0.001
-"""A floor or an object that reaches farther into the body than this is reported [m]; contacts press less deep."""
+"""Depth of an intersection that is reported [m]; contacts indent less."""
 
 
 def warn_of_script(script: ScriptTable, robot: Robot, where: Path) -> None:
-    """Warn of contacts and loads far from the surface, and of a floor that cuts the robot at rest.
+    """Warn of contacts and loads far from the surface, and of a floor that intersects the robot at rest.
 
     Arguments:
-        script, robot: what is simulated.
-        where: what messages name.
+        script, robot: of the simulation.
+        where: for messages.
     """
     mesh = robot.body.mesh
     for location, point in _places(script):
@@ -51,7 +51,7 @@ def warn_of_script(script: ScriptTable, robot: Robot, where: Path) -> None:
 
 
 def warn_of_experiment(experiment: Experiment, where: Path) -> None:
-    """Warn of a floor that cuts the moving robot, and of objects that cut it; each once, in its worst frame."""
+    """Warn of a floor or objects that intersect the moving robot; each once, in its worst frame."""
     if not experiment.frames:
         return
     robot, script, mesh = experiment.robot, experiment.script, experiment.robot.body.mesh
@@ -102,13 +102,13 @@ def _warn_of_floor(script: ScriptTable, robot: Robot, positions: FloatArray, whe
 
 
 def _below(robot: Robot, positions: FloatArray, height: float) -> float:
-    """Return how far the part of a body that moves reaches below a height [m]; its clamp may stand in the floor."""
+    """Return the depth of the moving part of a body below a height [m]; the clamp may stand in the floor."""
     moving = np.setdiff1d(np.unique(surface_triangles(robot.body.mesh)), robot.body.clamped)
     return max(0.0, float(height - positions[moving, 2].min())) if len(moving) else 0.0
 
 
 def _overlap(body: Shape, item: Shape) -> float:
-    """Return how deep the points of either of two closed surfaces lie inside the other [m]; 0 where they are apart."""
+    """Return the largest depth of the points of two closed surfaces inside each other [m]; 0 if they do not intersect."""
     depth = 0.0
     for one, other in ((body, item), (item, body)):
         points = one.points[np.unique(one.triangles)]

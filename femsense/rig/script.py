@@ -1,5 +1,4 @@
-"""The script of a virtual experiment (`femsense-script-1`): what is pulled when, what touches, what the truth has,
-what is seen."""
+"""The script of a virtual experiment (`femsense-script-1`): inputs, contacts, ground truth and measurements."""
 
 from __future__ import annotations
 
@@ -24,22 +23,22 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class SweepTable(Schema):
-    """One excursion from rest and back."""
+    """Loading from rest and unloading."""
 
-    label: Annotated[str, Field(min_length=1, description="a label, each sweep its own")]
+    label: Annotated[str, Field(min_length=1, description="a unique label")]
     cables: dict[str, float | list[float]] = Field(
-        {}, description="cable → its value at the height of the sweep [N or m], or a list with one value a frame"
+        {}, description="input of each cable at the peak of the sweep [N or m], or a list with one value per frame"
     )
     chambers: dict[str, float | list[float]] = Field(
-        {}, description="chamber → its pressure at the height of the sweep [Pa], or a list with one value a frame"
+        {}, description="pressure of each chamber at the peak of the sweep [Pa], or a list with one value per frame"
     )
     rest: Count = Field(0, description="frames at rest before the sweep, ≥ 0")
-    up: Count = Field(3, description="frames on the way up, the height included, ≥ 0")
-    hold: Count = Field(0, description="frames at the height, ≥ 0")
-    down: Count = Field(3, description="frames on the way down, rest included, ≥ 0")
-    levels: list[float] | None = Field(None, description="one factor a frame, in place of rest, up, hold and down")
-    dt_s: Positive | None = Field(None, description="time from frame to frame [s], > 0")
-    free: bool | None = Field(None, description="true: nothing undeclared touches; by default false where a contact acts")
+    up: Count = Field(3, description="frames of loading, with the peak, ≥ 0")
+    hold: Count = Field(0, description="frames at the peak, ≥ 0")
+    down: Count = Field(3, description="frames of unloading, with the rest state, ≥ 0")
+    levels: list[float] | None = Field(None, description="one factor per frame, instead of rest, up, hold and down")
+    dt_s: Positive | None = Field(None, description="time between frames [s], > 0")
+    free: bool | None = Field(None, description="true: contact-free; default: false if a contact acts")
     gravity_m_s2: Vector | None = Field(None, description="gravity in the robot frame during this sweep [m/s²]")
 
     def profile(self) -> list[float]:
@@ -52,25 +51,25 @@ class SweepTable(Schema):
 
 
 class LoadTable(Schema):
-    """A known load: it stands in loads.csv."""
+    """A known load, written to loads.csv."""
 
     sweep: str = Field(description="label of the sweep in which it acts")
     point_m: Vector = Field(description=PLACE)
-    force_n: Vector | list[Vector] = Field(description="newton [x, y, z], or one such vector a frame of the sweep")
+    force_n: Vector | list[Vector] = Field(description="force [x, y, z] [N], or one vector per frame of the sweep")
 
 
 class TruthTable(Schema):
-    """How the truth differs from the estimator's model beside the effects."""
+    """The model of the ground truth, apart from the effects."""
 
     refinements: Annotated[int, Field(ge=0, le=3)] = Field(
-        1, description="how often every tetrahedron is split into eight, 0 … 3"
+        1, description="number of uniform refinements (each splits every tetrahedron into eight), 0 … 3"
     )
     element: Literal["tet4", "tet10"] = Field("tet10", description='"tet4" or "tet10"')
     law: Literal["corotational", "neo_hookean", "gent"] = Field(
         "neo_hookean", description='"neo_hookean", "gent" or "corotational"'
     )
     stretch_limit: Positive | None = Field(None, description="Gent's limit jm of I₁ − 3, > 0")
-    substeps: Annotated[int, Field(ge=1)] = Field(3, description="steps from frame to frame, ≥ 1")
+    substeps: Annotated[int, Field(ge=1)] = Field(3, description="load steps between two frames, ≥ 1")
 
     @model_validator(mode="after")
     def _gent_needs_its_limit(self) -> TruthTable:
@@ -80,51 +79,53 @@ class TruthTable(Schema):
 
 
 class MotorsTable(Schema):
-    """How the motors differ from what is recorded; each cable's scale is drawn from the seed."""
+    """Differences between true and recorded inputs; the gain of each cable is drawn from the seed."""
 
     gain_std: NotNegative = Field(
-        0.0, description="standard deviation of the true input over the recorded one, each cable its own, ≥ 0"
+        0.0, description="standard deviation of the ratio of true to recorded input, independent for each cable, ≥ 0"
     )
-    backlash: NotNegative = Field(0.0, description="play: the way that a motor turns back before its cable follows [N or m], ≥ 0")
+    backlash: NotNegative = Field(0.0, description="backlash: reversal of the motor before the cable follows [N or m], ≥ 0")
 
 
 class MarkersTable(Schema):
-    """How well markers are seen."""
+    """Errors and visibility of the markers."""
 
-    names: list[str] | None = Field(
-        None, description="the markers that there are, in their order in markers.csv; by default all of the robot"
+    names: list[str] | None = Field(None, description="the markers, in their order in markers.csv; default: all of the robot")
+    std_m: NotNegative = Field(
+        0.0, description="noise of each coordinate of each marker in each frame, standard deviation [m], ≥ 0"
     )
-    std_m: NotNegative = Field(0.0, description="noise of each coordinate of each marker in each frame [m], ≥ 0")
     frame_std_m: NotNegative = Field(
-        0.0, description="noise of each coordinate that all markers of a frame have in common [m], ≥ 0"
+        0.0, description="noise of each coordinate common to all markers of a frame, standard deviation [m], ≥ 0"
     )
-    placement_std_m: NotNegative = Field(0.0, description="how far from its place each marker is glued, each coordinate [m], ≥ 0")
-    occlusion: bool = Field(True, description="true: markers that the camera cannot see have no row")
-    rest_file: bool = Field(False, description="true: rest.csv holds the markers of the unloaded body")
+    placement_std_m: NotNegative = Field(
+        0.0, description="error of the place of each marker on the body, standard deviation of each coordinate [m], ≥ 0"
+    )
+    occlusion: bool = Field(True, description="true: markers hidden from the camera have no row")
+    rest_file: bool = Field(False, description="true: write rest.csv with the markers of the unloaded body")
 
 
 class CloudsTable(Schema):
-    """Which frames get clouds, and in which form."""
+    """The frames with clouds, and their format."""
 
     kind: Literal["none", "ply", "depth"] = Field("none", description='"none", "ply" (clouds/) or "depth" (depth/ and color/)')
     frames: Literal["all", "contact"] = Field("all", description='"all" or "contact"')
-    extra_frames: list[Count] = Field([], description="further frames, counted from 0")
-    voxel_m: NotNegative = Field(0.0, description="PLY only: one point a cube of this size [m]; 0: all points")
+    extra_frames: list[Count] = Field([], description="additional frames, counted from 0")
+    voxel_m: NotNegative = Field(0.0, description="PLY only: size of the voxels, one point per voxel [m]; 0: all points")
     crop_m: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = Field(
         None, description="PLY only: two corners of a box in the robot frame [m]"
     )
 
 
 class SceneTable(Schema):
-    """What else is in the picture."""
+    """Appearance of floor, probe and robot."""
 
     floor_z_m: float | None = Field(0.0, description="height of the floor [m]")
     floor_rgb: Color = Field([0.55, 0.53, 0.50], description=COLOR)
     probe_rgb: Color = Field([0.85, 0.30, 0.12], description=COLOR)
-    robot_rgb: Color | None = Field(None, description=COLOR + "; by default the robot's appearance")
-    robot_albedo: Share = Field(0.6, description="what the robot sends back of infrared light, 0 … 1")
-    robot_gloss: Share = Field(0.0, description="how likely a depth of the robot is lost where it gleams, 0 … 1")
-    floor_albedo: Share = Field(0.6, description="what the floor sends back of infrared light, 0 … 1")
+    robot_rgb: Color | None = Field(None, description=COLOR + "; default: the robot's appearance")
+    robot_albedo: Share = Field(0.6, description="infrared albedo of the robot, 0 … 1")
+    robot_gloss: Share = Field(0.0, description="probability of a missing depth at specular reflections of the robot, 0 … 1")
+    floor_albedo: Share = Field(0.6, description="infrared albedo of the floor, 0 … 1")
 
 
 class ScriptTable(Schema):
@@ -134,19 +135,19 @@ class ScriptTable(Schema):
     seed: Count = Field(0, description="a whole number ≥ 0")
     actuation: Literal["tension", "displacement"] = Field("tension", description='"tension" [N] or "displacement" [m]')
     actuation_zero: Literal["absolute", "unknown"] = Field("absolute", description='"absolute" or "unknown"')
-    initial: dict[str, float] = Field({}, description="cable → its true input before the first sweep [N or m]")
-    input_std: NotNegative = Field(0.0, description="noise of the recorded inputs [N or m], ≥ 0")
-    dt_s: Positive = Field(0.5, description="time from frame to frame [s], > 0")
+    initial: dict[str, float] = Field({}, description="true input of each cable before the first sweep [N or m]")
+    input_std: NotNegative = Field(0.0, description="noise of the recorded inputs, standard deviation [N or m], ≥ 0")
+    dt_s: Positive = Field(0.5, description="time between frames [s], > 0")
     sweeps: Annotated[list[SweepTable], Field(min_length=1)] = Field(description="at least one [[sweeps]] with label and cables")
-    objects: list[ObjectTable] = Field([], description="tables [[objects]]: what can touch the body")
+    objects: list[ObjectTable] = Field([], description="tables [[objects]]: objects that can touch the body")
     contacts: list[ContactTable] = Field([], description="tables [[contacts]]")
     loads: list[LoadTable] = Field([], description="tables [[loads]]")
     truth: TruthTable = Field(default_factory=lambda: TruthTable.model_validate({}), description="a table [truth]")
-    effects: list[dict[str, Any]] = Field([], description="tables [[effects]] that only the truth has")
+    effects: list[dict[str, Any]] = Field([], description="tables [[effects]] of the ground truth alone")
     motors: MotorsTable = Field(default_factory=lambda: MotorsTable.model_validate({}), description="a table [motors]")
     sensors: list[SensorTable] = Field([], description="tables [[sensors]]: sensors in the body, written to sensors.csv")
     camera: ViewTable | None = Field(None, description="a table [camera] with eye_m and target_m, or T_robot_camera")
-    cameras: dict[str, ViewTable] = Field({}, description="tables [cameras.NAME] in place of [camera], where there are several")
+    cameras: dict[str, ViewTable] = Field({}, description="tables [cameras.NAME] instead of [camera] for several cameras")
     markers: MarkersTable = Field(default_factory=lambda: MarkersTable.model_validate({}), description="a table [markers]")
     clouds: CloudsTable = Field(default_factory=lambda: CloudsTable.model_validate({}), description="a table [clouds]")
     scene: SceneTable = Field(default_factory=lambda: SceneTable.model_validate({}), description="a table [scene]")
@@ -159,7 +160,7 @@ class ScriptTable(Schema):
 
     @property
     def views(self) -> dict[str, ViewTable]:
-        """The cameras by their names; "" where there is one."""
+        """The cameras by their names; "" for a single camera."""
         return self.cameras or ({} if self.camera is None else {"": self.camera})
 
 

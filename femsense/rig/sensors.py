@@ -1,10 +1,10 @@
 """Sensors in the body of the virtual rig: a strain or a shift between two of its points, with lag, noise and drift.
 
-    strain:  ε = |x_b − x_a| / |X_b − X_a| − 1,                      reading = zero + gain ε
-    colour:  u = (x_b − x_a) · d, d across the way from a to b,      reading_k = zero + gain ½ (1 + cos 2π (u / period − k / 3))
+    strain:  ε = |x_b − x_a| / |X_b − X_a| − 1,                                reading = zero + gain ε
+    colour:  u = (x_b − x_a) · d,  d perpendicular to the line from a to b,      reading_k = zero + gain ½ (1 + cos 2π (u / period − k / 3))
 
-A colour sensor at a looks at a pattern of colours at b; with the shift u other colours come before it (Scharff et al. 2018).
-What a sensor follows with a lag is the body; noise and drift are its own.
+A colour sensor at a looks at a pattern of colours at b; a shift u brings other colours in front of it (Scharff et al. 2018).
+The sensor follows the body with a lag; noise and drift are added to its reading.
 """
 
 from __future__ import annotations
@@ -27,28 +27,26 @@ DIGITS = 9
 
 
 class SensorTable(Schema):
-    """A sensor in the body; its readings stand in sensors.csv."""
+    """A sensor in the body; its readings are written to sensors.csv."""
 
     name: Annotated[
         str, Field(min_length=1, description="a name; a colour sensor has the channels NAME_red, NAME_green, NAME_blue")
     ]
     kind: Literal["strain", "colour"] = Field(
-        "strain", description='"strain" between two points, or "colour": a pattern that shifts'
+        "strain", description='"strain" between two points, or "colour": a pattern that is displaced'
     )
     from_m: Vector = Field(description="one point of the body at rest [m], robot frame")
     to_m: Vector = Field(description="the other point at rest [m]")
     across: Vector | None = Field(
         None,
-        description="of a colour sensor: direction in which its pattern shifts; by default the one across that is most vertical",
+        description="of a colour sensor: direction of the measured displacement; default: the most vertical transverse direction",
     )
-    period_m: Annotated[float, Field(gt=0)] = Field(
-        0.01, description="of a colour sensor: length over which its colours repeat [m], > 0"
-    )
-    gain: float = Field(1.0, description="reading per unit of strain, or between dark and bright")
-    zero: float = Field(0.0, description="reading at no strain, or in the dark")
-    lag_s: Annotated[float, Field(ge=0)] = Field(0.0, description="time constant with which it follows the body [s], ≥ 0")
-    noise_std: Annotated[float, Field(ge=0)] = Field(0.0, description="noise of a reading, in its unit, ≥ 0")
-    drift_per_s: float = Field(0.0, description="drift of its zero as the body warms up, in its unit per second")
+    period_m: Annotated[float, Field(gt=0)] = Field(0.01, description="of a colour sensor: period of the colour pattern [m], > 0")
+    gain: float = Field(1.0, description="reading per unit of strain, or difference between dark and bright")
+    zero: float = Field(0.0, description="reading at zero strain, or in the dark")
+    lag_s: Annotated[float, Field(ge=0)] = Field(0.0, description="time constant of the sensor [s], ≥ 0")
+    noise_std: Annotated[float, Field(ge=0)] = Field(0.0, description="noise of a reading, standard deviation in its unit, ≥ 0")
+    drift_per_s: float = Field(0.0, description="drift of the zero reading, in its unit per second")
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -59,7 +57,7 @@ class SensorTable(Schema):
 def sensor_readings(
     sensors: Sequence[SensorTable], mesh: TetMesh, states: Sequence[FloatArray], time_s: FloatArray, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Return what sensors read, shape (F, channels).
+    """Return the readings of sensors, shape (F, channels).
 
     Arguments:
         sensors: in the order of their columns.
@@ -90,7 +88,7 @@ def sensor_readings(
 
 
 def write_sensors(path: Path, sensors: Sequence[SensorTable], time_s: FloatArray, readings: FloatArray) -> None:
-    """Write sensors.csv: frame, time_s and a column a channel, as `femsense learn` reads it."""
+    """Write sensors.csv: frame, time_s and one column per channel, as read by `femsense learn`."""
     names = [channel for sensor in sensors for channel in sensor.channels]
     rows = [[k, *np.round([t, *row], DIGITS).tolist()] for k, (t, row) in enumerate(zip(time_s, readings))]
     write_csv(path, ("frame", "time_s", *names), rows)
@@ -112,7 +110,7 @@ def _colours(way: FloatArray, ends: FloatArray, sensor: SensorTable) -> FloatArr
 
 
 def _delayed(ideal: FloatArray, time_s: FloatArray, tau: float) -> FloatArray:
-    """Return what follows with a time constant, from the first value on."""
+    """Return values filtered with a time constant, starting at the first value."""
     if tau == 0.0:
         return ideal
     late = ideal.copy()

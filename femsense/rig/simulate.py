@@ -1,4 +1,4 @@
-"""`simulate`: a script becomes a recording as a camera would see it, with the truth beside it."""
+"""`simulate`: from a script to a recording, with its truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from femsense.rig.truth_files import check_place, write_truth
 Progress = Callable[[int, int], None]
 Keep = tuple[str | Path, Mapping[str, Any]]
 CHECKPOINT_S = 10.0
-"""Seconds of work that a stopped simulation may lose."""
+"""Maximum work that an interrupted simulation loses [s]."""
 
 
 def simulate(
@@ -43,23 +43,21 @@ def simulate(
 ) -> Path:
     """Run a virtual experiment and write its recording, with a folder `truth/` inside.
 
-    A frame that does not settle is left out of the recording, with a warning that names it.
+    A frame that does not converge is left out of the recording, with a warning that names it.
 
     Arguments:
-        robot: as the estimator knows it; the truth gets the script's mesh, law and effects.
+        robot: the robot of the estimator; the truth has the script's mesh, law and effects.
         script: a script, its plain tables, or the path of a TOML file.
-        out_folder: the recording; a simulated one that stood there is replaced, and only when all is written.
+        out_folder: the recording; an earlier simulated one is replaced, when the new one is complete.
         progress: called with (frames done, frames in all).
-        keep: a file that holds the frames that are done, so that a run that is stopped goes on there with the same result,
-            and what it is made
-            from: a file that says something else is not used. It is removed at the end.
+        keep: a checkpoint file and the inputs that it must match: an interrupted simulation resumes with the same result, and a file with
+                    other inputs is ignored. It is removed at the end.
 
     Returns:
         the folder.
 
     Raises:
-        InputError: where the script does not fit, or other files stand in `out_folder`. DataError: where no frame has an
-            equilibrium.
+        InputError: the script does not fit, or `out_folder` contains other files. DataError: no frame has an equilibrium.
     """
     check_place(out_folder)
     where = Path(script) if isinstance(script, str | Path) else Path("script")
@@ -76,12 +74,12 @@ def run_experiment(
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Experiment:
-    """Return the truth of a script, seen by its cameras but not yet written.
+    """Return the true states of a script, with the visibility of its markers, not yet written.
 
     Arguments:
         robot, script, progress: as of `simulate`.
-        where: what messages name; meshes of objects stand beside it.
-        checkpoint: keeps the frames that are done.
+        where: for messages; its folder contains the object meshes.
+        checkpoint: keeps the completed frames.
 
     Raises:
         InputError, DataError: as `simulate`.
@@ -106,7 +104,7 @@ def run_experiment(
             visible[v, k] = chosen & seen
     if not visible.any() and chosen.any() and script.clouds.kind == "none":
         raise InputError(
-            "the camera sees no marker in any frame",
+            "no marker is visible in any frame",
             where=f"{where}: camera",
             expected="markers, or [clouds]",
             hint="another eye_m; scene.floor_z_m below the robot; or markers.occlusion = false",
@@ -131,7 +129,7 @@ def write_experiment(experiment: Experiment, out_folder: str | Path) -> Path:
 def _course(
     robot: Robot, plan: Plan, script: ScriptTable, folder: Path, progress: Progress | None, checkpoint: Checkpoint
 ) -> Course:
-    """Return the true path, from where it was stopped on. Raises DataError where no frame settles."""
+    """Return the true path, resumed from the checkpoint. Raises DataError if no frame converges."""
     course, count = checkpoint.kept(Course) or Course(), len(plan.time_s)
     for now in true_course(robot, plan, substeps=script.truth.substeps, folder=folder, kept=course):
         course = now
@@ -139,11 +137,11 @@ def _course(
             progress(course.done, count)
         checkpoint.keep(course, every=CHECKPOINT_S)
     if not course.frames:
-        raise DataError(f"none of {count} frames settles; frame {course.skipped[0][0]}: {course.skipped[0][1]}")
+        raise DataError(f"none of {count} frames converges; frame {course.skipped[0][0]}: {course.skipped[0][1]}")
     if course.skipped:
         named = ", ".join(str(k) for k, _ in course.skipped)
         warnings.warn(
-            f"{len(course.skipped)} of {count} frames do not settle and are left out: {named}; the first: {course.skipped[0][1]}",
+            f"{len(course.skipped)} of {count} frames do not converge and are left out: {named}; the first: {course.skipped[0][1]}",
             stacklevel=2,
         )
     return course

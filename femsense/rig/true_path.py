@@ -23,27 +23,27 @@ from femsense.rig.presses import Hovering, Press, Presses, TrueContact, between
 from femsense.rig.truth import creep_matrix, true_inputs
 
 SETTLED = 1e-8
-"""Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""
+"""Tensions along the cables and contact forces have converged if an iteration changes them by less than this [N]."""
 SETTLED_HELD = 1e-6
-"""The same where cables are held: their tensions come from the balance of the body, to its tolerance [N]."""
+"""The same for held cables, whose tensions follow from the equilibrium to its tolerance [N]."""
 PASSES = 200
 SHORTEST = 0.05
-"""Least share of a step towards the contact forces that a state asks for."""
+"""Smallest step of the fixed-point iteration for contact forces, as a share of the full step."""
 SOFT = 1e-5
-"""Shares of the moduli rest when a pass moves them by less than this."""
+"""Shares of the moduli have converged if an iteration changes them by less than this."""
 SLOW = 0.9
-"""Share of the pass before from which on passes of a held cable are summed beforehand."""
+"""Ratio of consecutive changes of a held cable beyond which the series is extrapolated."""
 FAR, NEARER = float(np.log(2.0)), 0.7
-"""A sum may change the logarithm of a tension by so much at first, and then by a smaller and smaller share of it."""
+"""Largest extrapolation of the logarithm of a tension at first, and factor by which this decreases."""
 TINY = 1e-12
-"""Tensions below this are none [N]."""
+"""Tensions below this count as zero [N]."""
 FINER = 4
-"""A frame that does not settle is tried once more in so many times as many steps."""
+"""A frame that does not converge is repeated with this multiple of the substeps."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueFrame:
-    """The truth in one frame."""
+    """The true state in one frame."""
 
     state: Equilibrium
     motor: FloatArray
@@ -54,34 +54,34 @@ class TrueFrame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Memory:
-    """What the body remembers between frames."""
+    """The history-dependent state of the body."""
 
     state: Equilibrium
     grips: list[Grip]
-    """Of the bends of each cable."""
+    """Friction states of the bends of each cable."""
     most: FloatArray
-    """Largest energy density that each element has seen [J/m³], shape (m,)."""
+    """Largest energy density so far in each element [J/m³], shape (m,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Course:
-    """How far a path has come."""
+    """Progress along a path."""
 
     frames: tuple[tuple[int, TrueFrame], ...] = ()
-    """Index and truth of the frames that settled."""
+    """Index and true state of the converged frames."""
     skipped: tuple[tuple[int, str], ...] = ()
-    """Index of the frames that did not, and why."""
+    """Index of the frames that did not converge, with the reason."""
     memory: Memory | None = field(default=None)
 
     @property
     def done(self) -> int:
-        """Number of frames that are done, settled or not."""
+        """Number of completed frames, converged or not."""
         return len(self.frames) + len(self.skipped)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Load:
-    """What drives the body at one moment."""
+    """The loads at one moment."""
 
     inputs: FloatArray  # (a,)
     forces: FloatArray  # known loads, (n, 3) N
@@ -99,16 +99,16 @@ class _Load:
 
 
 def true_path(robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Path()) -> list[TrueFrame]:
-    """Return the truth of every frame.
+    """Return the true state of every frame.
 
     Arguments:
         robot: see `true_robot`.
-        plan: what happens.
-        substeps: steps from frame to frame; the path between them is straight in the inputs and loads.
-        folder: where meshes of objects stand.
+        plan: the inputs and loads.
+        substeps: steps from frame to frame; inputs and loads are interpolated linearly.
+        folder: of the object meshes.
 
     Raises:
-        DataError: where there is no equilibrium.
+        DataError: no equilibrium.
     """
     path = TruePath(robot, plan, folder)
     return [path.frame(k, substeps) for k in range(len(plan.time_s))]
@@ -117,12 +117,12 @@ def true_path(robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Pat
 def true_course(
     robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Path(), kept: Course | None = None
 ) -> Iterator[Course]:
-    """Yield how far the path has come after each frame; a frame that does not settle costs itself,
-    and the path goes on from the one before.
+    """Yield the progress after each frame; a frame that does not converge is skipped, and the path continues from
+    the one before.
 
     Arguments:
         robot, plan, substeps, folder: as of `true_path`.
-        kept: where an earlier call stopped; what follows is the same to the last bit.
+        kept: progress of an interrupted call; the continuation gives bit-identical results.
     """
     course = kept or Course()
     path = TruePath(robot, plan, folder)
@@ -149,7 +149,7 @@ def _tried(path: TruePath, k: int, substeps: int, memory: Memory) -> TrueFrame:
 
 
 class TruePath:
-    """The state of the truth, moved on step by step; bodies without friction carry given tensions along their cables."""
+    """The true state, advanced step by step; the bodies that are solved have no friction, but given tensions along their cables."""
 
     def __init__(self, robot: Robot, plan: Plan, folder: Path) -> None:
         self.control = plan.control
@@ -169,9 +169,9 @@ class TruePath:
         self.last = self._nothing()
 
     def frame(self, k: int, substeps: int) -> TrueFrame:
-        """Return the truth of frame k, one after the last. Raises DataError."""
+        """Return the true state of frame k, consecutively. Raises DataError."""
         load = self._load(k)
-        self.state = replace(self.state, factor=None)  # a path that goes on later starts without one too
+        self.state = replace(self.state, factor=None)  # as after a restart from a checkpoint
         for step in range(1, substeps + 1):
             self.go(self.last.towards(load, step / substeps), k)
         self.last = load
@@ -180,22 +180,22 @@ class TruePath:
         return TrueFrame(replace(self.state, factor=None), freeze(self.inputs[k]), contacts, self.presses.hovering(k, x))
 
     def memory(self) -> Memory:
-        """Return what the body remembers."""
+        """Return the history-dependent state."""
         return Memory(replace(self.state, factor=None), list(self.grips), self.most)
 
     def remember(self, memory: Memory) -> None:
-        """Go back to what the body remembered."""
+        """Restore a history-dependent state."""
         self.state, self.grips, self.most = memory.state, list(memory.grips), memory.most
 
     def go_on_from(self, course: Course) -> None:
-        """Stand where a path has come to."""
+        """Continue from the end of an earlier path."""
         assert course.memory is not None
         self.remember(course.memory)
         if course.frames:
             self.last = self._load(course.frames[-1][0])
 
     def _nothing(self) -> _Load:
-        """Return the load of the body at rest: its own weight."""
+        """Return the load at rest: the body's own weight."""
         gravity = self.body.gravity if self.plan.gravity is None else self.plan.gravity[0]
         return _Load(
             np.zeros(len(self.friction)),
@@ -206,13 +206,13 @@ class TruePath:
         )
 
     def _load(self, k: int) -> _Load:
-        """Return what drives the body in frame k."""
+        """Return the loads in frame k."""
         gravity = self.body.gravity if self.plan.gravity is None else self.plan.gravity[k]
         known = self.known.get(k, np.zeros((len(self.body.mesh.nodes), 3)))
         return _Load(self.inputs[k], known, self.presses.at(k), gravity, (self.creeping @ self.pressures)[k])
 
     def go(self, load: _Load, frame: int) -> None:
-        """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
+        """Advance to a load; state, tensions along the cables and contact forces are consistent at the end."""
         whole = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
         passes, far = [self._motors(load)], FAR
         pressed = FixedPoint(self._contact_forces(load))
@@ -229,26 +229,28 @@ class TruePath:
             same = soft is None or shares is None or bool(np.abs(soft - shares).max() < SOFT)
             if same and self._settled(load, along, forces):
                 self.most = np.maximum(self.most, energy_density(self.body, self.state.positions))
-                # of where it converged: while bends slide, any tension at the motor gives the same shares
+                # of the converged state: while bends slide, every tension at the motor gives the same shares
                 self.grips = self._along(self._motors(load))[1]
                 return
             passes.append(self._motors(load))
             pressed.step(self._contact_forces(load))
-        raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
+        raise DataError(
+            f"the true state of frame {frame} does not converge: friction and contact keep changing; use more substeps"
+        )
 
     def _shares(self) -> FloatArray | None:
-        """Return the share of its modulus that each element has by all it has been through, (m,); None: all of it."""
+        """Return the softened share of each element's modulus, after its largest energy density so far, (m,); None: no softening."""
         if not self.softening:
             return None
         now = energy_density(self.body, self.state.positions)
         return softened_share(self.softening, np.maximum(self.most, now), now)
 
     def _motors(self, load: _Load) -> FloatArray:
-        """Return the tensions at the motors [N], shape (a,): of held cables as they came out last."""
+        """Return the tensions at the motors [N], shape (a,); of held cables those of the last state."""
         return load.inputs if self.control == "tension" else np.array(list(self.state.tension.values()))
 
     def _along(self, motors: FloatArray) -> tuple[list[FloatArray], list[Grip]]:
-        """Return the tensions along each cable [N], far end first, and what the bends would remember."""
+        """Return the tensions along each cable [N], far end first, and the friction states that follow."""
         tensions, grips = [], []
         for cable, grip, friction, motor in zip(self.body.cables, self.grips, self.friction, motors):
             bends = bend_angles(cable, self.state.positions)[::-1]
@@ -281,7 +283,7 @@ class TruePath:
         return state
 
     def _settled(self, load: _Load, along: list[FloatArray], forces: FloatArray) -> bool:
-        """Return whether what was solved with is what its result asks for."""
+        """Return whether tensions and contact forces of the solution equal those assumed for it."""
         wanted, _ = self._along(self._motors(load))
         used = self.state.segment_tensions
         moved = [np.abs(w - u).max(initial=0.0) for w, u in zip(wanted, used)]
@@ -295,7 +297,7 @@ class TruePath:
 
 
 class FixedPoint:
-    """Seeks x = g(x): the step towards g(x) is as long as the last two say (vector Aitken; Irons & Tuck 1969), and never longer than whole."""
+    """Solves x = g(x); the step length is extrapolated from the last two (vector Aitken; Irons & Tuck 1969), at most a full step."""
 
     def __init__(self, value: FloatArray) -> None:
         self.value = value
@@ -303,7 +305,7 @@ class FixedPoint:
         self._share = 1.0
 
     def step(self, wanted: FloatArray) -> None:
-        """Move on, with g of the value at hand."""
+        """Advance, given g of the current value."""
         missed = wanted - self.value
         if self._missed is not None:
             change = missed - self._missed
@@ -314,11 +316,11 @@ class FixedPoint:
 
 
 def creep_ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
-    """Return the tensions at the motors that passes creep towards [N], (a,); None where they do not creep.
+    """Return the extrapolated tensions at the motors [N], (a,); None without slow convergence.
 
-    While the bends of a held cable hold, what is behind them stays,
-    and the tension at the motor moves by nearly the same small share in every pass, until they slide. So where the logarithms of
-    three passes move like a geometric series, it is summed (Aitken 1926), up to `far` in the logarithm.
+    While the bends of a held cable stick, the tension behind them is constant, and the tension at the motor changes by nearly the same
+    small ratio in every iteration, until they slide. If the logarithms of three iterations form a geometric series, its limit is taken
+    (Aitken 1926), within `far` in the logarithm.
     """
     if len(passes) < 3:
         return None

@@ -1,4 +1,4 @@
-"""The true body and its inputs: another mesh and law than the estimator's; gain, zero, play and creep of its motors."""
+"""The true body and its inputs: another mesh and law than the estimator's; gain, zero, backlash and creep."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from femsense.rig.script import TruthTable
 
 
 def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, Any]]) -> Robot:
-    """Return the robot as it truly is.
+    """Return the true robot.
 
     Arguments:
-        robot: as it is declared.
+        robot: the declared robot.
         table: mesh and law of the truth.
         effects: entries as in `[[effects]]`, applied to the truth only.
 
     Raises:
-        InputError: where an effect does not fit.
+        InputError: an effect does not fit.
     """
     mesh = true_mesh(robot.body.mesh, table)
     body = robot.body if mesh is robot.body.mesh else body_on_mesh(robot.body, mesh)
@@ -45,7 +45,7 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
 
 
 def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
-    """Return the mesh of the truth; the robot's own where nothing is refined and the element is the same."""
+    """Return the true mesh; the robot's own without refinement and with the same element order."""
     if not table.refinements and mesh.is_quadratic == (table.element == "tet10"):
         return mesh
     fine = to_linear(mesh)
@@ -58,7 +58,7 @@ def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
 
 
 def true_inputs(robot: Robot, plan: Plan) -> FloatArray:
-    """Return what the motors truly do in each frame [N] or [m], shape (F, a): gain, zero, play and creep of the truth."""
+    """Return the true inputs of each frame [N] or [m], shape (F, a): with gain, zero, slack and creep of the truth."""
     act = robot.actuation
     inputs = act.gain * motor_inputs(plan)
     if act.coupling is not None:
@@ -70,10 +70,10 @@ def true_inputs(robot: Robot, plan: Plan) -> FloatArray:
 
 
 def motor_inputs(plan: Plan) -> FloatArray:
-    """Return what the motors do when they are told the plan [N] or [m], shape (F, a): their own scale, and play.
+    """Return the motor inputs for the plan [N] or [m], shape (F, a): with the motors' scale and backlash.
 
-    With a play of width w a cable moves only when its motor pushes on one end of the play: y_k = min(max(y_{k−1}, u_k − w/2),
-    u_k + w/2), counted from where the motors begin.
+    With a backlash of width w a cable moves only when its motor is at one end of it: y_k = min(max(y_{k−1}, u_k − w/2),
+    u_k + w/2), starting at the initial motor position.
     """
     told = plan.commanded + plan.initial
     scaled = told if plan.motor_scale is None else told * plan.motor_scale
@@ -88,8 +88,8 @@ def motor_inputs(plan: Plan) -> FloatArray:
 def creep_matrix(time_s: FloatArray, terms: Sequence[tuple[float, float]]) -> FloatArray:
     """Return C, shape (F, F), with crept = C @ values.
 
-    The convolution of J(t) = 1 + Σ f (1 − exp(−t/τ)) with the rate of values that go straight from frame to frame; what was
-    there before the first frame has crept to its end. Each row is summed in full, from the closed form of each piece.
+    The convolution of J(t) = 1 + Σ f (1 − exp(−t/τ)) with the rate of values that are linear from frame to frame; values
+    before the first frame are fully crept. Each row is summed from the closed form of each piece.
     """
     F = len(time_s)
     rate = np.zeros((F, F))

@@ -24,7 +24,7 @@ CONTACT_COLUMNS = (
 
 
 def check_place(folder: str | Path) -> None:
-    """Refuse a place for a simulated recording unless it is new or holds what the rig wrote. Raises InputError."""
+    """Raise InputError unless a folder is new or contains a simulated recording."""
     check_target(folder, folder=True)
     final = followed(folder)
     if not final.is_dir() or not {path.name for path in final.iterdir()} - {UNFINISHED}:
@@ -35,7 +35,7 @@ def check_place(folder: str | Path) -> None:
         read_document(final / "truth" / "truth.json", TRUTH_FORMAT)
     except InputError:
         raise InputError(
-            "the recording there is no simulated one and would be deleted",
+            "the recording there is not a simulated one and would be deleted",
             where=final,
             found="no truth/truth.json of the virtual rig",
             expected=f"a new folder, or {what}",

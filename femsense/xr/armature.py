@@ -26,7 +26,7 @@ PIECES = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BonePoses:
-    """Where the bones are at one time, robot frame."""
+    """Poses of the bones at one time, robot frame."""
 
     positions: FloatArray
     """Origins [m], shape (b, 3)."""
@@ -82,13 +82,13 @@ class ArmatureOptions:
     bones: int = 8
     """How many, spread evenly over the length at rest, each in the middle of its share."""
     at_m: tuple[float, ...] | None = None
-    """Or where they are: arc lengths at rest [m] from the first point, increasing."""
+    """Alternatively their arc lengths at rest [m] from the first point, increasing."""
     plane_normal: tuple[float, float, float] | None = None
     """Of a body that bends in one plane; None: in space."""
     inextensible: bool = False
-    """Whether the line keeps its length at rest: then only the directions are taken from the points."""
+    """Whether the line keeps its rest length: then only the directions are taken from the points."""
     start_normal: tuple[float, float, float] | None = None
-    """The x axis of the first bone at rest, as far as it is across the tangent; None: the robot axis that is most across."""
+    """Direction of the x axis of the first bone at rest, projected across the tangent; None: the robot axis most perpendicular to it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

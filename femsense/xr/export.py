@@ -24,7 +24,7 @@ from femsense.xr.usdz_export import write_usdz
 from femsense.xr.user_skin import UserSkin, export_skin
 
 ENDINGS = (".glb", ".usdz")
-"""What is written."""
+"""Supported formats."""
 
 
 class _States(Protocol):
@@ -60,31 +60,31 @@ def export_glb(
     skin: UserSkin | None = None,
     arrows: bool = False,
 ) -> ExportReport:
-    """Write a run as a skinned, animated mesh (binary glTF 2.0), or as `.usdz` where the path ends so.
+    """Write a run as a skinned, animated mesh (binary glTF 2.0), or as `.usdz` if the path has that suffix.
 
     Arguments:
         run: of `estimate`, or a folder that it was written to.
-        path: the `.glb` or `.usdz` file; its folder is made where it is missing.
-        bones: how many; chosen on held-out frames if None.
-        color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's where the run knows it.
-        skin: a surface of your own that the body carries (`read_skin`).
-        arrows: the contact forces too, as nodes that move with them (`glb_arrows`); in `.glb` alone.
+        path: the `.glb` or `.usdz` file; its folder is created.
+        bones: number of bones; None: chosen on held-out frames.
+        color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's.
+        skin: a surface of your own that deforms with the body (`read_skin`).
+        arrows: add the contact forces as animated nodes (`glb_arrows`); `.glb` only.
 
     Returns:
-        what was written, with the distance to the finite-element surface.
+        a report of the export, with the distance to the finite-element surface.
 
     Raises:
-        InputError: another ending, another file at that place, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
+        InputError: another suffix, a foreign file at that path, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
     """
     target = Path(path).expanduser()
     if target.suffix.lower() not in ENDINGS:
         hint = "--mcap and --rerun write for Foxglove and Rerun" if target.suffix.lower() in (".mcap", ".rrd") else None
-        raise InputError("the ending names no format that is written", where=target, expected=" or ".join(ENDINGS), hint=hint)
+        raise InputError("unsupported file suffix", where=target, expected=" or ".join(ENDINGS), hint=hint)
     check_target(target, folder=False, kind=GLB if target.suffix.lower() == ".glb" else USDZ)
     target.parent.mkdir(parents=True, exist_ok=True)
     if arrows:
         if target.suffix.lower() != ".glb":
-            raise InputError("arrows are not written there", where=target, expected="a .glb file")
+            raise InputError("arrows are supported in .glb files only", where=target, expected="a .glb file")
         return _with_arrows(run, export_glb(run, target, bones=bones, color_rgb=color_rgb, skin=skin))
     if target.suffix.lower() == ".usdz":
         with tempfile.TemporaryDirectory(prefix="femsense-export-") as folder:

@@ -1,4 +1,4 @@
-"""Packages that only some exports need."""
+"""Optional packages of single exports."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from femsense.core.errors import InputError
 
 
 def needed(module: str, *, package: str, extra: str, doing: str) -> Any:
-    """Return a module of a package that an extra brings.
+    """Return a module of an optional package.
 
     Arguments:
         module: its name.
         package, extra: what to install.
-        doing: what needs it, such as "writing MCAP".
+        doing: its purpose for the message, such as "writing MCAP".
 
     Raises:
-        InputError: it is not there.
+        InputError: the package is not installed.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise InputError(
-            f"{doing} needs a package that is not there",
+            f"{doing} needs a package that is not installed",
             where=package,
             found=str(error),
             expected=f"the extra [{extra}]",

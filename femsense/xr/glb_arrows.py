@@ -1,7 +1,7 @@
-"""Contact forces in a glTF file: an arrow for each contact that moves, turns and grows with its force, and what is not known of it.
+"""Contact forces in a glTF file: an arrow for each contact that moves, turns and scales with its force, and its uncertainty.
 
-The arrow's tip is the place of contact. A pale cone about it is one standard deviation of the direction, a pale spheroid at the tip
-one of the place. Where a contact is not there, its nodes have no size. Viewers without a page show forces by this.
+The tip of the arrow is the contact point. A pale cone shows one standard deviation of the direction, a pale spheroid at the tip one of the
+contact point. In frames without the contact its nodes have zero size. Any glTF viewer shows forces this way.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from femsense.xr.glb_reader import parts_of
 from femsense.xr.gltf import INDEX_DATA, VERTEX_DATA, Buffer, container
 
 LONGEST = 0.42
-"""Of the body's size: the arrow of the largest force."""
+"""Length of the arrow of the largest force, relative to the body's size."""
 SIDES = 24
 SHAFT, HEAD, HEAD_LENGTH = 0.03, 0.08, 0.28
 """Radii, and the length of the head, of an arrow of length 1."""
@@ -32,18 +32,18 @@ NODE = "forces"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Track:
-    """One contact over the frames; scale 0 where it is not there."""
+    """One contact over the frames; scale 0 in frames without it."""
 
     place: FloatArray
     """[m], shape (F, 3)."""
     turn: FloatArray
     """Quaternions x y z w that turn +Y into the force, shape (F, 4)."""
     length: FloatArray
-    """Of the arrow [m], shape (F,)."""
+    """Length of the arrow [m], shape (F,)."""
     aside: FloatArray
-    """One standard deviation of its tail, across [m], shape (F,)."""
+    """One standard deviation of its tail, across the force [m], shape (F,)."""
     blur: FloatArray
-    """One standard deviation of its place along each axis [m], shape (F, 3)."""
+    """One standard deviation of the contact point along each axis [m], shape (F, 3)."""
 
 
 class RunLike(Protocol):
@@ -115,10 +115,10 @@ def _tracks(run: RunLike, size: float) -> list[_Track]:
 
 
 def _track(contacts: Sequence[ContactForce], frames: IntArray, count: int, metres_per_newton: float) -> _Track:
-    """Return a contact over so many frames, seen in some of them."""
+    """Return a contact over `count` frames, present in `frames`."""
     from scipy.spatial.transform import Rotation
 
-    nearest = np.abs(np.arange(count)[:, None] - frames).argmin(axis=1)  # where it is not there it stays where it was
+    nearest = np.abs(np.arange(count)[:, None] - frames).argmin(axis=1)  # in frames without it, its last pose is kept
     forces = np.array([one.force_n_xyz for one in contacts])
     sizes = np.linalg.norm(forces, axis=1)
     along = forces / np.maximum(sizes, 1e-12)[:, None]

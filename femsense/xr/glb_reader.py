@@ -1,4 +1,4 @@
-"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, the bones' poses over time,
+"""Reads the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, bone poses over time,
 and the surface."""
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def read_glb(data: bytes) -> AnimatedSkin:
 
 
 def read_surface(data: bytes) -> Surface:
-    """Return what the same content shows. Raises InputError as `read_glb`."""
+    """Return the surface in the same content. Raises InputError as `read_glb`."""
     with _ours():
         return _surface(*parts_of(data))
 
@@ -78,7 +78,7 @@ def _ours() -> Iterator[None]:
 
 
 def parts_of(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the document and the binary part of a file. Raises ValueError where it is no binary glTF."""
+    """Return the JSON document and the binary chunk of a file. Raises ValueError if it is not binary glTF."""
     magic, _, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if magic != b"glTF" or kind != b"JSON" or length != len(data):
         raise ValueError("not binary glTF")

@@ -1,7 +1,7 @@
 """Skinned, animated meshes as binary glTF 2.0 (one `.glb` file), written by hand.
 
-The file stands in glTF's own frame: metres, Y up, right-handed. Bones are flat siblings under one root node, which turns the
-robot frame (Z up) into that frame; animation keys are therefore bone poses in the robot frame, the same numbers as live ones.
+The file uses glTF's frame: metres, Y up, right-handed. Bones are flat siblings under one root node, which rotates the
+robot frame (Z up) into that frame; animation keys are therefore bone poses in the robot frame, as in live streams.
 Reference: Khronos Group, glTF 2.0 Specification, 2021.
 """
 
@@ -33,7 +33,7 @@ VERTEX_DATA, INDEX_DATA = 34962, 34963
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExportReport:
-    """What an export wrote."""
+    """The result of an export."""
 
     path: Path
     """The file."""
@@ -78,12 +78,12 @@ def export_states(
         time_s: time of each frame [s], shape (F,), strictly increasing.
         nodes_m: nodes of each frame [m], shape (F, n, 3).
         path: the `.glb` file; replaced in one step.
-        bones: how many; chosen on held-out frames if None.
+        bones: number of bones; None: chosen on held-out frames.
         color_rgb: colour of the body, sRGB in 0 … 1, shape (3,).
         name: of the body, in the file.
 
     Returns:
-        what was written, with the distance to the finite-element surface.
+        a report of the export, with the distance to the finite-element surface.
 
     Raises:
         InputError: states that are not finite, times that do not increase, shapes that do not belong together.
@@ -118,7 +118,7 @@ def write_glb(
     texture: Texture | None = None,
     name: str = "robot",
 ) -> Path:
-    """Write a skinned mesh with one animation; no half-written file is ever seen (`write_beside`).
+    """Write a skinned mesh with one animation, under a temporary name that is renamed at the end (`write_beside`).
 
     Arguments:
         path: the file.
@@ -127,7 +127,7 @@ def write_glb(
         skin: bones and weights of these vertices.
         poses: T_robot_bone of each frame, shape (F, B, 4, 4).
         time_s: time of each frame [s], shape (F,), strictly increasing; the file counts from the first.
-        color_rgb: sRGB in 0 … 1: one colour (3,), or one a vertex (V, 3).
+        color_rgb: sRGB in 0 … 1: one colour (3,), or one per vertex (V, 3).
         texture: an image instead.
         name: of the body.
 
@@ -225,7 +225,7 @@ class Buffer:
         views: list[dict[str, Any]] | None = None,
         accessors: list[dict[str, Any]] | None = None,
     ) -> None:
-        """Begin with nothing, or with what a file has."""
+        """Begin empty, or with the content of a file."""
         self.content = bytearray() if content is None else content
         self.views, self.accessors = views or [], accessors or []
 
@@ -262,7 +262,7 @@ class Buffer:
 
 
 def _add_mesh(buffer: Buffer, rest: FloatArray, triangles: IntArray, skin: Skin, colors: FloatArray | None) -> dict[str, Any]:
-    """Return the primitive: vertices at rest in glTF's frame, since that is where the bones at rest put them."""
+    """Return the primitive, with vertices at rest in glTF's frame, which matches the inverse bind matrices."""
     R = T_GLTF_ROBOT[:3, :3]
     normals = vertex_normals(rest, triangles)
     normals[(normals**2).sum(axis=1) < 0.5] = (0.0, 0.0, 1.0)

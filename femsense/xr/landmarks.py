@@ -1,4 +1,4 @@
-"""Points that a twin shares with the real robot: its markers, and cameras where calibration put them."""
+"""Points that a digital twin shares with the real robot: its markers, and cameras at their calibrated positions."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Landmark:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Landmarks:
-    """What a person can touch to lay the twin over the robot."""
+    """Points for aligning the twin with the robot by touch."""
 
     markers: tuple[Landmark, ...] = ()
     cameras: tuple[Landmark, ...] = ()
 
 
 def landmarks_of_run(run: Path) -> Landmarks:
-    """Return the markers of the run's robot and the cameras of its calibration; what is no longer there is left out."""
+    """Return the markers of the run's robot and the cameras of its calibration, as far as their files exist."""
     document = _document(run / "run.json")
     calibration = _document(run / "calibration.json")
     told = _markers(_folder(document))
@@ -44,7 +44,7 @@ def landmarks_of_run(run: Path) -> Landmarks:
 
 
 def robot_table(run: Path) -> dict[str, Any]:
-    """Return what robot.toml of the run's robot says, or nothing where it is no longer there."""
+    """Return the content of robot.toml of the run's robot; empty if it no longer exists."""
     folder = _folder(_document(run / "run.json"))
     try:
         return {} if folder is None else tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))

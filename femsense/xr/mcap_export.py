@@ -27,7 +27,7 @@ TURNED = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class McapReport:
-    """What was written."""
+    """The result of an export."""
 
     frames: int
     clouds: int
@@ -124,7 +124,7 @@ def _entities(run: Run, index: int, contacts: list[ContactForce], at: int) -> li
 
 
 def _arrow(contact: ContactForce) -> dict[str, Any]:
-    """Return an arrow that ends where the force acts."""
+    """Return an arrow that ends at the contact point."""
     start, along = arrow_of(contact)
     length = float(np.linalg.norm(along))
     return {

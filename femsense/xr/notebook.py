@@ -24,7 +24,7 @@ class Shown:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return self.server.url
 
     def _repr_html_(self) -> str:

@@ -22,7 +22,7 @@ UNCERTAIN = (0.9, 0.25, 0.15, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class RerunReport:
-    """What was written."""
+    """The result of an export."""
 
     frames: int
     clouds: int
@@ -33,7 +33,7 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
     """Write a run as a file of the Rerun viewer.
 
     Entities: world/body (mesh), world/forces (arrows, N in the labels), world/places (ellipsoids of two standard deviations),
-    world/camera/cloud; force/…, tension/… and pressure/… as plots; log (what was wrong with a frame). The timeline is `time` [s].
+    world/camera/cloud; force/…, tension/… and pressure/… as plots; log (statuses other than ok). The timeline is `time` [s].
 
     Arguments:
         folder: a run that `femsense estimate` wrote.

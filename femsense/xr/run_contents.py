@@ -1,4 +1,4 @@
-"""What a run folder holds for those who show it: states, contacts, inputs, the skinned mesh."""
+"""The contents of a run folder for viewers: states, contacts, inputs, the skinned mesh."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def skin_for_run(folder: str | Path, file: str | Path, *, unit: str | None = Non
 
 
 def contacts_of_run(folder: str | Path) -> dict[str, Any]:
-    """Return what the page shows beside the mesh, ready for JSON; everything in the robot frame, SI.
+    """Return the data that the page shows in addition to the mesh, ready for JSON; robot frame, SI.
 
     Returns:
         `format`, `name`, `frame` ("robot"), and `frames`: for each state its time from the first [s], the frame's
-        number, status, residual and inputs where `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` names
-        the inputs, with their units and ranges: "declared" by robot.toml, or "reached" by the run where nothing is;
-        `markers` and `cameras` are what the real robot shares with it; `field` is what `stress_of_run` holds.
+        number, status, residual and inputs if `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` lists
+        the inputs, with units and ranges: "declared" by robot.toml, or else "reached" in the run;
+        `markers` and `cameras` are points shared with the real robot; `field` names the content of `stress_of_run`.
 
     Raises:
         InputError: a column is missing, or a value is not a number.
@@ -121,7 +121,7 @@ def stress_of_run(folder: str | Path, glb: bytes) -> SurfaceStress:
 
 
 def _stiffness(run: Path) -> float | None:
-    """Return 3 μ of the robot's material [Pa], or None where it is not known."""
+    """Return 3 μ of the robot's material [Pa], or None if it is unknown."""
     material = robot_table(run).get("material", {})
     try:
         return 1.5 * float(material["young_modulus_pa"]) / (1.0 + float(material["poisson_ratio"]))
@@ -136,7 +136,7 @@ def has_current_glb(run: Path) -> bool:
 
 
 def current_glb(run: Path, scratch: Path) -> Path:
-    """Return the mesh of the run, made anew where it is missing or older than the states."""
+    """Return the mesh of the run, created if it is missing or older than the states."""
     glb = run / "robot.glb"
     if has_current_glb(run):
         return glb
@@ -146,7 +146,7 @@ def current_glb(run: Path, scratch: Path) -> Path:
 
 
 class _Row:
-    """One row of a table, which knows where it stands."""
+    """One row of a table, with its location for messages."""
 
     def __init__(self, values: dict[str, str], where: str) -> None:
         self.values, self.where = values, where
@@ -160,7 +160,7 @@ class _Row:
         return value
 
     def optional(self, key: str) -> float | None:
-        """Return the number, or None where the cell is empty or says nan."""
+        """Return the number, or None if the cell is empty or nan."""
         text = (self.values.get(key) or "").strip()
         if not text:
             return None
@@ -194,7 +194,7 @@ def _contact(row: _Row) -> dict[str, Any]:
 
 
 INPUT_COLUMNS = (("tension_", "_n", "N", "cables", "tension_n"), ("pressure_", "_pa", "Pa", "chambers", "pressure_pa"))
-"""How frames.csv names what drives the robot: before and after the name, and its unit; and how robot.toml names its limits."""
+"""Inputs in frames.csv: prefix and suffix of the column, unit; and key and suffix of the limits in robot.toml."""
 
 
 def _input_columns(rows: list[_Row]) -> list[str]:
@@ -203,8 +203,8 @@ def _input_columns(rows: list[_Row]) -> list[str]:
 
 
 def _input(column: str, rows: list[_Row], robot: dict[str, Any]) -> dict[str, Any]:
-    """Return name, unit and range of an input: what robot.toml allows, or from 0 to the largest value of the run where it
-    says nothing, or less than the run has."""
+    """Return name, unit and range of an input: declared by robot.toml, or from 0 to the largest value of the run if nothing is declared or
+    the run exceeds it."""
     before, after, unit, table, limit = next(kind for kind in INPUT_COLUMNS if column.startswith(kind[0]))
     values = [value for value in (row.optional(column) for row in rows) if value is not None]
     name = column[len(before) : -len(after)]
@@ -223,7 +223,7 @@ def _input(column: str, rows: list[_Row], robot: dict[str, Any]) -> dict[str, An
 
 
 def _rows(path: Path, columns: Iterable[str]) -> list[_Row]:
-    """Return the rows of a CSV file; none where there is no file."""
+    """Return the rows of a CSV file; empty if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -241,7 +241,7 @@ def _nearest(times: FloatArray, time: float) -> int:
 
 
 def run_folder(folder: str | Path) -> Path:
-    """Return the folder of a run. Raises InputError where it holds no states."""
+    """Return the folder of a run. Raises InputError if it has no states."""
     run = Path(folder)
     if not (run / "states.npz").is_file():
         raise InputError(
@@ -268,7 +268,7 @@ def load_states(run: Path) -> dict[str, Any]:
 
 
 def name_of_run(run: Path) -> str:
-    """Return the robot's name where run.json tells it, else the folder's."""
+    """Return the robot's name from run.json, else the folder's."""
     try:
         known = json.loads((run / "run.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""What a viewer of another program is given of a run: the body's surface, arrows of forces, clouds, the camera."""
+"""The scene of a run for other viewers: the body's surface, force arrows, clouds, the camera."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def camera_pose(folder: str | Path) -> FloatArray | None:
 
 
 def recording_of(run: Run) -> Recording | None:
-    """Return the recording that a run was made from, or None where it is no longer there."""
+    """Return the recording of a run, or None if it no longer exists."""
     from femsense.io.recording_folder import load_recording
 
     folder = run.recording_folder
@@ -35,7 +35,7 @@ def recording_of(run: Run) -> Recording | None:
 
 
 def cloud_of(recording: Recording | None, frame: int) -> PointCloud | None:
-    """Return the cloud of a frame [m, camera frame], or None where there is none."""
+    """Return the cloud of a frame [m, camera frame], or None if there is none."""
     from femsense.io.clouds.frame_clouds import read_frame_cloud
 
     at = np.flatnonzero(recording.frame_numbers == frame) if recording is not None else np.zeros(0, dtype=np.int64)
@@ -50,7 +50,7 @@ def body_surface(run: Run, index: int) -> tuple[FloatArray, IntArray]:
 
 
 def arrow_of(contact: ContactForce) -> tuple[FloatArray, FloatArray]:
-    """Return start and vector [m] of an arrow that ends where the force acts, each of shape (3,)."""
+    """Return start and vector [m] of an arrow that ends at the contact point, each of shape (3,)."""
     size = float(np.linalg.norm(contact.force_n_xyz))
     length = max(METRES_PER_NEWTON * size, 1e-4)
     along = contact.force_n_xyz / max(size, 1e-12) * length

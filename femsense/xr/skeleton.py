@@ -1,4 +1,4 @@
-"""Bones: where they sit on the body at rest, and how they are placed."""
+"""Bones: their poses on the body at rest, and their placement."""
 
 from __future__ import annotations
 

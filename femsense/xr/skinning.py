@@ -1,10 +1,10 @@
-"""Linear blend skinning of a deformed surface: weights of at most four bones a vertex, and bone poses of each frame.
+"""Linear blend skinning of a deformed surface: weights of at most four bones per vertex, and bone poses of each frame.
 
     x_i = Σ_b w_ib (R_b p_i + t_b),   w_ib ≥ 0,   Σ_b w_ib = 1,   at most four w_ib > 0
 
 with p_i the rest position relative to the origin of bone b. Weights and rigid transforms are fitted in turn to frames of
-the surface (Le and Deng 2012, Smooth skinning decomposition with rigid bones). With fixed weights, a frame is one small
-product and a few sweeps of rigid fits, each bone against what the others leave.
+the surface (Le and Deng 2012, Smooth skinning decomposition with rigid bones). With fixed weights, a frame takes one small
+product and a few sweeps of rigid fits, each bone fitted to the residual of the others.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ INFLUENCES = 4
 BONE_COUNTS = (4, 6, 8, 12, 16, 20, 24, 32)
 """Numbers of bones that are tried."""
 FIT_VERTICES = 3000
-"""Bones are sought on at most so many vertices; the weights of all vertices follow."""
+"""Maximum number of vertices used to find bones; the weights of all vertices follow."""
 FIT_FRAMES = 80
-"""Bones are sought on at most so many frames, those that differ most."""
+"""Maximum number of frames used to find bones, the most different ones."""
 FEWEST_FRAMES_TO_CHOOSE = 8
 """With fewer frames the number of bones is not chosen on held-out ones."""
 DEFAULT_BONES = 12
@@ -34,9 +34,9 @@ ROUNDS = 12
 FIT_SWEEPS = 12
 ONLINE_SWEEPS = 4
 NOISE = 1e-6
-"""Motion below this share of the body's size says nothing about weights."""
+"""Motion below this share of the body's size carries no information on weights."""
 PULL = 1e-3
-"""Pull of the weights to the smooth ones, as a share of the squared error of single bones."""
+"""Regularisation of the weights towards smooth ones, as a share of the squared error of single bones."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -97,8 +97,8 @@ class PoseFit:
 
         Arguments:
             vertices: positions of the surface [m], shape (V, 3). Not checked here: this is the step of every live frame.
-            start: poses of the frame before, shape (B, 4, 4). The better of them and of separate rigid fits is improved.
-            sweeps: how often each bone is fitted against what the others leave.
+            start: poses of the previous frame, shape (B, 4, 4). The better of them and of separate rigid fits is improved.
+            sweeps: number of passes in which each bone is fitted to the residual of the others.
         """
         bones = len(self.origins)
         Y = (self.A @ vertices).reshape(bones, 4, 3)
@@ -113,7 +113,7 @@ def prepare_poses(skin: Skin) -> PoseFit:
 
 
 def fit_poses(skin: Skin, states: npt.ArrayLike, *, sweeps: int = FIT_SWEEPS) -> FloatArray:
-    """Fit the bones to frames of the surface, each started from the one before.
+    """Fit the bones to frames of the surface, each starting from the previous one.
 
     Arguments:
         skin: the surface and its weights.
@@ -155,16 +155,16 @@ def skin_rms(skin: Skin, poses: FloatArray, states: FloatArray) -> float:
 
 
 def fit_skin(rest: npt.ArrayLike, states: npt.ArrayLike, *, bones: int | None = None) -> Skin:
-    """Find bones and weights for a surface that moves.
+    """Compute bones and weights for a moving surface.
 
     Arguments:
         rest: vertices at rest, robot frame [m], shape (V, 3).
         states: the same vertices in each frame [m], shape (F, V, 3); one frame is enough.
-        bones: how many, 1 … 255. Default: chosen on held-out frames among 4 … 32, since more bones than the motion
-            needs make unseen frames worse; 12 where there are too few frames to hold any out.
+        bones: number of bones, 1 … 255. Default: chosen on held-out frames among 4 … 32, since more bones than the motion
+            needs increase the error on unseen frames; 12 if there are too few frames to hold any out.
 
     Returns:
-        the skin. Fewer bones come back where the body has fewer distinct vertices.
+        the skin. It has fewer bones if the body has fewer distinct vertices.
 
     Raises:
         InputError: shapes that do not belong together, no frame, numbers that are not finite, an impossible bone count.
@@ -214,7 +214,7 @@ def as_states(states: npt.ArrayLike, vertices: int) -> FloatArray:
             where=f"states[{bad[0]}]",
             found=f"{len(bad)} of {len(frames)} frames with numbers that are not finite",
             expected="finite positions [m]",
-            hint="leave out the frames whose equilibrium was not found",
+            hint="leave out the frames without equilibrium",
         )
     return frames
 
@@ -317,9 +317,9 @@ def _fit_weights(rest: FloatArray, frames: FloatArray, origins: FloatArray, pose
 
 
 def _smooth_weights(rest: FloatArray, origins: FloatArray) -> FloatArray:
-    """Return weights (V, B) that fall off with distance: inverse squared distances to the four nearest bones.
+    """Return weights (V, B) that decrease with distance: inverse squared distances to the four nearest bones.
 
-    The fifth distance is taken off, so that the weights change without steps where one bone gives way to another.
+    The fifth distance is subtracted, so that the weights are continuous where the set of nearest bones changes.
     """
     squared = ((rest[:, None] - origins) ** 2).sum(axis=2)
     inverse = 1.0 / (squared + 1e-6 * _size(rest) ** 2)
@@ -331,8 +331,8 @@ def _smooth_weights(rest: FloatArray, origins: FloatArray) -> FloatArray:
 
 
 def _finished(rest: FloatArray, origins: FloatArray, joints: IntArray, weights: FloatArray) -> Skin:
-    """Return the skin with each bone in the middle of what it carries (weights squared),
-    and with bones that carry nothing left out."""
+    """Return the skin with each bone at the weighted centre of its vertices (weights squared),
+    without bones that carry no weight."""
     dense = np.zeros((len(origins), len(rest)))
     np.add.at(dense, (joints.ravel(), np.repeat(np.arange(len(rest)), INFLUENCES)), weights.ravel())
     used = (dense**2).sum(axis=1) > 1e-12

@@ -46,7 +46,7 @@ def set_bone(M: FloatArray, b: int, sums: FloatArray, moment: FloatArray, weight
         sums: Σ w p qᵀ over Σ w qᵀ, shape (4, 3).
         moment: Σ w p, shape (3,).
         weight: Σ w.
-        prior: weight of the present rotation, which decides what the vertices leave open.
+        prior: weight of the current rotation, which determines directions that the vertices leave free.
         R: work, shape (3, 3).
     """
     if weight <= 1e-300:
@@ -65,14 +65,14 @@ def set_bone(M: FloatArray, b: int, sums: FloatArray, moment: FloatArray, weight
 
 @njit(cache=True)
 def sweep_poses(N: FloatArray, Y: FloatArray, share: FloatArray, start: FloatArray, sweeps: int) -> FloatArray:
-    """Return bone poses (B, 4, 4) after sweeps of rigid fits, each bone against what the others leave.
+    """Return bone poses (B, 4, 4) after sweeps of rigid fits, each bone fitted to the residual of the others.
 
     Arguments:
         N: normal matrices of all pairs of bones, shape (B, 4, B, 4).
         Y: sums of weighted rest positions times vertices of the frame, shape (B, 4, 3).
         share: Σ w of each bone, shape (B,).
         start: poses to start from where they fit better than separate fits, shape (B, 4, 4), or (0, 4, 4).
-        sweeps: how many.
+        sweeps: number of passes.
     """
     bones = len(N)
     R, sums, moment = np.empty((3, 3)), np.empty((4, 3)), np.empty(3)
@@ -119,13 +119,13 @@ def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray, before: Float
 
 @njit(cache=True)
 def prior_of(N: FloatArray, b: int) -> float:
-    """Return the small weight of a bone's present rotation, which decides what its vertices leave open."""
+    """Return the small weight of a bone's current rotation, which determines directions that its vertices leave free."""
     return 1e-9 * float(N[b, 0, b, 0] + N[b, 1, b, 1] + N[b, 2, b, 2])
 
 
 @njit(cache=True)
 def left_by_others(N: FloatArray, Y: FloatArray, M: FloatArray, b: int, sums: FloatArray) -> None:
-    """Write what bone b has to explain: its sums of the frame less what the other bones do, shape (4, 3)."""
+    """Write the target of bone b: its sums of the frame minus the contributions of the other bones, shape (4, 3)."""
     for i in range(4):
         for k in range(3):
             rest = Y[b, i, k]
@@ -143,7 +143,7 @@ def left_by_others(N: FloatArray, Y: FloatArray, M: FloatArray, b: int, sums: Fl
 def weights_of_vertices(
     rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, smooth: FloatArray, tiny: float, pull: float
 ) -> tuple[IntArray, FloatArray]:
-    """Return joints (V, 4) and weights (V, 4) of least squares over the frames, each vertex for itself.
+    """Return joints (V, 4) and weights (V, 4) that fit the frames by least squares, independently for each vertex.
 
     Minimises (1/F) Σ_f |Σ_b w_b (R_b p + t_b) − x|² + λ |w − smooth|² with λ = tiny + pull · (smallest error of a single bone).
 
@@ -152,8 +152,8 @@ def weights_of_vertices(
         states: vertices of all frames [m], shape (V, F, 3).
         origins: bone origins at rest [m], shape (B, 3).
         poses: T_robot_bone, shape (F, B, 4, 4).
-        smooth: weights where motion says nothing, shape (V, B).
-        tiny: squared motion that says nothing [m²].
+        smooth: weights in the absence of motion, shape (V, B).
+        tiny: squared motion without information [m²].
         pull: share of a single bone's squared error.
     """
     vertices, frames, bones = len(rest), len(poses), len(origins)
@@ -198,8 +198,8 @@ def weights_of_vertices(
 def misses_of_bones(
     rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, D: FloatArray, error: FloatArray
 ) -> tuple[float, float]:
-    """Write how far each bone alone misses a vertex, (B, 3 F), and its mean square (B,);
-    return the least and the mean of these."""
+    """Write the error of each vertex for each single bone, (B, 3 F), and its mean square (B,);
+    return the smallest and the mean of these."""
     frames = len(poses)
     p = np.empty(3)
     least, mean = np.inf, 0.0
@@ -248,8 +248,8 @@ def smallest(values: FloatArray, count: int) -> IntArray:
 def simplex_least_squares(G: FloatArray, g: FloatArray) -> FloatArray:
     """Return w ≥ 0 with Σ w = 1 that minimises wᵀ G w / 2 − g w, shape (k,), for positive definite G.
 
-    Active set in the manner of Lawson and Hanson (1974): begin with the best single entry, let in the entry that gains most,
-    step back to the border where an entry would turn negative.
+    Active set in the manner of Lawson and Hanson (1974): begin with the best single entry, add the entry with the largest gain,
+    and step back to the boundary where an entry would become negative.
     """
     k = len(g)
     first = 0

@@ -1,10 +1,10 @@
-"""Von Mises stress on the surface of a body, from its states alone, for colours.
+"""Von Mises stress on the surface of a body, computed from its states, for visualisation.
 
     E = ½ (FᵀF − I),   S = λ tr(E) I + 2 μ E,   σ_vm = √(3/2) |dev S| = √6 μ |dev E|
 
 with F of each element's corners (St. Venant–Kirchhoff, Holzapfel 2000, section 6.5),
 averaged at each corner over the elements around it by their volumes; the middle of an edge has the mean of its ends.
-At the strains of soft robots in use it follows the stress of the corotational law; it is a picture, no measurement.
+At the strains of soft robots in use it agrees with the corotational law; it is a visualisation, not a measurement.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class SurfaceStress:
 def surface_stress(strain: FloatArray, stiffness_pa: float) -> SurfaceStress:
     """Return the stress of strains at vertices, shape (F, V).
 
-    stiffness_pa: 3 μ; 100 gives strains in percent where no material is known.
+    stiffness_pa: 3 μ; 100 gives strains in percent if the material is unknown.
     """
     largest = float(strain.max(initial=0.0))
     return SurfaceStress(stiffness_pa * largest, np.rint(255.0 * strain / max(largest, 1e-12)).astype(np.uint8))

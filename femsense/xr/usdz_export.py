@@ -25,7 +25,7 @@ ROUGHNESS = 0.55
 
 
 def write_usdz(glb: bytes, path: str | Path) -> Path:
-    """Write the content of a `.glb` file of femsense as `.usdz`; beside and renamed.
+    """Write the content of a `.glb` file of femsense as `.usdz`, under a temporary name that is renamed at the end.
 
     Arguments:
         glb: content of the file that `export_glb` wrote.
@@ -57,7 +57,7 @@ def write_usdz(glb: bytes, path: str | Path) -> Path:
 
 
 def _describe(usd: dict[str, Any], stage: Any, name: str, end_s: float) -> Any:
-    """Set units and times; return the skeleton's root, which is what the file shows."""
+    """Set units and times; return the skeleton's root, the default prim of the file."""
     usd["UsdGeom"].SetStageUpAxis(stage, usd["UsdGeom"].Tokens.y)
     usd["UsdGeom"].SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(TICKS)

@@ -22,7 +22,7 @@ from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
 from femsense.xr.skinning import as_states, fit_poses, fit_skin, rms, skin_vertices, weigh_points
 
 BUDGET = 100_000
-"""Vertices at most: what headsets draw at their rate."""
+"""Maximum number of vertices: what headsets draw at their frame rate."""
 FAR = 0.05
 """A vertex farther from the body than this share of its size does not belong to it; half of the vertices may not."""
 SHOWN = 40
@@ -68,9 +68,9 @@ def read_skin(path: str | Path, *, unit: str | None = None, T_robot_skin: Any = 
 
 
 def decimated(skin: UserSkin, budget: int, *, baked: FloatArray | None = None) -> UserSkin:
-    """Return a surface with at most so many vertices; colours are those of the nearest vertex of before.
+    """Return a surface with at most `budget` vertices; colours are those of the nearest original vertex.
 
-    baked: colours that stand for the texture, sRGB, shape (V, 3).
+    baked: colours sampled from the texture, sRGB, shape (V, 3).
     """
     import open3d as o3d
     from scipy.spatial import cKDTree
@@ -94,7 +94,7 @@ def decimated(skin: UserSkin, budget: int, *, baked: FloatArray | None = None) -
 
 
 def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
-    """Tie a surface to a body. Raises InputError where most of it lies elsewhere, such as in another unit or frame."""
+    """Embed a surface in a body. Raises InputError if most of it is far from the body, for example in another unit or frame."""
     ties = embed_points(mesh, skin.rest)
     size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
     far = float(np.median(ties.outside))
@@ -123,22 +123,22 @@ def export_skin(
     color_rgb: npt.ArrayLike | None = None,
     name: str = "robot",
 ) -> ExportReport:
-    """Write the frames of a run as an animated surface of the user's own; bones are those of the body's surface.
+    """Write the frames of a run as an animated surface of the user; bones are those of the body's surface.
 
     Arguments:
         mesh: the body at rest [m].
         time_s, nodes_m: times [s], shape (F,), and nodes of each frame [m], shape (F, n, 3).
         path: the `.glb` file.
         skin: the surface.
-        bones: how many; chosen on held-out frames if None.
-        color_rgb: of a surface without colours.
+        bones: number of bones; None: chosen on held-out frames.
+        color_rgb: colour of a surface without colours.
         name: of the body, in the file.
 
     Returns:
-        what was written; its errors are distances to where the elements carry the vertices, over at most SHOWN frames.
+        a report of the export; its errors are distances to the vertices embedded in the elements, over at most SHOWN frames.
 
     Raises:
-        InputError: as `gltf.export_states`, and where the surface lies elsewhere.
+        InputError: as `gltf.export_states`, and if the surface is far from the body.
     """
     ties = tie_skin(skin, mesh)
     frames = as_states(nodes_m, len(mesh.nodes))
@@ -184,7 +184,7 @@ def _load(file: Path) -> Any:
 
 
 def _colors(mesh: Any) -> FloatArray | None:
-    """Return the colours that a file gives its vertices or its one material."""
+    """Return the vertex colours of a file, or the colour of its only material."""
     if mesh.visual.kind in ("vertex", "face"):
         return freeze(np.asarray(mesh.visual.vertex_colors, dtype=float)[:, :3] / 255.0)
     material = getattr(mesh.visual, "material", None)
@@ -204,7 +204,7 @@ def _texture(mesh: Any) -> Texture | None:
 
 
 def _baked(mesh: Any) -> FloatArray | None:
-    """Return what the texture shows at each vertex, sRGB, shape (V, 3)."""
+    """Return the texture colour at each vertex, sRGB, shape (V, 3)."""
     if _texture(mesh) is None:
         return None
     return freeze(np.asarray(mesh.visual.to_color().vertex_colors, dtype=float)[:, :3] / 255.0)

@@ -19,7 +19,7 @@ from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, s
 
 PAGE = Path(__file__).with_name("viewer") / "dist"
 Content = Path | bytes | Callable[[], bytes]
-"""Of a file that is served: where it is, what is in it, or how that is made when it is asked for."""
+"""A served file: its path, its content, or a function that creates it on request."""
 TYPES = {".glb": "model/gltf-binary", ".js": "text/javascript", ".json": "application/json"}
 
 
@@ -36,7 +36,7 @@ class ViewServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
     def start(self) -> None:
@@ -50,7 +50,7 @@ class ViewServer(ThreadingHTTPServer):
 
     def stop(self) -> None:
         """Stop answering, free the port, remove temporary files."""
-        if self._thread.ident is not None:  # an interrupted `wait` leaves a thread that says it is not alive
+        if self._thread.ident is not None:  # after an interrupted `wait`, is_alive() of the thread is wrong
             self.shutdown()
         self.server_close()
         self.scratch.cleanup()
@@ -60,13 +60,13 @@ class ViewServer(ThreadingHTTPServer):
 
 
 def serve(folder: str | Path, *, port: int = 0, open_browser: bool = True, page: Path = PAGE) -> ViewServer:
-    """Start the page of a run on 127.0.0.1 and return at once.
+    """Serve the page of a run on 127.0.0.1 and return immediately.
 
     Arguments:
-        folder: holds `states.npz`, and `contacts.csv` and `frames.csv` where there are contacts. `robot.glb` is
-            made where it is missing or older than the states; in a temporary place where the folder cannot be written.
-        port: 0 takes a free one.
-        open_browser: shows the page in the default browser.
+        folder: contains `states.npz`, and `contacts.csv` and `frames.csv` if there are contacts. `robot.glb` is
+            created if it is missing or older than the states, in a temporary folder if the run is read-only.
+        port: 0 selects a free one.
+        open_browser: open the page in the default browser.
         page: folder of the built page.
 
     Returns:
@@ -111,7 +111,11 @@ def write_static_page(folder: str | Path, out_dir: str | Path, *, page: Path = P
     foreign = [name for name in (*files, "fields.bin") if (out / name).exists() and not (out / "contacts.json").is_file()]
     if foreign:
         raise InputError(
-            "something else stands there", where=out, found=", ".join(foreign), expected="a folder of its own", hint="another -o"
+            "the folder contains other files",
+            where=out,
+            found=", ".join(foreign),
+            expected="a folder of its own",
+            hint="another -o",
         )
     followed(out).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="femsense-view-") as scratch:
@@ -139,7 +143,7 @@ def page_files(page: Path) -> dict[str, Path]:
 
 
 def live_page_files(page: Path) -> dict[str, Path | bytes]:
-    """Return the same for a page that shows what streams beside it. Raises MissingDependency."""
+    """Return the same for a page that also shows a live stream. Raises MissingDependency."""
     files: dict[str, Path | bytes] = {**page_files(page)}
     index = (page / "index.html").read_text(encoding="utf-8")
     files["index.html"] = index.replace("<html ", '<html data-mode="live" ', 1).encode()
@@ -155,7 +159,7 @@ def _json(value: dict[str, Any]) -> bytes:
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Answers with the files of the page and nothing else of this machine."""
+    """Serves the files of the page, and no other file of this machine."""
 
     server: ViewServer
 
@@ -185,4 +189,4 @@ class _Handler(SimpleHTTPRequestHandler):
             self.wfile.write(data)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the library does not print."""
+        """Suppress the library's log output."""

@@ -75,7 +75,7 @@ def test_the_first_answer_says_that_it_converges_and_moves_no_node_far() -> None
     rest = follower.step({"tip": TIP[0]}).positions
     motion = follower.step(target)
     moved = np.linalg.norm(motion.positions - rest, axis=1).max()
-    assert motion.status == "converging" and motion.text.startswith("converging: ") and "mm off by now" in motion.text
+    assert motion.status == "converging" and motion.text.startswith("converging: ") and "mm from the target" in motion.text
     assert 0.0 < moved < 0.045 * robot.body.reach  # by both inputs
     assert rested(follower, target).status == "reached"
 

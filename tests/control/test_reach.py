@@ -12,7 +12,7 @@ from helpers import DATA, block_mesh
 
 import femsense as fs
 from femsense.control.goal import make_goal
-from femsense.control.slopes import Slopes, exact_slopes, lent_slopes
+from femsense.control.slopes import Slopes, approximate_slopes, exact_slopes
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import SolveOptions
 from femsense.fem.mesh import embed_points
@@ -83,10 +83,10 @@ def test_slopes_are_those_of_the_states_near_by() -> None:
     slopes, keeps = exact_slopes(robot.body, goal, state)
     near = place(robot, {"top": 0.4 + 1e-4, "side": 0.3}) - place(robot, {"top": 0.4 - 1e-4, "side": 0.3})
     np.testing.assert_allclose(slopes.points[:, 0], near / 2e-4, rtol=1e-4, atol=1e-8)
-    lent = lent_slopes(robot.body, goal, keeps)
+    lent = approximate_slopes(robot.body, goal, keeps)
     assert slopes.exact and lent is not None and not lent.exact
     np.testing.assert_allclose(lent.points, slopes.points)
-    assert lent_slopes(robot.body, goal, replace(state, factor=None)) is None
+    assert approximate_slopes(robot.body, goal, replace(state, factor=None)) is None
 
 
 def test_slopes_that_a_step_has_shown_give_that_step_and_leave_others() -> None:
@@ -268,15 +268,15 @@ def test_the_finger_of_the_peers_reaches_its_heights_and_keeps_its_limits() -> N
     ("target", "more", "text"),
     [
         ({"tap": [0.0, 0.0, 0.0]}, {}, "did you mean 'tip'"),
-        ({}, {}, "nothing is wanted"),
-        ({"tip": [0.0, 0.0]}, {}, "not a place"),
+        ({}, {}, "no target"),
+        ({"tip": [0.0, 0.0]}, {}, "not a position"),
         ({(0.05, 0.5, 0.0): [0.0, 0.0, 0.0]}, {}, r"target: far from the surface of the body\n.* 470.0 mm from the body"),
         ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([0.05, 0.5, 0.0], [0.0, 0.0, 0.1])]}, "forces: far from the surface"),
         ({"tip": [0.0, 0.0, 0.0]}, {"forces": [([50.0, 0.0, 15.0], [0.0, 0.0, 0.1])]}, "divide by 1000"),
         ({"tip": [0.0, 0.0, 0.0]}, {"contacts": [fs.WallContact((0.05, 0.5, 0.0), (0.0, 0.0, 1.0), 0.0, 0.1)]}, "contacts: far"),
         ({"tip": [0.0, 0.0, 0.0]}, {"control": "torque"}, "unknown control"),
-        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "no cable or chamber"),
-        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "wrong way round"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "unknown cable or chamber"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "reversed limits"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(target: dict[str, list[float]], more: dict[str, object], text: str) -> None:

@@ -90,7 +90,7 @@ def test_the_script_rises_and_refuses_what_bursts(folder: Path) -> None:
     np.testing.assert_allclose(plan.pressures[:, 0], [5e3, 10e3, 5e3, 0, 4e3, 8e3, 6e3, 6e3, 0, 6e3, 6e3])
     assert plan.commanded.shape == (11, 0)
     wrong = {
-        "more pressure than the chamber bears": changed(SCRIPT, {"sweeps__0__chambers": {"core": 13e3}}),
+        "pressure above the chamber's maximum": changed(SCRIPT, {"sweeps__0__chambers": {"core": 13e3}}),
         "(?s)unknown chamber.*core": changed(SCRIPT, {"sweeps__0__chambers": {"cor": 1e3}}),
         "another number of values than frames": changed(SCRIPT, {"sweeps__1__chambers": {"core": [1.0]}}),
     }

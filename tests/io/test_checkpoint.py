@@ -61,7 +61,7 @@ def test_a_search_that_was_stopped_goes_on_where_it_was(stopped: Path, tmp_path:
     file.parent.mkdir()
     file.write_bytes(stopped.read_bytes())
     found, whole = search(file, said.append), search(None, lambda text: None)
-    assert said[:2] == ["going on where it stopped (effects found: 1)", "screening effects (1 found so far)"]
+    assert said[:2] == ["resuming the search (effects found: 1)", "screening effects (1 found so far)"]
     assert found.verdict == whole.verdict and found.sentence == whole.sentence
     assert [e.name for e in found.effects] == [e.name for e in whole.effects] and "cable_friction" in found.sentence
     assert found.after.validation_rms_m == pytest.approx(whole.after.validation_rms_m, rel=1e-4)

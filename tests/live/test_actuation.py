@@ -90,7 +90,7 @@ def test_late_values_hold_and_are_said() -> None:
 def test_a_sender_whose_clock_stands_still_is_said() -> None:
     actuation = reader([(5.0, np.array([1.0, 2.0]))] * 3, limits=ActuationLimits(late_s=0.05))
     assert within(5.0, lambda: Notice.ACTUATION_FROZEN in actuation.notices())
-    assert "stands still" in actuation.notices()[Notice.ACTUATION_FROZEN]
+    assert "does not advance" in actuation.notices()[Notice.ACTUATION_FROZEN]
     actuation.close()
 
 

@@ -49,6 +49,8 @@ def calibration(rotation: float, position: float, status: str = "converged") -> 
 
 def test_a_pose_that_is_known_badly_does_not_suffice() -> None:
     assert insufficiency(calibration(1e-3, 1e-4)) == ""
-    assert "2.00 mm" in insufficiency(calibration(1e-3, 2e-3)) and "needed are 0.50 mm" in insufficiency(calibration(1e-3, 2e-3))
+    assert "2.00 mm" in insufficiency(calibration(1e-3, 2e-3)) and "required are 0.50 mm" in insufficiency(
+        calibration(1e-3, 2e-3)
+    )
     assert "0.57°" in insufficiency(calibration(1e-2, 1e-4))
     assert insufficiency(calibration(1e-3, 1e-4, "not settled: 40 steps")) == "not settled: 40 steps"

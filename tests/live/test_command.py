@@ -51,7 +51,7 @@ def test_a_recording_is_replayed_into_a_session_that_every_command_takes(block: 
     assert run(["export", str(session), "-o", str(tmp_path / "robot.glb")]) == 0 and (tmp_path / "robot.glb").is_file()
     assert run(["inspect", str(session)]) == 0
     again = femsense(*words)
-    assert again.returncode == 2 and "a session replaces nothing" in json.loads(again.stdout)["error"]
+    assert again.returncode == 2 and "a session does not replace files" in json.loads(again.stdout)["error"]
 
 
 def test_wrong_words_are_refused_with_what_to_try(

@@ -38,7 +38,7 @@ def test_a_camera_that_stays_has_no_drift() -> None:
 def test_a_shift_of_the_camera_is_measured_and_said() -> None:
     found = drift_after(lambda p: p + np.array([0.0, 0.003, 0.0]))
     assert found.position_m == pytest.approx(3e-3, rel=0.1) and found.is_moved and not found.is_deformed
-    assert "the pose by 2.9 mm" in found.text and "camera or base moved" in found.text
+    assert "the pose by 2.9 mm" in found.text and "the camera or the base moved" in found.text
 
 
 def test_a_turn_of_the_camera_is_measured() -> None:

@@ -65,11 +65,11 @@ def test_who_is_slow_gets_the_newest_frame_and_the_others_are_counted(recording:
 @pytest.mark.parametrize(
     ("fault", "state", "words"),
     [
-        ("unplug=3+1.5", LinkState.UNPLUGGED, "plug the camera in again"),
+        ("unplug=3+1.5", LinkState.UNPLUGGED, "reconnect the camera"),
         ("refuse=3+1.5", LinkState.REFUSED, "close other programs"),
         ("silent=3+0.8", LinkState.TIMED_OUT, "check cable and hub"),
         ("hang=3+1.0", LinkState.TIMED_OUT, "no frame for"),
-        ("crash=3+0.1", LinkState.RECONNECTING, "the driver of the camera crashed"),
+        ("crash=3+0.1", LinkState.RECONNECTING, "the camera driver crashed"),
     ],
 )
 def test_a_camera_that_is_lost_comes_back_by_itself(recording: Path, fault: str, state: LinkState, words: str) -> None:
@@ -102,9 +102,9 @@ def test_a_camera_without_a_first_frame_is_restarted(recording: Path) -> None:
     ("fault", "notice", "words"),
     [
         ("usb2=0+600", Notice.SLOW_LINK, "USB 2.1: use a USB 3 port"),
-        ("back=3+600", Notice.STAMPS_BACK, "times are mapped anew"),
+        ("back=3+600", Notice.STAMPS_BACK, "the time mapping restarts"),
         ("jump=3+600", Notice.STAMPS_JUMP, "by 100"),
-        ("apart=0+30", Notice.OUT_OF_STEP, "80 ms of 100 ms"),
+        ("apart=0+30", Notice.OUT_OF_STEP, "80 ms of a period of 100 ms"),
         ("drop=3+0.4", Notice.DROPPED, "the device lost"),
         ("flicker=0+600", Notice.FLICKER, "between 4.0 and 12.0 ms"),
     ],

@@ -50,7 +50,7 @@ def test_a_frame_after_a_time_out_is_a_stream_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("event", "words"), [(LinkEvent.UNPLUGGED, "plug the camera in again"), (LinkEvent.REFUSED, "other programs")]
+    ("event", "words"), [(LinkEvent.UNPLUGGED, "reconnect the camera"), (LinkEvent.REFUSED, "other programs")]
 )
 def test_a_lost_camera_is_tried_again_at_longer_and_longer_intervals(event: LinkEvent, words: str) -> None:
     link = streaming()

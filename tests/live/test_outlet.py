@@ -83,7 +83,7 @@ def test_the_terminal_shows_force_interval_age_rates_drops_and_keys(robot: Robot
 
 def test_a_lost_camera_leaves_the_last_answer_with_its_age(robot: Robot) -> None:
     text = text_of(snapshot_of(robot, LinkState.UNPLUGGED, "gone"), 103.0)
-    assert "unplugged for 5 s; gone; plug the camera in again" in text and "3.1 s old: ok" in text and "1.118" in text
+    assert "unplugged for 5 s; gone; reconnect the camera" in text and "3.1 s old: ok" in text and "1.118" in text
 
 
 def test_lines_say_what_has_changed_once(robot: Robot) -> None:

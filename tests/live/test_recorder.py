@@ -84,7 +84,7 @@ def test_a_disk_that_is_full_ends_the_recording_and_not_the_session(recorder_of)
     recorder = recorder_of(write=full)
     recorder.keep(frame(0), np.zeros(2), contact_free=False)
     assert within(5.0, lambda: recorder.error != "")
-    assert recorder.error == "nothing is recorded any more: No space left on device"
+    assert recorder.error == "recording has stopped: No space left on device"
     assert not recorder.keep(frame(1), np.zeros(2), contact_free=False) and recorder.lost.sensed == 1
     recorder.close()
 
@@ -99,5 +99,5 @@ def test_events_are_kept_with_their_times(recorder_of) -> None:
 
 def test_a_session_replaces_nothing(recorder_of) -> None:
     recorder_of().close()
-    with pytest.raises(InputError, match="a session replaces nothing"):
+    with pytest.raises(InputError, match="a session does not replace files"):
         recorder_of()

@@ -123,7 +123,9 @@ def test_a_tare_begins_a_part_of_its_own_that_replays_too(block: tuple[Path, Pat
 
 def test_a_calibration_that_never_suffices_says_what_is_known(block: tuple[Path, Path]) -> None:
     hopeless = SessionOptions(coverage=replace(WAITS, frames=3, position_m=1e-9))
-    with pytest.raises(DataError, match=r"no calibration after \d+ contact-free frames: the camera is known to"):
+    with pytest.raises(
+        DataError, match=r"no sufficient calibration after \d+ contact-free frames: the camera pose: standard deviations of"
+    ):
         run_session(block[0], f"software:{block[1]}", hopeless, FeedOptions())
 
 

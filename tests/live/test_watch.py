@@ -50,7 +50,7 @@ def test_cameras_out_of_step_are_said_with_their_offset_until_they_are_not() -> 
     watch = FrameWatch(0.0)
     for k in range(3):
         watch.stamp(raw(k, 0.1 * k, 0.1 * k, view_stamps_s=(0.1 * k, 0.1 * k + 0.08)))
-    assert "80 ms of 100 ms" in watch.notices[Notice.OUT_OF_STEP]
+    assert "80 ms of a period of 100 ms" in watch.notices[Notice.OUT_OF_STEP]
     watch.stamp(raw(3, 0.3, 0.3, view_stamps_s=(0.3, 0.301)))
     assert Notice.OUT_OF_STEP not in watch.notices
 

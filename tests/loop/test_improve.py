@@ -22,7 +22,7 @@ from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.search import distinguishes_effects
 from femsense.loop.search.search_state import SearchProgress
 from femsense.loop.thresholds import DEFAULTS
-from femsense.loop.verdict.returned_model import is_sure
+from femsense.loop.verdict.returned_model import is_significant
 from femsense.loop.verdict.sentences import by_noise
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, LoadRows, Timeline
@@ -72,7 +72,7 @@ def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pul
         "load_forces": np.array(list(forces.values())),
     }
     loop = improve(weightless, [replace(recording, **known) if forces else recording], effects=["cable_gain", "cable_friction"])
-    said = "These data do not tell stiffness from cable_gain." in loop.sentence
+    said = "These data do not distinguish stiffness from cable_gain." in loop.sentence
     assert [e.name for e in loop.effects] == ["stiffness"] and said == (not load)
     assert loop.next_experiment.startswith("hang a known weight") == (not load)
 
@@ -86,7 +86,7 @@ def test_what_only_held_out_data_show_is_said():
     )
     loop = improve(arm((4, 1, 1)), [fitted], validation=[held], effects=["cable_gain", "cable_friction"])
     assert loop.verdict == "unexplained" and loop.left.held_out
-    assert "Held-out data show what the fitted ones do not, most in frame" in loop.sentence
+    assert "Held-out data have a larger residual than fitted data, most in frame" in loop.sentence
     assert loop.left.worst_frame.frame in (2, 3) and loop.left.rms_m > 3 * loop.noise_m
 
 
@@ -96,7 +96,9 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
         ONE_EACH, effects=[{"name": "cable_gain", "scale": {"right": 0.8}}], labels=labels, truth=arm((4, 1, 1))
     )
     train, held, how = hold_out(recording, np.arange(24))
-    assert how == f"{len(held)} of 24 frames (each sweep holds what no other does)" and set(train) | set(held) == set(range(24))
+    assert how == f"{len(held)} of 24 frames (each sweep has inputs that no other has)" and set(train) | set(held) == set(
+        range(24)
+    )
     assert {int(k) // 6 for k in held} == {0, 1, 2, 3} and len(held) == 8 and not set(train) & set(held)
     np.testing.assert_array_equal(recording.inputs[train].max(axis=0), recording.inputs.max(axis=0))
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
@@ -121,7 +123,7 @@ def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_h
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"], options=ImproveOptions(thresholds=strict))
     assert not loop.effects and loop.robot is loop.declared
     assert "evidence for cable_friction" in loop.sentence and "discretisation error is" in loop.sentence
-    assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
+    assert loop.verdict == "unexplained" and "no effect that passes the tests fits" in loop.sentence
 
 
 def test_an_effect_whose_states_do_not_converge_again_is_taken_back():
@@ -148,7 +150,7 @@ def test_where_nothing_explains_what_is_left_effects_are_sought_again_from_the_f
     told: list[str] = []
     soon = ImproveOptions(thresholds=replace(DEFAULTS, lacks=0.3))  # less than any weights leave
     loop = improve(arm((4, 1, 1)), [off], effects=["cable_friction", "payload"], progress=told.append, options=soon)
-    assert any(text.startswith("nothing explains what is left") for text in told)
+    assert any(text.startswith("no effect fits the residual") for text in told)
     assert loop.verdict == "unexplained" and not [e for e in loop.effects if e.name in ("cable_friction", "payload")]
     assert loop.noise_m < 2e-4 and loop.model_error is not None and loop.model_error.held_out_m > 1e-3
 
@@ -165,7 +167,7 @@ def test_a_search_that_begins_again_keeps_what_was_tried_and_takes_other_weights
     weights = Noise({"white": 5e-3}, "", assumed=1e-4)
     course.begin_again(data, weights)
     assert not course.over and not course.found and course.noise is weights and course.holds_error
-    assert not course.outweighed[0].is_named and "asked again" in course.outweighed[0].verdict
+    assert not course.outweighed[0].is_named and "repeated with weights" in course.outweighed[0].verdict
 
 
 def test_a_model_that_lacks_nothing_is_told_so():
@@ -201,7 +203,7 @@ def test_names_that_do_not_exist_are_refused():
 def test_data_without_free_markers_say_so():
     inputs, _ = sweeps()
     recording, _ = record(inputs[:4], free=False)
-    with pytest.raises(DataError, match="free of undeclared contact"):
+    with pytest.raises(DataError, match="no contact-free frame has markers or clouds"):
         improve(arm(), [recording])
 
 
@@ -342,7 +344,9 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
 def test_noise_that_no_camera_has_is_said():
     data = SimpleNamespace(robot=arm((4, 1, 1)), thresholds=DEFAULTS)
     assert by_noise(data, Repeatability(1e-3, 3, True, "")) == ""
-    assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Repeatability(2e-3, 3, True, ""))
+    assert "Noise of 3.5 mm on a body of 100 mm is larger than that of any camera" in by_noise(
+        data, Repeatability(2e-3, 3, True, "")
+    )
 
 
 def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
@@ -350,9 +354,9 @@ def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     fitted = SimpleNamespace(
         fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
     )
-    assert is_sure(fitted, "stiffness", np.array([0.029]), DEFAULTS) and not is_sure(
+    assert is_significant(fitted, "stiffness", np.array([0.029]), DEFAULTS) and not is_significant(
         fitted, "stiffness", np.array([0.031]), DEFAULTS
     )
-    assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1]), DEFAULTS) and not is_sure(
+    assert is_significant(fitted, "cable_offset", np.array([0.1, 0.1]), DEFAULTS) and not is_significant(
         fitted, "cable_offset", np.array([0.1, 0.2]), DEFAULTS
     )

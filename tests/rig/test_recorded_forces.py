@@ -82,7 +82,7 @@ def test_markers_alone_resolve_less(folders: tuple[Path, Path]) -> None:
     assert (noisy.found.normal_std > markers.found.normal_std).all()
     empty = {name: getattr(bare, name)[:0] for name in ("marker_frame", "marker_index", "marker_view", "marker_xyz")}
     nothing = replace(bare, **empty)
-    with pytest.raises(DataError, match="nothing was measured"):
+    with pytest.raises(DataError, match="neither clouds nor markers"):
         recorded_forces(robot, nothing, calibration)
 
 

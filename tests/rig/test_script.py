@@ -61,7 +61,7 @@ def test_gravity_of_a_sweep(robot: Any) -> None:
         ({"loads__0__force_n": [[0.0, 0.0, 1.0]]}, ["script: loads[0].force_n", "1 vectors", "6 vectors"]),
         ({"sweeps__0__cables": {"tpo": 1.0}}, ["script: sweeps[0].cables.tpo", "unknown cable", "did you mean 'top'"]),
         ({"initial": {"bottom": 1.0}}, ["script: initial.bottom", "unknown cable", "top, side"]),
-        ({"sweeps__0__cables": {"top": -2.0}}, ["a tension below zero", "-1.75 N"]),
+        ({"sweeps__0__cables": {"top": -2.0}}, ["a negative tension", "-1.75 N"]),
         ({"sweeps__1__levels": [0.0, 1.0]}, ["script: sweeps[1].cables.side", "3 values", "2 values"]),
         (
             {"sweeps__0__up": 0, "sweeps__0__rest": 0, "sweeps__0__hold": 0, "sweeps__0__down": 0},

@@ -255,7 +255,7 @@ def test_a_contact_patch_is_small_and_on_one_side(robot: Robot) -> None:
 
 def test_a_load_that_no_body_carries_costs_its_frames_and_not_the_recording(robot: Robot, tmp_path: Path) -> None:
     crushed = changed(BARE, {"sweeps__0__cables": {"top": 4000.0}, "sweeps__0__levels": [0.0, 1.0, 0.0005], "sweeps__0__up": 1})
-    with pytest.warns(UserWarning, match="1 of 6 frames do not settle and are left out: 1; the first: .* overload"):
+    with pytest.warns(UserWarning, match="1 of 6 frames do not converge and are left out: 1; the first: .* overload"):
         folder = simulate(robot, crushed, tmp_path / "out")
     recording = load_recording(folder)
     assert recording.frame_numbers.tolist() == [0, 2, 3, 4, 5]
@@ -271,7 +271,7 @@ def test_a_load_that_no_body_carries_costs_its_frames_and_not_the_recording(robo
 
 def test_where_no_frame_settles_there_is_no_recording(robot: Robot) -> None:
     crushed = changed(BARE, {"initial": {"top": 4000.0}, "sweeps": [{"label": "a", "levels": [0.0]}], "loads": []})
-    with pytest.raises(DataError, match=r"none of 1 frames settles; frame 0: .*overload"):
+    with pytest.raises(DataError, match=r"none of 1 frames converges; frame 0: .*overload"):
         run_experiment(robot, check_script(crushed))
 
 
@@ -381,6 +381,6 @@ def test_a_probe_touches_from_outside(kind: str) -> None:
 
 def test_a_camera_that_sees_no_marker_is_refused(robot: Robot, tmp_path: Path) -> None:
     away = changed(SCRIPT, {"camera__eye_m": [1.0, 0.0, 0.3], "camera__target_m": [2.0, 0.0, 0.3]})
-    with pytest.raises(InputError, match="sees no marker"):
+    with pytest.raises(InputError, match="no marker is visible"):
         simulate(robot, away, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -65,6 +65,6 @@ def test_a_recording_of_a_real_robot_is_never_deleted(tmp_path: Path, truth: str
         (recording / "truth" / "truth.json").write_text(truth)
     before = folder_hash(recording)
     robot = load_robot(write_block_robot(tmp_path / "robot"))
-    with pytest.raises(InputError, match="no simulated one and would be deleted"):
+    with pytest.raises(InputError, match="not a simulated one and would be deleted"):
         simulate(robot, CLOUDS, recording)
     assert folder_hash(recording) == before

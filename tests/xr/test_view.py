@@ -102,7 +102,7 @@ def test_a_page_is_not_written_over_another(run: Path, page: Path, tmp_path: Pat
     out = tmp_path / "mine"
     out.mkdir()
     (out / "index.html").write_text("mine")
-    with pytest.raises(InputError, match="something else stands there"):
+    with pytest.raises(InputError, match="the folder contains other files"):
         view.write_static_page(run, out, page=page)
     assert (out / "index.html").read_text() == "mine"
     (out / "index.html").unlink()

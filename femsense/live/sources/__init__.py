@@ -1,4 +1,4 @@
-"""Where frames come from. `SOURCES` is the one registry: another camera is a class with four methods and a line there."""
+"""Sources of frames. `SOURCES` is their registry: a new camera is a class with four methods and an entry there."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ SOURCES: Mapping[str, str] = {
     "recording": "femsense.live.sources.recorded:Recorded",
     "software": "femsense.live.sources.software:SoftwareCamera",
 }
-"""Word before the colon → module and class that takes what stands behind it."""
+"""Prefix → module and class, constructed with the text after the colon."""
 CAMERAS = ("realsense", "orbbec", "oak")
-"""Sources whose devices `list_cameras` asks for."""
+"""Sources whose devices `list_cameras` lists."""
 
 
 def make_source(text: str, *, as_fast_as_possible: bool = False) -> FrameSource:
-    """Return the source that a text names, not opened yet.
+    """Return the source that a text specifies, not opened yet.
 
     Arguments:
         text: `realsense[:SERIAL]`, `orbbec[:SERIAL]`, `oak[:ID]`, `mcap:FILE` (`-` is standard input), `foxglove:ws://…`,
-            `software:RECORDING[?FAULTS]`, or a path: a recording is replayed, any other folder is one that grows.
-        as_fast_as_possible: replay the next frame as soon as one was asked for, not at its own time.
+            `software:RECORDING[?FAULTS]`, or a path: a recording is replayed, any other folder is watched for new files.
+        as_fast_as_possible: replay the next frame on request instead of at its time.
 
     Raises:
-        InputError: no such source.
+        InputError: an unknown source.
     """
     word, _, rest = text.partition(":")
     if word not in SOURCES:
@@ -52,7 +52,7 @@ def make_source(text: str, *, as_fast_as_possible: bool = False) -> FrameSource:
 
 
 def list_cameras() -> tuple[tuple[FoundCamera, ...], dict[str, str]]:
-    """Return the cameras that are plugged in, and for each kind of camera whose package is missing the line that installs it."""
+    """Return the connected cameras, and for each kind of camera whose package is missing the install command."""
     from femsense.core.errors import MissingDependency
 
     found: list[FoundCamera] = []

@@ -1,4 +1,4 @@
-"""A folder into which another program writes images or clouds, one file a frame."""
+"""A folder into which another program writes images or clouds, one file per frame."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo,
 
 POLL_S = 0.005
 SETTLED_S = 0.02
-"""A file that has not changed for this long is whole: writers that rename lose nothing by it, others are not read half-written."""
+"""A file that has not changed for this long is complete, even if its writer does not write under a temporary name [s]."""
 CAMERA_FILE = "camera.toml"
 
 
 class GrowingFolder:
-    """Files `NUMBER.png`, `.ply` or `.pcd` in `depth/` with `color/`, or in `clouds/`, of a folder, as they appear.
+    """New files `NUMBER.png`, `.ply` or `.pcd` in `depth/` with `color/`, or in `clouds/`, of a folder.
 
-    `camera.toml` in the folder holds the camera as recording.toml has it; depth images need it. Stamps are the files' own times.
+    `camera.toml` in the folder describes the camera as recording.toml does; depth images need it. Stamps are the modification times.
     """
 
     def __init__(self, folder: str) -> None:
@@ -31,7 +31,7 @@ class GrowingFolder:
         self._kind = ImageKind.DEPTH
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start with what is written from now on."""
+        """Start with files written from now on."""
         if not self.folder.is_dir():
             raise SourceLost(Loss.UNPLUGGED, f"there is no folder {self.folder}")
         table = self._table()
@@ -41,7 +41,7 @@ class GrowingFolder:
         self._kind = ImageKind.CLOUD if (self.folder / ImageKind.CLOUD).is_dir() else ImageKind.DEPTH
         if self._kind is ImageKind.DEPTH and cameras[0] is None:
             raise InputError(
-                "depth images need the lens of their camera",
+                "depth images need the intrinsics of their camera",
                 where=self.folder,
                 found=f"no {CAMERA_FILE} with a table [camera]",
                 expected="width, height, fx, fy, cx, cy, depth_unit_m, as in recording.toml",
@@ -50,11 +50,11 @@ class GrowingFolder:
         return SourceInfo(f"folder {self.folder.name}", cameras, float("nan"), T_robot_camera=poses)
 
     def newest(self, timeout_s: float) -> RawFrame | None:
-        """Return the newest whole frame; those between it and the last one are skipped and counted."""
+        """Return the newest complete frame; those between it and the previous one count as skipped."""
         end = time.monotonic() + timeout_s
         while True:
             if not self.folder.is_dir():
-                raise SourceLost(Loss.UNPLUGGED, f"the folder {self.folder} is gone")
+                raise SourceLost(Loss.UNPLUGGED, f"the folder {self.folder} was removed")
             numbers = [number for number in self._numbers() if number > self._last]
             for number in sorted(numbers, reverse=True):
                 frame = self._frame(number)
@@ -66,10 +66,10 @@ class GrowingFolder:
             time.sleep(POLL_S)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resources are held."""
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return none: folders are not plugged in."""
+        """Return none: folders are not devices."""
         return []
 
     def _table(self) -> RecordingTable:
@@ -83,7 +83,7 @@ class GrowingFolder:
         return [int(file.stem) for file in files if file.suffix.lower() in FOLDERS[self._kind] and file.stem.isdecimal()]
 
     def _frame(self, number: int) -> RawFrame | None:
-        """Return a frame; None where one of its files is still being written."""
+        """Return a frame; None while one of its files is being written."""
         images, stamp = [], 0.0
         for kind in (self._kind, ImageKind.COLOR):
             file = next(

@@ -1,4 +1,4 @@
-"""ROS 2 topics from a Foxglove bridge, which runs where ROS is: a WebSocket that carries messages with their schemas."""
+"""ROS 2 topics from a Foxglove bridge that runs next to ROS: a WebSocket with messages and their schemas."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from femsense.live.sources.source import Loss, SourceLost
 
 PROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 DATA = struct.Struct("<BIQ")
-"""Operation, subscription and time [ns] in front of a message."""
+"""Header of a message: operation, subscription and time [ns]."""
 MESSAGE = 1
 LARGEST = 1 << 27
 POLL_S = 0.2
@@ -25,7 +25,7 @@ class Foxglove(RosSource):
     """`ws://HOST:8765[?depth=TOPIC&color=TOPIC]`."""
 
     def messages(self, stop: Event, frames: TopicFrames) -> Iterator[Message]:
-        """Subscribe to the topics that are wanted, and yield their messages."""
+        """Subscribe to the required topics, and yield their messages."""
         try:
             from mcap.records import Schema
             from mcap_ros2.decoder import DecoderFactory

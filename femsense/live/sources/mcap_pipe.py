@@ -1,4 +1,4 @@
-"""ROS 2 topics from a named pipe that carries MCAP: whoever has ROS writes there, this machine needs none."""
+"""ROS 2 topics from a named pipe with MCAP data, written on a machine with ROS; none is needed here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class McapPipe(RosSource):
     """`PIPE[?depth=TOPIC&color=TOPIC]`."""
 
     def messages(self, stop: Event, frames: TopicFrames) -> Iterator[Message]:
-        """Yield messages in the order in which they come."""
+        """Yield messages in the order of arrival."""
         try:
             from mcap.reader import NonSeekingReader
             from mcap_ros2.decoder import DecoderFactory
@@ -28,7 +28,7 @@ class McapPipe(RosSource):
             raise SourceLost(Loss.UNPLUGGED, f"there is no pipe {path}: mkfifo makes one")
         if not stat.S_ISFIFO(path.stat().st_mode):
             raise InputError(
-                "a file is no pipe",
+                "a file is not a pipe",
                 where=path,
                 found="a regular file",
                 expected="a named pipe (mkfifo) that a program writes MCAP to",

@@ -18,7 +18,7 @@ NEEDED_MBIT_S = WIDTH * HEIGHT * RATE_HZ * (16 + 24) / 1e6
 
 
 class Oak:
-    """One camera, by its device id or the first one."""
+    """One camera, by its device id, else the first one."""
 
     def __init__(self, device_id: str) -> None:
         self.device_id = device_id
@@ -28,7 +28,7 @@ class Oak:
         self._waiting: Any = None
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start depth and colour; opening a device boots it, so that a loss needs no other reset."""
+        """Start depth and colour; opening a device boots it, so that no reset is needed after a loss."""
         dai = _library()
         try:
             device = dai.Device(dai.DeviceInfo(self.device_id)) if self.device_id else dai.Device()
@@ -56,12 +56,12 @@ class Oak:
         return SourceInfo(name, (lens,), float(RATE_HZ), link=f"USB {speed.name}", is_slow_link=slow)
 
     def newest(self, timeout_s: float) -> RawFrame | None:
-        """Return the newest depth with the colour of the same time, as far as that has come."""
+        """Return the newest depth image with the last colour image."""
         end = time.monotonic() + timeout_s
         while time.monotonic() < end:
             try:
                 depth, color = self._depth.tryGet(), self._color.tryGet()
-            except RuntimeError as error:  # a queue is closed with its device
+            except RuntimeError as error:  # the queue is closed when its device disconnects
                 raise SourceLost(Loss.UNPLUGGED, str(error)) from None
             self._waiting = color or self._waiting
             if depth is None:
@@ -77,14 +77,14 @@ class Oak:
         return None
 
     def close(self) -> None:
-        """Stop the pipeline, which lets go of the device."""
+        """Stop the pipeline, which releases the device."""
         if self._pipeline is not None:
             with suppress(RuntimeError):
                 self._pipeline.stop()
         self._pipeline = None
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return the OAK cameras that are plugged in; their speed is known only once they are booted."""
+        """Return the connected OAK cameras; their link speed is unknown before they are booted."""
         dai = _library()
         return [
             FoundCamera(f"oak:{info.getDeviceId()}", f"OAK {info.name}", info.protocol.name, False, NEEDED_MBIT_S)

@@ -1,4 +1,4 @@
-"""Orbbec cameras (Gemini, Femto) by pyorbbecsdk2: depth, and colour that the SDK registers to it."""
+"""Orbbec cameras (Gemini, Femto) by pyorbbecsdk2: depth, and colour registered to it by the SDK."""
 
 from __future__ import annotations
 
@@ -99,12 +99,12 @@ class Orbbec:
     def close(self) -> None:
         """Stop the pipeline."""
         if self._pipeline is not None:
-            with suppress(Exception):  # of the SDK, about a device that is gone
+            with suppress(Exception):  # the SDK raises on a disconnected device
                 self._pipeline.stop()
         self._pipeline = None
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return the Orbbec cameras that are plugged in."""
+        """Return the connected Orbbec cameras."""
         ob = _library()
         devices = ob.Context().query_devices()
         infos = [devices.get_device_by_index(i).get_device_info() for i in range(devices.get_count())]
@@ -129,7 +129,7 @@ class Orbbec:
             raise SourceLost(Loss.UNPLUGGED, f"no Orbbec {self.serial} on the bus: {error}") from None
 
     def _first_scale(self, ob: Any) -> float:
-        """Return metres in one unit of depth, which only frames tell. Raises SourceLost where none comes."""
+        """Return metres per unit of depth, read from a frame. Raises SourceLost if none arrives."""
         end = time.monotonic() + 5.0
         while time.monotonic() < end:
             frames = self._pipeline.wait_for_frames(500)
@@ -153,7 +153,7 @@ def _is_slow(link: str) -> bool:
 
 
 def _red_first(ob: Any, frame: Any) -> Any:
-    """Return the pixels of a colour frame, red first, shape (H, W, 3)."""
+    """Return the pixels of a colour frame in RGB order, shape (H, W, 3)."""
     data = np.frombuffer(frame.get_data(), np.uint8)
     if frame.get_format() == ob.OBFormat.MJPG:
         return decoded_image(data.tobytes(), "orbbec")

@@ -1,4 +1,4 @@
-"""Intel RealSense cameras by pyrealsense2: depth, and colour that is registered to it."""
+"""Intel RealSense cameras by pyrealsense2: depth, and colour registered to it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class RealSense:
         )
 
     def close(self) -> None:
-        """Stop the sensors; one that is gone is left alone."""
+        """Stop the sensors, except of a disconnected device."""
         for sensor in self._sensors:
             with suppress(RuntimeError):
                 sensor.stop()
@@ -138,13 +138,13 @@ class RealSense:
         return devices[0]
 
     def _check_presence(self, rs: Any) -> None:
-        """Raise SourceLost where the device is gone from the bus."""
+        """Raise SourceLost if the device is no longer on the bus."""
         if self._given is None:
             self._on_bus(rs)
 
 
 def _library() -> Any:
-    """Return pyrealsense2, with the libusb that a package may bring. Raises MissingDependency."""
+    """Return pyrealsense2, with the libusb of an installed package, if any. Raises MissingDependency."""
     with suppress(ImportError, OSError):
         import libusb_package
 
@@ -168,7 +168,7 @@ class _Stream:
 
 
 def _nearest(sensors: list[Any], stream: Any, form: Any) -> _Stream | None:
-    """Return the stream of a kind that is nearest to the wanted size and rate; None where there is none."""
+    """Return the stream of a kind that is nearest to the requested size and rate; None without such a stream."""
     offered = [_Stream(k, profile) for k, sensor in enumerate(sensors) for profile in sensor.get_stream_profiles()]
     fitting = [one for one in offered if one.profile.stream_type() == stream and one.profile.format() == form]
 
@@ -187,7 +187,7 @@ def _camera(rs: Any, profile: Any, depth_unit: float) -> Camera:
 
 
 def _depth_unit(rs: Any, device: Any) -> float:
-    """Return metres in one unit of depth; 1 mm where the camera does not report it."""
+    """Return metres per unit of depth; 1 mm if the camera does not report it."""
     sensors = [sensor for sensor in device.query_sensors() if sensor.supports(rs.option.depth_units)]
     return round(float(sensors[0].get_option(rs.option.depth_units)), 9) if sensors else 0.001
 

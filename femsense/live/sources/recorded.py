@@ -1,4 +1,4 @@
-"""A recording replayed as a camera would give it, at its own times or as fast as possible."""
+"""Replay of a recording as a camera, in real time or as fast as possible."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo,
 from femsense.model.recording import Recording
 
 LARGEST = 1.2
-"""Room in the ring over the largest frame of the recording."""
+"""Size of a ring slot relative to the largest frame of the recording."""
 
 
 class Recorded:
-    """A recording that poses as a camera."""
+    """A recording replayed as a camera."""
 
     def __init__(self, folder: str, *, as_fast_as_possible: bool = False, is_endless: bool = False) -> None:
-        """Arguments: folder; whether each frame comes when it is asked for; whether the recording begins again at its end."""
+        """Arguments: folder; whether frames are returned on request instead of at their times; whether the recording repeats."""
         self.folder = Path(folder).expanduser()
         self.as_fast_as_possible, self.is_endless = as_fast_as_possible, is_endless
         self._recording: Recording | None = None
@@ -32,7 +32,7 @@ class Recorded:
         self._next = 0
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start to replay: where the recording is now, counted from the first opening, or behind the last frame received."""
+        """Start the replay at the time since the first opening, or after the last frame received."""
         recording = self._recording = load_recording(self.folder)
         if not recording.has_clouds and not recording.has_markers:
             raise InputError("nothing to replay", where=self.folder, found="no clouds and no markers", expected="either")
@@ -53,7 +53,7 @@ class Recorded:
         )
 
     def newest(self, timeout_s: float) -> RawFrame | None:
-        """Return the next frame when its time has come; frames whose time passed before are dropped, as a camera drops them."""
+        """Return the next frame at its time; frames whose time has passed are dropped, as by a camera."""
         count = self.recording.frame_count
         if not self.as_fast_as_possible:
             while (self.is_endless or self._next + 1 < count) and self.due_s(self._next + 1) <= time.monotonic():
@@ -64,25 +64,25 @@ class Recorded:
                 if wait > timeout_s:
                     return None
         if self._next >= count and not self.is_endless:
-            raise SourceLost(Loss.ENDED, f"{self.folder} is over")
+            raise SourceLost(Loss.ENDED, f"{self.folder} has ended")
         number, self._next = self._next, self._next + 1
         stamp = self.due_s(number) - self._begun_s + float(self.recording.time_s[0])
         return replace(self.frame(number % count), number=number, stamp_s=stamp)
 
     def due_s(self, number: int) -> float:
-        """Return when a frame is to come [s, monotonic clock], by its number counted over all repetitions."""
+        """Return the due time of a frame [s, monotonic clock], numbered over all repetitions."""
         times = self.recording.time_s
         period = float(times[-1] - times[0]) * (1.0 + 1.0 / max(1, len(times) - 1))
         return self._begun_s + float(times[number % len(times)] - times[0]) + number // len(times) * period
 
     @property
     def recording(self) -> Recording:
-        """What is replayed."""
+        """The replayed recording."""
         assert self._recording is not None, "not open"
         return self._recording
 
     def frame(self, k: int) -> RawFrame:
-        """Return frame k of the recording, an index 0 … F − 1, as a camera would give it."""
+        """Return frame k of the recording, 0 … F − 1, as a frame of a camera."""
         r = self.recording
         images = []
         for view, (file, color) in enumerate(zip(r.cloud_files[k], r.color_files[k])):
@@ -110,11 +110,11 @@ class Recorded:
         )
 
     def close(self) -> None:
-        """Forget the recording."""
+        """Release the recording."""
         self._recording = None
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return none: recordings are not plugged in."""
+        """Return none: recordings are not devices."""
         return []
 
     def _size(self, k: int) -> int:

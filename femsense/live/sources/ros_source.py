@@ -1,4 +1,4 @@
-"""A source of ROS 2 messages: a thread reads them, the newest frame waits."""
+"""A source of ROS 2 messages: a thread reads them and keeps the newest frame."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from femsense.live.sources.ros_topics import TopicFrames, topics_of
 from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo, SourceLost
 
 FIRST_FRAME_S = 10.0
-"""How long the first image and its lens may take."""
+"""Time limit for the first image and its CameraInfo [s]."""
 Message = tuple[str, str, Any]
 """Topic, type and the decoded message."""
 
 
 class RosSource(ABC):
-    """What sources of ROS 2 messages share; each says in `messages` where they come from."""
+    """Base of the sources of ROS 2 messages; subclasses read them in `messages`."""
 
     kind = "messages"
 
@@ -34,10 +34,10 @@ class RosSource(ABC):
 
     @abstractmethod
     def messages(self, stop: Event, frames: TopicFrames) -> Iterator[Message]:
-        """Yield messages until `stop` is set; of the topics that `frames` wants. Raises SourceLost, OSError."""
+        """Yield messages of the topics requested by `frames` until `stop` is set. Raises SourceLost, OSError."""
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start to read, and wait for the first frame: it tells the camera."""
+        """Start reading, and wait for the first frame, which defines the camera."""
         self._stop, self._lost = Event(), None
         self._thread = Thread(target=self._read, args=(self._stop,), daemon=True, name="femsense-ros")
         self._thread.start()
@@ -61,11 +61,11 @@ class RosSource(ABC):
         return None
 
     def close(self) -> None:
-        """Stop to read; a read that waits ends with the process."""
+        """Stop reading; a blocked read ends with the process."""
         self._stop.set()
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return none: topics are not plugged in."""
+        """Return none: topics are not devices."""
         return []
 
     def _read(self, stop: Event) -> None:
@@ -77,8 +77,8 @@ class RosSource(ABC):
                         self._waiting.get_nowait()
                     with suppress(queue.Full):
                         self._waiting.put_nowait(frame)
-            self._lost = SourceLost(Loss.ENDED, f"{self.address} is over")
+            self._lost = SourceLost(Loss.ENDED, f"{self.address} has ended")
         except SourceLost as lost:
             self._lost = lost
-        except Exception as error:  # whatever a broken message makes of a decoder
+        except Exception as error:  # decoders raise various errors on a malformed message
             self._lost = SourceLost(Loss.UNPLUGGED, f"{self.address}: {type(error).__name__}: {error}")

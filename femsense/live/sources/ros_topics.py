@@ -1,4 +1,4 @@
-"""ROS 2 messages as frames, whoever brings them: an image of depth with its CameraInfo, and colour where it is named."""
+"""ROS 2 messages as frames, independent of the transport: a depth image with its CameraInfo, and colour if its topic is given."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ DECODER = "ROS 2 messages need the package mcap-ros2-support\n  try:      pip in
 
 
 def topics_of(text: str) -> tuple[str, TopicFrames]:
-    """Return the address in `ADDRESS?depth=TOPIC&color=TOPIC`, and what puts its messages together."""
+    """Return the address in `ADDRESS?depth=TOPIC&color=TOPIC`, and an assembler of its messages."""
     address, _, more = text.partition("?")
     return address, TopicFrames(**{key: value for key, value in parse_qsl(more) if key in ("depth", "color")})
 
 
 class TopicFrames:
-    """Puts messages together to frames.
+    """Assembles frames from messages.
 
-    The first topic with depth images, or with clouds, is the camera, unless `depth` names another one; a colour topic has to be
-    named, and registered to depth, as `aligned_depth_to_color` with the colour image is.
+    The first topic with depth images, or with clouds, is the camera, unless `depth` names another one; a colour topic
+    must be given and registered to depth, like `aligned_depth_to_color` and the colour image.
     """
 
     def __init__(self, depth: str = "", color: str = "") -> None:
@@ -44,11 +44,11 @@ class TopicFrames:
         self._infos: dict[str, Any] = {}
 
     def is_wanted(self, topic: str, kind: str) -> bool:
-        """Return whether a topic of a type is to be read."""
+        """Return whether a topic is required, by its name and type."""
         return kind in TYPES and (not self.depth or kind == INFO or topic in (self.depth, self.color))
 
     def take(self, topic: str, kind: str, message: Any) -> RawFrame | None:
-        """Take in a message; return the frame that it completes, if it does. Raises InputError."""
+        """Add a message; return the frame that it completes, or None. Raises InputError."""
         if kind == INFO:
             self._infos[topic.rpartition("/")[0]] = message
             self._find_camera()
@@ -66,7 +66,7 @@ class TopicFrames:
             self._unit_m = FINE_UNIT
         self._find_camera()
         if kind == IMAGE and self.camera is None:
-            return None  # its lens is still to come
+            return None  # its CameraInfo has not arrived
         self._number += 1
         image = _depth_image(message, topic) if kind == IMAGE else _cloud_image(message, topic)
         images = (image,) if self._color is None or kind == CLOUD else (image, self._color)
@@ -80,7 +80,7 @@ class TopicFrames:
 
 
 def _depth_image(message: Any, topic: str) -> Image:
-    """Return depth in millimetres, which images of 16 bits have by REP 118, or in FINE_UNIT, if it comes as floats in metres."""
+    """Return depth in millimetres (16-bit images, REP 118), or in FINE_UNIT for images of floats in metres."""
     pixels, encoding = raw_image(message, topic)
     return Image(ImageKind.DEPTH, png_of(depth_of_metres(pixels) if encoding == "32FC1" else pixels))
 

@@ -1,4 +1,4 @@
-"""A recorded file that poses as a device, with faults: to rehearse what a session does when a camera misbehaves."""
+"""A recording as a simulated device with faults, for tests of a session with a failing camera."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ ONCE = "once"
 
 
 class Fault(StrEnum):
-    """What a device does wrong, from a frame on for some seconds."""
+    """Faults of a device, each with a first frame and a duration."""
 
     SILENT = "silent"
-    """Gives no frames."""
+    """No frames."""
     HANG = "hang"
-    """Does not return from a call."""
+    """Calls do not return."""
     CRASH = "crash"
-    """Takes its process down; for an instant."""
+    """Its process exits."""
     UNPLUG = "unplug"
     REFUSE = "refuse"
-    """Another program has it."""
+    """In use by another program."""
     DROP = "drop"
-    """Counts frames and does not deliver them."""
+    """Frames are counted and not delivered."""
     BACK = "back"
     """Its clock is set back by BACK_S."""
     JUMP = "jump"
     """Its clock is set forward by JUMP_S."""
     APART = "apart"
-    """A second camera that is exposed APART_S later."""
+    """A second camera is exposed APART_S later."""
     USB2 = "usb2"
     FLICKER = "flicker"
-    """Its exposure hunts."""
+    """The exposure time alternates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +50,14 @@ class PlannedFault:
 
     fault: Fault
     frame: int
-    """From which frame of the recording on."""
+    """First frame of the recording with the fault."""
     seconds: float
 
 
 class SoftwareCamera:
     """`RECORDING?unplug=20+2&silent=40+3`: the device is unplugged at frame 20 for 2 s, and silent from frame 40 for 3 s.
 
-    As a device it has no end: the recording begins again, unless `once` is among the faults.
+    The recording repeats without end, unless `once` is among the faults.
     """
 
     def __init__(self, text: str) -> None:
@@ -67,7 +67,7 @@ class SoftwareCamera:
         self.faults = tuple(_planned(word, value, text) for word, value in words if word != ONCE)
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start, unless it is unplugged or refused just now."""
+        """Start. Raises SourceLost while it is unplugged or refused."""
         info = self._camera.open(opening)
         self._raise_lost()
         slow = self._active(Fault.USB2)
@@ -79,7 +79,7 @@ class SoftwareCamera:
         )
 
     def newest(self, timeout_s: float) -> RawFrame | None:
-        """Return the next frame as the device gives it in its present state."""
+        """Return the next frame with the active faults; None without one."""
         self._raise_lost()
         if self._active(Fault.CRASH):
             os._exit(1)
@@ -91,11 +91,11 @@ class SoftwareCamera:
         return self._spoiled(frame)
 
     def close(self) -> None:
-        """Let go of the recording."""
+        """Release the recording."""
         self._camera.close()
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return none: it is not plugged in."""
+        """Return none: it is not a device."""
         return []
 
     def _raise_lost(self) -> None:
@@ -117,7 +117,7 @@ class SoftwareCamera:
         return replace(frame, stamp_s=stamp, view_stamps_s=stamps, exposure_s=exposure)
 
     def _active(self, fault: Fault) -> bool:
-        """Return whether a fault of this kind acts now."""
+        """Return whether a fault of this kind is active."""
         elapsed = [(one.seconds, time.monotonic() - self._camera.due_s(one.frame)) for one in self.faults if one.fault is fault]
         return any(0.0 <= since < seconds for seconds, since in elapsed)
 

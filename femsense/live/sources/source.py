@@ -1,4 +1,4 @@
-"""What a source of frames is."""
+"""The interface of a source of frames."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Loss(StrEnum):
     REFUSED = "refused"
     """In use by another program, no permission, or a broken device."""
     ENDED = "ended"
-    """A recording that is over."""
+    """The recording has ended."""
 
 
 class SourceLost(FemsenseError):
-    """A source that has no more frames, until it is opened again."""
+    """A source without further frames until it is reopened."""
 
     def __init__(self, loss: Loss, text: str) -> None:
-        """Arguments: why, and in words what happened and what to do."""
+        """Arguments: the reason; a message with cause and remedy."""
         self.loss, self.text = loss, text
         super().__init__(text)
 
@@ -36,72 +36,72 @@ class SourceLost(FemsenseError):
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """What a source is told when it is opened."""
+    """Arguments of opening a source."""
 
     begun_s: float = float("nan")
-    """`SourceInfo.begun_s` of the first time [s]; nan the first time."""
+    """`SourceInfo.begun_s` of the first opening [s]; nan at the first opening."""
     attempt: int = 0
-    """0 the first time; later a source may reset its device first."""
+    """0 at the first opening; at later ones a source may reset its device."""
     last_number: int = -1
     """Counter of the last frame that was received; −1: none."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SourceInfo:
-    """What is known of a source once it is open."""
+    """Properties of an open source."""
 
     name: str
-    """Model and serial number, for people."""
+    """Model and serial number, for display."""
     cameras: tuple[Camera | None, ...]
-    """One a view; None where frames come as clouds and the lens is not known."""
+    """One per view; None for point clouds without known intrinsics."""
     rate_hz: float
-    """Frames a second that it is set to; nan: not known."""
+    """Configured frame rate [Hz]; nan: unknown."""
     camera_names: tuple[str, ...] = ("",)
-    """One a view; "" where there is one."""
+    """One per view; "" for a single view."""
     link: str = ""
     """Such as "USB 3.2"; empty: none."""
     is_slow_link: bool = False
-    """Whether the link carries less than the streams need, as USB 2 does."""
+    """Whether the bandwidth of the link is too low for the streams, as with USB 2."""
     T_robot_camera: tuple[FloatArray | None, ...] = ()
     """Declared poses; empty: none."""
     actuation: str | None = None
-    """What the inputs that come with frames are, "tension" or "displacement"; None: none come."""
+    """Kind of the inputs that arrive with frames, "tension" or "displacement"; None: without inputs."""
     actuation_zero: str = "absolute"
     marker_noise_m: float | None = None
     begun_s: float = float("nan")
-    """When a recording began to be replayed [s, monotonic clock]: it goes on from there when it is opened again."""
+    """Start time of the replay of a recording [s, monotonic clock], kept when it is reopened."""
     largest_frame: int = 1 << 23
-    """Of an encoded frame [bytes]."""
+    """Maximum size of an encoded frame [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundCamera:
-    """A camera that is plugged in."""
+    """A connected camera."""
 
     source: str
-    """As --camera takes it."""
+    """Argument of --camera."""
     name: str
     link: str
     is_slow_link: bool
     needed_mbit_s: float
-    """Of the streams that a session asks for, without compression [Mbit/s]."""
+    """Data rate of the requested streams without compression [Mbit/s]."""
 
 
 class FrameSource(Protocol):
-    """A camera, or what poses as one. All calls come from one thread of the process that has it."""
+    """A camera, or a substitute. All calls are made by one thread of the process that owns it."""
 
     def open(self, opening: Opening) -> SourceInfo:
-        """Start to stream. Raises SourceLost, InputError, MissingDependency."""
+        """Start streaming. Raises SourceLost, InputError, MissingDependency."""
         ...
 
     def newest(self, timeout_s: float) -> RawFrame | None:
-        """Return the next frame; None where none came in time. Raises SourceLost where none will come."""
+        """Return the newest frame; None after the timeout. Raises SourceLost if no frame will arrive."""
         ...
 
     def close(self) -> None:
-        """Stop, and let go of the device; also one that was never opened or is gone."""
+        """Stop and release the device; allowed if it was never opened or is disconnected."""
         ...
 
     def list_devices(self) -> list[FoundCamera]:
-        """Return the devices of this kind that are plugged in; none where it is not a device. Raises MissingDependency."""
+        """Return the connected devices of this kind; none if it is not a device. Raises MissingDependency."""
         ...

@@ -1,1 +1,1 @@
-"""Recordings as the loop sees them: trials, what is held out, outliers, rows of clouds."""
+"""The data of the loop: trials, held-out frames, outliers, rows of clouds."""

@@ -1,7 +1,7 @@
-"""What a residual may go with: the inputs, their direction and history, time, load, gravity and depth, one number a frame.
+"""Covariates of a residual: inputs, their direction and history, time, load, gravity and depth, one number per frame.
 
-Rank correlations make an attribution readable; they decide nothing. Neighbouring frames are no independent draws, so that their
-p-values are optimistic even after Holm's adjustment (1979).
+Rank correlations describe a residual; no decision depends on them. Neighbouring frames are not independent, so their p-values are too small even after
+Holm's adjustment (1979).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from femsense.model.observation import Scene
 from femsense.model.recording import Recording
 
 FEWEST = 5
-"""Frames that a rank correlation needs."""
+"""Minimum number of frames for a rank correlation."""
 EACH_INPUT = 8
-"""More cables or chambers than this are not looked at one by one."""
+"""With more cables or chambers than this, none is listed by itself."""
 
 
 def actuation_of(recording: Recording) -> FloatArray:
-    """Return how far each frame is driven, shape (F,): the sum of all inputs, pressures in units of the inputs' range; else the load."""
+    """Return the total actuation of each frame, shape (F,): the sum of all inputs, pressures scaled to the range of the inputs; without inputs the load."""
     parts = [np.abs(table - table.min(axis=0)).sum(axis=1) for table in (recording.inputs, recording.pressures) if table.size]
     moving = [part for part in parts if np.ptp(part) > 0]
     if not moving:
@@ -31,14 +31,14 @@ def actuation_of(recording: Recording) -> FloatArray:
 
 
 def load_of(recording: Recording) -> FloatArray:
-    """Return the size of the known load of each frame [N], shape (F,)."""
+    """Return the magnitude of the known load of each frame [N], shape (F,)."""
     total = np.zeros((len(recording.time_s), 3))
     np.add.at(total, recording.load_frame, recording.load_forces)
     return np.asarray(np.linalg.norm(total, axis=1))
 
 
 def unloading(recording: Recording) -> BoolArray:
-    """Return in which frames the robot is on its way back, shape (F,); a hold keeps the direction it was reached in."""
+    """Return in which frames the actuation decreases, shape (F,); during a hold the direction is that of the motion before it."""
     change = np.sign(np.diff(actuation_of(recording), prepend=0.0))
     moved = np.flatnonzero(change)
     last = np.searchsorted(moved, np.arange(len(change)), side="right") - 1
@@ -46,7 +46,7 @@ def unloading(recording: Recording) -> BoolArray:
 
 
 def covariates_of(scene: Scene) -> dict[str, FloatArray]:
-    """Return what a residual may go with, one value for each frame of a scene that changes at all, shape (f,)."""
+    """Return the covariates that vary, name → one value per frame of a scene, shape (f,)."""
     recording, frames = scene.recording, scene.frames
     drive, back = actuation_of(recording), unloading(recording)
     turned = np.flatnonzero(np.diff(back.astype(int), prepend=int(back[0])) != 0)
@@ -80,13 +80,13 @@ def covariates_of(scene: Scene) -> dict[str, FloatArray]:
 
 
 def stacked(tables: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Return the covariates of several scenes one after the other; one that a scene lacks is left out."""
+    """Concatenate the covariates of several scenes; one that a scene lacks is left out."""
     common = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
     return {name: np.concatenate([table[name] for table in tables]) for name in common}
 
 
 def rank_with(values: FloatArray, covariates: Mapping[str, FloatArray]) -> list[Correlation]:
-    """Return Spearman's correlation of a number a frame with each covariate, the strongest first, p-values adjusted after Holm (1979)."""
+    """Return Spearman's correlation of a number per frame with each covariate, the strongest first, p-values adjusted after Holm (1979)."""
     from scipy.stats import spearmanr
 
     rows = list[tuple[str, float, float]]()

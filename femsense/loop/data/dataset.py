@@ -1,4 +1,4 @@
-"""The data of the loop: recordings, checked, split by sweeps, and calibrated for a start."""
+"""The data of the loop: recordings, checked, split by sweeps, with a first calibration."""
 
 from __future__ import annotations
 
@@ -35,60 +35,61 @@ from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot
 
 MAX_ROWS = 3000
-"""Marker rows a recording at most, and rows of clouds; more are thinned out by whole frames."""
+"""Maximum number of marker rows per recording, and of cloud rows; beyond it whole frames are left out."""
 MESH = next(effect for effect in EFFECTS if effect.remeshes)
-"""The effect that says which mesh is fine enough."""
+"""The effect that refines the mesh."""
 QUADRATIC: Entry = {"element": "tet10"}
-"""What stands for a mesh fine enough while effects are sought, where linear elements are declared (see `elements`)."""
+"""The element order of the search if linear elements are declared (see `search/element_order.py`)."""
 MEASURED = ("auto", "markers", "clouds", "both")
-"""What may be used of a recording; auto: its markers, or its clouds where it has no markers."""
+"""Which measurements of a recording are fitted; auto: its markers, or its clouds if it has no markers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Data:
-    """Recordings, split. Where a recording has both, its markers are one trial and its clouds the next."""
+    """Recordings, split. If both markers and clouds of a recording are used, they are two consecutive trials."""
 
     robot: Robot
-    """As declared, or on quadratic elements where effects are sought with these; with points of its surface behind the markers where there are clouds."""
+    """The declared robot, or the same on quadratic elements during the search; with surface points after its markers if clouds are used."""
     control: str
     train: list[Trial]
     held: list[Trial]
     held_of: list[int | None]
-    """The training trial whose pose a held-out trial shares; None: it gets its own."""
+    """Index of the training trial whose pose a held-out trial shares; None: it gets its own."""
     split: list[str]
     placement_std: float
     input_scale: FloatArray
     """Typical range of each cable's input [N] or [m], shape (a,)."""
     declared: Robot
-    """As it came."""
+    """The robot as passed in."""
     forms: tuple[Effect, ...] = FORMS
-    """What may be tried, a user's effects among it."""
+    """Effects that may be tried, including user-defined ones."""
     outliers: tuple[tuple[int, str], ...] = ()
-    """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
+    """Frame numbers and marker names of the removed outliers."""
     mesh_note: str = ""
-    """Why the discretisation error is not known; empty where it is."""
+    """Why the discretisation error is unknown; empty if it is known."""
     mesh_as_shown: bool = False
-    """Whether the discretisation error counts by how much of it the data show, since they have shown that the declared mesh suffices."""
+    """Whether the discretisation error is scaled to the share that the data show, after they have shown that the declared mesh suffices."""
     relative: bool = False
-    """Whether markers are less what the model misses of a reference, which holds for the modulus and the inputs that it was computed with: these stay."""
+    """Whether the residuals of a reference are subtracted from the markers. They were computed with the declared modulus and inputs, so these are not
+    fitted."""
     thresholds: Thresholds = DEFAULTS
-    """What decides."""
+    """Decision thresholds."""
     effort: Effort = EFFORT
-    """How much is tried."""
+    """Limits of the computational effort."""
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """What the data are: "markers", "clouds" or both."""
+        """Kinds of measurements: "markers", "clouds" or both."""
         kinds = {"markers" if t.scene.crossings is None else "clouds" for t in self.train}
         return tuple(sorted(kinds, reverse=True))
 
     def with_trials(self, of: Callable[[Trial], Trial]) -> Data:
-        """Return the data with something else in the place of each trial, fitted and held out."""
+        """Return the data with a function applied to each trial, fitted and held out."""
         return replace(self, train=[of(t) for t in self.train], held=[of(t) for t in self.held])
 
     @property
     def settled(self) -> tuple[tuple[Effect, Entry], ...]:
-        """What the robot has that is not declared, as an effect: quadratic elements."""
+        """Effects that the search assumes and that are not declared: quadratic elements."""
         return ((MESH, QUADRATIC),) if self.robot.body.mesh.is_quadratic != self.declared.body.mesh.is_quadratic else ()
 
     @property
@@ -98,21 +99,21 @@ class Data:
 
 
 def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "auto") -> Data:
-    """Check the recordings, split them, and calibrate each for a start.
+    """Check the recordings, split them, and calibrate each for starting values.
 
     Arguments:
-        robot: as it is declared.
+        robot: the declared robot.
         recordings: to fit.
-        validation: to judge on.
-        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
+        validation: to hold out.
+        measured: which measurements are fitted, one of MEASURED.
 
     Raises:
         InputError: bad arguments; DataError: the data do not allow a fit.
     """
     if not recordings:
-        raise InputError("nothing to learn from", where="recordings", expected="at least one recording")
+        raise InputError("no recording", where="recordings", expected="at least one recording")
     if measured not in MEASURED:
-        raise InputError("no such kind of data", where="measured", found=measured, expected=", ".join(MEASURED))
+        raise InputError("unknown kind of measurements", where="measured", found=measured, expected=", ".join(MEASURED))
     recordings = [check_against(robot, r) for r in recordings]
     validation = [check_against(robot, r) for r in validation]
     control = recordings[0].actuation
@@ -131,7 +132,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     words: list[str] = []
     for recording, kinds in zip(recordings, used):
         frames = np.union1d(*kinds)
-        fitted, kept, how = (
+        fitted, kept, description = (
             (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
         )
         if not len(kept) and not validation:
@@ -142,7 +143,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
             if later is not None:
                 held.append(replace(later, together=bool(held) and later.together and held_of[-1] == first))
                 held_of.append(first)
-        words.append(how)
+        words.append(description)
     for recording, kinds in zip(validation, used[len(recordings) :]):
         frames = np.union1d(*kinds)
         for one, _ in _trials(robot, declared, recording, kinds, frames, frames[:0], first_only=True):
@@ -156,7 +157,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
 
 
 def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]:
-    """Return the frames whose markers, and those whose clouds are used. Raises DataError where there are none."""
+    """Return the frames with used markers, and those with used clouds. Raises DataError if there are none."""
     usable = usable_frames(recording)
     none = usable[:0]
     marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]
@@ -170,7 +171,7 @@ def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]
 
 
 def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:
-    """Return so many of the frames at most, evenly spread."""
+    """Return at most `most` of the frames, evenly spread."""
     return (
         frames[np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))] if len(frames) else frames
     )
@@ -180,12 +181,12 @@ def _nothing(recording: Recording, measured: str) -> str:
     wanted = measured if measured in ("markers", "clouds") else "markers or clouds"
     has = {"markers": bool(len(recording.marker_frame)), "clouds": has_clouds(recording)}
     if not any(has[kind] for kind in has if kind in wanted):
-        return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in frames that are free (or whose loads are declared)"
-    return f"no frame with {wanted} is free of undeclared contact: the loop needs {wanted} in free frames (or declared loads)"
+        return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in contact-free frames (or frames with declared loads)"
+    return f"no contact-free frame has {wanted}: the loop needs {wanted} in contact-free frames (or frames with declared loads)"
 
 
 def marked_frames(recording: Recording) -> IntArray:
-    """Return the frames whose markers are used, thinned out. Raises DataError where there are none."""
+    """Return the frames whose markers are fitted, thinned out. Raises DataError if there are none."""
     return _frames_of(recording, "markers")[0]
 
 
@@ -199,7 +200,7 @@ def _trials(
     *,
     first_only: bool = False,
 ) -> list[tuple[Trial, Trial | None]]:
-    """Return the trials of a recording, (fitted, held out): its markers and its clouds, with a calibration to start from.
+    """Return the (fitted, held out) trials of a recording: its markers and its clouds, with a calibration as starting values.
 
     `first_only` fits the pose on the first frames.
     """
@@ -241,7 +242,7 @@ def _trials(
 
 
 def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[FloatArray, ...], FloatArray | None, States]:
-    """Return poses, initial inputs and states to start from: of the calibration where there are markers, else as declared.
+    """Return poses, initial inputs and states as starting values: from a calibration if there are markers, else as declared.
 
     Raises:
         InputError: neither markers, nor a declared pose.
@@ -256,24 +257,24 @@ def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise InputError(
-            "clouds without markers need to know where the camera stands",
+            "without markers, clouds need a known camera pose",
             where=recording.folder,
             found=f"no T_robot_camera of camera {', '.join(missing)}, no markers.csv, no rest.csv",
-            expected="T_robot_camera in recording.toml (maps camera coordinates to robot coordinates; a few millimetres and degrees off will do)",
-            hint="or show three markers in one frame, or measure them at rest (rest.csv)",
+            expected="T_robot_camera in recording.toml (maps camera coordinates to robot coordinates; accurate to a few millimetres and degrees)",
+            hint="or record three markers in one frame, or measure markers at rest (rest.csv)",
         )
     return tuple(T for T in recording.T_robot_camera if T is not None), initial, {}
 
 
 def _bare_scene(robot: Robot, recording: Recording, frames: IntArray, *, with_rest: bool) -> Scene:
-    """Return a scene of some frames without rows."""
+    """Return a scene of some frames, without rows."""
     none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
     scene = Scene(recording, frames, none, none, none, nowhere, none, none, nowhere)
     return with_rest_markers(robot, scene) if with_rest else scene
 
 
 def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> SurfaceRows | None:
-    """Return where the rows of a scene lie on the body, and their normals; None where they are markers."""
+    """Return the position and the normals of the rows of a scene on the body; None for markers."""
     if scene.crossings is None:
         return None
     keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
@@ -283,9 +284,9 @@ def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surfa
 
 
 def groups_of(scene: Scene, frames: IntArray | None = None, surface: SurfaceRows | None = None) -> Groups:
-    """Return what the rows of a scene have in common; sweeps are counted among `frames`, by default those of the scene.
+    """Return the grouping of the rows of a scene by marker, frame, sweep and state; sweeps are counted among `frames`, by default those of the scene.
 
-    `surface`: where the rows lie, if they are of clouds.
+    `surface`: position of the rows on the body if they are of clouds.
     """
     recording = scene.recording
     frames = scene.frames if frames is None else frames
@@ -308,4 +309,4 @@ def _rest_std(robot: Robot, trial: Trial) -> float | None:
 
 
 NUISANCE = CALIBRATED
-"""Effects that are always fitted along."""
+"""Effects that every fit includes, because calibration may adjust them: the modulus and the input offsets."""

@@ -9,11 +9,11 @@ from femsense.model.recording import Recording, state_key
 
 
 def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
-    """Return the number of the sweep that each frame belongs to, shape (f,): in the order of their names, so that it does not matter in which
-    order they were recorded; else in the order of time.
+    """Return the number of the sweep of each frame, shape (f,). Labelled sweeps are numbered in the order of their names, so that the order of recording
+    does not matter; others in the order of time.
 
-    A sweep is what the column `sweep` says; without it an excursion of the inputs from their lowest level and back; where
-    the inputs do not move, a run of frames under the same loads.
+    A sweep is given by the column `sweep`; without it, an excursion of the inputs from their lowest level and back; if the
+    inputs do not move, a run of frames under the same loads.
     """
     if recording.sweep is not None:
         labels = [recording.sweep[k] for k in frames]
@@ -24,7 +24,7 @@ def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
 
 
 def _drives(recording: Recording) -> FloatArray:
-    """Return inputs and pressures in one unit, shape (F, a + c): the widest range of a pressure is that of an input."""
+    """Return inputs and pressures in one unit, shape (F, a + c): pressures are scaled so that their widest range equals that of the inputs."""
     width = [float(np.ptp(table, axis=0).max(initial=0.0)) for table in (recording.inputs, recording.pressures)]
     scale = width[0] / width[1] if min(width) > 0 else 1.0
     return np.hstack([recording.inputs, scale * recording.pressures])
@@ -45,14 +45,14 @@ def _runs(recording: Recording, frames: IntArray) -> IntArray:
 
 
 def _fresh(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
-    """Return whether frames that are held out have a state that none of the others has."""
+    """Return whether the held-out frames contain a state that no fitted frame has."""
     keys = [state_key(recording, int(k)) for k in frames]
     fitted = {key for key, out in zip(keys, held) if not out}
     return any(key not in fitted for key, out in zip(keys, held) if out)
 
 
 def _can_be_spared(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
-    """Return whether frames may be held out while the others drive every input as far, under loads as heavy, in as many directions of gravity."""
+    """Return whether the remaining frames reach at least 90 % of each input and of the load, and all directions of gravity."""
     size = np.hstack([np.abs(_drives(recording)), _loads(recording)[:, None]])[frames]
     if (size[~held].max(axis=0, initial=0.0) < 0.9 * size.max(axis=0)).any():
         return False
@@ -63,19 +63,18 @@ def _can_be_spared(recording: Recording, frames: IntArray, held: BoolArray) -> b
 
 
 def _loads(recording: Recording) -> FloatArray:
-    """Return how heavy the known loads of each frame are [N], shape (F,)."""
+    """Return the sum of the magnitudes of the known loads of each frame [N], shape (F,)."""
     weights = np.linalg.norm(recording.load_forces, axis=1)
     return np.bincount(recording.load_frame, weights=weights, minlength=recording.frame_count).astype(float)
 
 
 def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:
-    """Return frames to fit, frames to hold out, and how they were chosen in words.
+    """Return the frames to fit, the frames to hold out, and the choice in words.
 
-    A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
-    its last quarter. Where what is left does not drive every input as far, under loads as heavy and in all directions of gravity (nobody could
-    tell then what an input does that is held out), or where these only repeat states that are fitted, sweeps that can be spared take their
-    places, if there are any that have states of their own: the evenly spread ones first, then from the last one on. Where no sweep can be
-    spared, a quarter of the frames of each.
+    A quarter of the sweeps is held out, evenly spread and including the last; of two or three sweeps the last one; of a single sweep
+    its last quarter. The fitted frames must reach at least 90 % of each input and load and all directions of gravity, and the held-out frames
+    must contain a state that is not fitted. Otherwise other sweeps take their places, the evenly spread ones first, then from the last
+    one on. If no sweep can be spared, a quarter of the frames of each is held out.
     """
     number = sweeps_of(recording, frames)
     count = int(number.max()) + 1
@@ -88,14 +87,13 @@ def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray
     if held is None:
         mask, held = _spared_within(recording, frames, number), even
         if mask.any():
-            return frames[~mask], frames[mask], f"{mask.sum()} of {len(frames)} frames (each sweep holds what no other does)"
+            return frames[~mask], frames[mask], f"{mask.sum()} of {len(frames)} frames (each sweep has inputs that no other has)"
     mask = np.isin(number, held)
     return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
 
 
 def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntArray) -> IntArray | None:
-    """Return the sweeps that are held out: `even` or, where these would be missed or only repeat what is fitted, as many of others that are not. None
-    where each sweep would be missed."""
+    """Return the sweeps to hold out: `even` if they can be spared and are new, else as many others that are. None if no sweep can be spared."""
 
     def fits(sweeps: list[int]) -> bool:
         return _can_be_spared(recording, frames, np.isin(number, sweeps))
@@ -116,8 +114,8 @@ def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntA
 
 
 def _spared_within(recording: Recording, frames: IntArray, number: IntArray) -> BoolArray:
-    """Return which frames are held out where each sweep would be missed, shape (f,): of each a quarter, evenly spread over those that would not, then
-    those with the largest inputs."""
+    """Return which frames are held out if no sweep can be spared, shape (f,): a quarter of each sweep, evenly spread over the frames that can be
+    spared, then those with the largest inputs."""
     held, height = np.zeros(len(frames), dtype=bool), np.abs(_drives(recording)[frames]).sum(axis=1)
     for sweep in range(int(number.max()) + 1):
         own = np.flatnonzero(number == sweep)

@@ -1,6 +1,6 @@
-"""Outliers: single measurements that are far from where the others of their frame and of their marker let expect them.
+"""Outliers: single measurements that deviate from the others of their frame and of their marker.
 
-A reflex, or a name that two markers swapped for a frame, weighs more than all the rest in a fit of squares, and spoils the error that is reported.
+A reflection, or the names of two markers swapped in one frame, would dominate a least-squares fit and the reported error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from femsense.loop.thresholds import Thresholds
 
 
 def without_outliers(data: Data, fitted: Sequence[FloatArray], held_out: Sequence[FloatArray]) -> Data:
-    """Return the data without outliers, as residuals (k, c) [m] of the fitted and of the held-out trials show them, and warn of each recording's."""
+    """Return the data without the outliers in the residuals (k, c) [m] of the fitted and the held-out trials, and warn of each recording's."""
     train = [_kept(data, t, r) for t, r in zip(data.train, fitted)]
     held = [_kept(data, t, r) for t, r in zip(data.held, held_out)]
     pairs = [*zip(data.train, train), *zip(data.held, held)]
@@ -27,7 +27,7 @@ def without_outliers(data: Data, fitted: Sequence[FloatArray], held_out: Sequenc
 
 
 def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
-    """Return a trial without its outliers; itself where there are none, or it is of clouds."""
+    """Return a trial without its outliers; unchanged if there are none, or for clouds."""
     if trial.scene.crossings is not None:
         return trial
     off = outliers(
@@ -38,24 +38,26 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     return replace(trial, scene=trial.scene.of_rows(~off), groups=trial.groups.of_rows(~off), mesh_error=None)
 
 
-def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, decides: Thresholds) -> BoolArray:
-    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by so many times the 90 % quantile.
+def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, thresholds: Thresholds) -> BoolArray:
+    """Return which rows of a residual (k, 3) [m] are outliers, shape (k,).
 
-    Several of a frame that are off the same way are no outliers: a part of the body is elsewhere than the model has it. Two that swapped their names
-    are off opposite ways.
+    After the medians of its frame and of its marker are subtracted, an outlier is longer than `far` [m] and than `outlying` times the 90 % quantile.
+
+    Several rows of a frame that deviate in the same direction are kept: there the model is wrong, not the measurement. Two markers with
+    swapped names deviate in opposite directions.
     """
     apart = _less_medians(_less_medians(residual, frame), marker)
     size = np.linalg.norm(apart, axis=1)
-    off = size > max(far, decides.outlying * float(np.quantile(size, 0.9)))
+    off = size > max(far, thresholds.outlying * float(np.quantile(size, 0.9)))
     for k in np.unique(frame[off]):
         rows = np.flatnonzero(off & (frame == k))
         if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():
             off[rows] = False
-    return off if off.sum() <= max(decides.rare * len(off), 1) else np.zeros(len(off), dtype=bool)
+    return off if off.sum() <= max(thresholds.rare * len(off), 1) else np.zeros(len(off), dtype=bool)
 
 
 def _less_medians(values: FloatArray, labels: IntArray) -> FloatArray:
-    """Return values (k, 3) less the median of those with the same label."""
+    """Return values (k, 3) with the median of the rows of the same label subtracted."""
     result = values.copy()
     for label in np.unique(labels):
         rows = labels == label

@@ -1,4 +1,4 @@
-"""States that are reached again: what differs between them is noise, whatever the model."""
+"""Repeated states: their differences are noise, whatever the model."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from femsense.loop.data.trial import Trial
 from femsense.model.repeats import State, squares_about_mean, stays_of
 
 Cell = tuple[State, int]
-"""A state with the one before it, and a marker."""
+"""A state with its predecessor, and a marker."""
 
 
 def rows_of_stays(trial: Trial, residual: FloatArray) -> dict[Cell, dict[int, FloatArray]]:
-    """Return for each state and marker the residuals of each stay [m], (frames, c)."""
+    """Return the residuals of each stay in each state, by marker: cell → stay → [m], (frames, c)."""
     stays = stays_of(trial.scene.recording)
     rows: dict[Cell, dict[int, list[FloatArray]]] = {}
     for k, m, r in zip(trial.scene.frame, trial.scene.marker, residual):
@@ -25,21 +25,21 @@ def rows_of_stays(trial: Trial, residual: FloatArray) -> dict[Cell, dict[int, Fl
 
 
 def repeated_means(trial: Trial, residual: FloatArray) -> list[FloatArray]:
-    """Return for each state and marker the mean residuals of its stays [m], (stays, c)."""
+    """Return the mean residuals of the stays in each state and marker [m], (stays, c)."""
     return [np.array([own.mean(axis=0) for own in of.values()]) for of in rows_of_stays(trial, residual).values()]
 
 
 def count_repeats(trial: Trial) -> int:
-    """Return how many stays repeat an earlier one."""
+    """Return the number of stays that repeat an earlier one."""
     stays = stays_of(trial.scene.recording)
     seen = {stays[int(k)] for k in trial.scene.frames}
     return len(seen) - len({state for _, state in seen})
 
 
 def scatter_of_repeats(trials: Sequence[Trial], residuals: Sequence[FloatArray]) -> tuple[float, int]:
-    """Return by how much rows of one marker in one state scatter along each axis [m], and by how many degrees of freedom that is known.
+    """Return the standard deviation along each axis of rows of one marker in one state [m], and its degrees of freedom.
 
-    Frames of one stay scatter by what differs from frame to frame; stays in one state also by what differs from sweep to sweep. The larger one counts.
+    It is the larger of two estimates: frames of one stay vary with the frame; means of stays in one state vary also with the sweep.
     """
     within, between = np.zeros(2), np.zeros(2)
     for trial, residual in zip(trials, residuals):

@@ -1,4 +1,4 @@
-"""Which states of a recording speak for all."""
+"""Representative states of a recording."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from femsense.model.recording import Recording
 from femsense.model.robot import spread_points
 
 FEWEST = 16
-"""They are as many at least."""
+"""Minimum number of representative states."""
 SAME = 1e-9
-"""States whose inputs and loads differ by less, in units of their ranges, are one."""
+"""States whose inputs and loads differ by less than this, in units of their ranges, are the same."""
 
 
 def spread_states(trial: Trial, most: int) -> tuple[IntArray, float]:
-    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending; and the share of
-    its states that these are."""
+    """Return the frames of at most `most` (at least FEWEST) states of a trial, chosen as different as possible, ascending; and the share of its
+    states that these are."""
     frames = trial.scene.frames
     vectors = state_vectors(trial.scene.recording, frames)
     every = representatives(vectors, len(vectors))
@@ -28,11 +28,11 @@ def spread_states(trial: Trial, most: int) -> tuple[IntArray, float]:
 
 
 def state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
-    """Return what drives each frame, each number in units of its range, shape (f, q)."""
+    """Return the drives of each frame, each number in units of its range, shape (f, q)."""
     table = drive_table(recording, frames)
     return np.asarray((table - table[0]) / ranges(table))
 
 
 def representatives(vectors: FloatArray, most: int) -> IntArray:
-    """Return indices of distinct states, at most so many, spread widely."""
+    """Return indices of at most `most` distinct states, spread widely."""
     return spread_points(vectors, most, apart=SAME)

@@ -1,4 +1,4 @@
-"""What was computed in some states, and what others have in between."""
+"""Quantities computed in some states and interpolated in others."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ def drive_table(recording: Recording, frames: IntArray) -> FloatArray:
 
 
 def ranges(table: FloatArray) -> FloatArray:
-    """Return by how much each column of a table of drives (f, q) varies, shape (q,)."""
+    """Return the range of each column of a table of drives (f, q), shape (q,)."""
     return np.asarray(np.maximum(np.ptp(table, axis=0), 1e-12))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sampled:
-    """What was computed in some states, and lies in between in others."""
+    """A quantity computed in n states and interpolated between them."""
 
     drives: FloatArray
-    """What drives these states, shape (n, q): rows of `drive_table`."""
+    """Drives of these states, shape (n, q): rows of `drive_table`."""
     values: FloatArray
     """Shape (n, …)."""
     ranges: FloatArray
-    """By how much each of the drives varies in all states, shape (q,)."""
+    """Range of each drive over all states, shape (q,)."""
 
     def at(self, drives: FloatArray) -> FloatArray:
-        """Return the values of states that are driven so, shape (f, …), drives of shape (f, q)."""
+        """Return the interpolated values at drives of shape (f, q), shape (f, …)."""
         count = len(self.values)
         known = RBFInterpolator(self.drives / self.ranges, self.values.reshape(count, -1), kernel="linear", degree=0)
         return np.asarray(known(drives / self.ranges)).reshape(len(drives), *self.values.shape[1:])

@@ -1,12 +1,12 @@
-"""Clouds as data of the loop: points of the surface, and where in each frame the measured surface crosses the normals there.
+"""Clouds as data of the loop: the distance of surface points of the model from the measured surface, along the normals.
 
-A point of the surface plays the part of a marker, and its distance from the measured surface that of its residual: one row. The measured
-surface is a smooth function of place (`femsense.pointcloud.sheets`) that knows nothing of a model, so that derivatives are those of the
-residual and two models are compared on the same rows; which rows there are is decided once, on the model with all that calibration may move.
+A surface point takes the place of a marker; its distance from the measured surface is its residual, one row. The measured
+surface is a smooth height field (`femsense.pointcloud.sheets`) that does not depend on a model, so residuals have exact derivatives and
+two models are compared on the same rows. The rows are selected once, with the calibrated model.
 
-Height fields are as wide as a finger and round off edges, steps and facets. So a row counts from what the model's own surface gives, made
-in the same way of the places on it that are nearest to the measured points: what the model has rounded off as well is no residual. Without
-it the right model is off, in the same places in all frames. That part is counted anew as the fit moves on (`renewed_rows`).
+Height fields are as wide as a finger and round off edges, steps and facets, in the same places in all frames. The model's surface is
+therefore smoothed in the same way, at the places nearest to the measured points, and its rounding is subtracted (`renewed_rows`
+recomputes it as the fit proceeds). Without this the true model would leave a residual at every edge.
 """
 
 from __future__ import annotations
@@ -36,48 +36,48 @@ from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.pointcloud.sheets import Crossings, Sheets, fit_sheet, joined
 
 SURFACE_POINTS = 140
-"""Points of the surface; a camera sees less than half of them at once."""
+"""Number of surface points; one camera sees less than half of them."""
 VOXEL = 0.01
-"""Edge of the cells that measured points are averaged over, in diagonals of the body."""
+"""Edge of the cells over which measured points are averaged, in diagonals of the body."""
 RADIUS = 3.5
 """Radius of a height field, in cells."""
 SPACING = 0.6
-"""Distance of the centres of height fields, in radii."""
+"""Spacing of the centres of height fields, in radii."""
 ROUNDS = 0.2
-"""Most that a height field rounds off, in radii: a right angle comes to 0.16, a place that the model's own fields do not cover to 0.2 … 2."""
+"""Largest rounding of a height field, in radii: 0.16 at a right angle; 0.2 … 2 where the model's own fields do not cover it."""
 STEEPEST = 0.78
-"""Cosine between the measured and the modelled normal below which a place is of another side of the body."""
+"""Cosine between the measured and the modelled normal below which a place belongs to another side of the body."""
 AROUND = 16
-"""Measured points around a place that tell whether it lies at the border of what was measured."""
+"""Number of neighbouring measured points that decide whether a place lies at the border of the measured surface."""
 LOPSIDED = 0.5
-"""Largest distance of their mean from the place, in their mean distance: it is 0.64 on a straight border."""
+"""Largest offset of their mean from the place, relative to their mean distance; on a straight border it is 0.64."""
 REACH = 0.1
-"""Largest distance of the measured surface from the model's, in diagonals; and of the robot's points where colours do not tell."""
+"""Largest distance of the measured surface from the model's, in diagonals; also of robot points that colour does not identify."""
 FACING = 0.35
 """Smallest cosine between a normal and the ray to the camera."""
 SMOOTH = 0.06
-"""Distance over which errors go together, in diagonals."""
+"""Correlation length of errors, in diagonals."""
 PLANE = 1.5
-"""Half the thickness of a floor or wall beside the robot, in cells."""
+"""Half the thickness of a floor or wall next to the robot, in cells."""
 STANDS_OUT = 5.0
-"""A row farther from its neighbours in the frame than this many of their usual differences is left out."""
+"""A row is an outlier if it deviates from its neighbours in the frame by more than this many robust standard deviations."""
 FEWEST_ROWS = 8
-"""Rows that a frame needs, neighbours that a row is compared with, and points off sharp edges without which those on edges count, too."""
+"""Minimum number of rows of a frame, of neighbours of a row, and of points away from sharp edges before points on edges are used too."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeasuredSurface:
-    """What the cameras measured of the robot."""
+    """The measured surface of the robot."""
 
     points: dict[tuple[int, int], FloatArray]
-    """(frame, view) → points [m], shape (r, 3), frame of that camera."""
+    """(frame, view) → points [m], shape (r, 3), in the frame of that camera."""
     sheets: Sheets
-    """The surfaces of these, in this order."""
+    """Height fields of these clouds, in the same order."""
     voxel: float
-    """Distance of neighbouring points [m]."""
+    """Spacing of neighbouring points [m]."""
 
     def cloud(self, sheet: int) -> FloatArray:
-        """Return the points of a surface by its number [m], shape (r, 3)."""
+        """Return the points of a cloud by its number [m], shape (r, 3)."""
         return list(self.points.values())[sheet]
 
 
@@ -92,7 +92,7 @@ def cloud_frames(recording: Recording) -> IntArray:
 
 
 def with_surface(robot: Robot) -> Robot:
-    """Return the robot with points of its free surface behind its markers, evenly spread and off sharp edges."""
+    """Return the robot with points of its free surface appended to its markers, evenly spread and away from sharp edges."""
     surface = body_surface(robot.body.mesh)
     nodes = robot.body.mesh.nodes
     flat = spread_features(robot.body, SURFACE_POINTS, among=flat_nodes(surface, nodes))
@@ -105,22 +105,22 @@ def diagonal_of(robot: Robot) -> float:
     return float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
 
 
-# What the cameras measured
+# Measured surface
 
 
 def read_clouds(
     robot: Robot, recording: Recording, states: dict[int, Equilibrium], poses: tuple[FloatArray, ...]
 ) -> MeasuredSurface:
-    """Return the robot's points in the clouds of some frames.
+    """Return the points of the robot in the clouds of some frames.
 
     Arguments:
-        robot: as it is declared.
+        robot: the declared robot.
         recording: with clouds or depth images.
-        states: of the frames that are wanted, as the model has them.
+        states: model states of these frames.
         poses: of the cameras.
 
     Raises:
-        InputError: a broken file; DataError: no camera sees the robot in any of the frames.
+        InputError: a malformed file; DataError: no camera sees the robot in any of the frames.
     """
     size = diagonal_of(robot)
     voxel = VOXEL * size
@@ -134,13 +134,13 @@ def read_clouds(
                 points[k, view] = own
     if not points:
         raise DataError(
-            "no camera sees the robot in any frame that can be used: check T_robot_camera, appearance.color_rgb, and that the clouds are in metres"
+            "no camera sees the robot in any usable frame: check T_robot_camera, appearance.color_rgb, and that the clouds are in metres"
         )
     return MeasuredSurface(points, joined([sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
 
 
 def sheet_of(points: FloatArray, radius: float) -> Sheets:
-    """Return the measured surface of one cloud: height fields at points that are evenly thinned out."""
+    """Return the measured surface of one cloud: height fields at evenly spaced points."""
     thin = voxel_grid(PointCloud(points), SPACING * radius).points
     chosen = np.unique(np.asarray(cKDTree(points).query(thin)[1]))
     return fit_sheet(points, points[chosen], estimate_normals(points, radius)[0][chosen], radius)
@@ -149,7 +149,7 @@ def sheet_of(points: FloatArray, radius: float) -> Sheets:
 def _robot_points(
     robot: Robot, cloud: PointCloud, pose: FloatArray, state: Equilibrium, triangles: IntArray, size: float
 ) -> FloatArray | None:
-    """Return the points of the robot in one cloud [m], shape (r, 3), frame of the camera: boxed, thinned and segmented as `estimate` does."""
+    """Return the points of the robot in one cloud [m], shape (r, 3), camera frame: cropped, thinned and segmented as in `estimate`."""
     voxel, margin, zero = VOXEL * size, 0.25 * size, np.zeros(len(cloud), dtype=np.int64)
     placed = PointCloud(in_robot_frame(cloud.points, zero, [pose], robot.observation), cloud.colors)
     box = np.array([state.positions.min(axis=0) - margin, state.positions.max(axis=0) + margin])
@@ -172,7 +172,7 @@ def states_of(
     initial: FloatArray | None,
     starts: dict[int, Equilibrium] | None = None,
 ) -> dict[int, Equilibrium]:
-    """Return the equilibrium of each frame of a scene. Raises DataError where there is none."""
+    """Return the equilibrium of each frame of a scene. Raises DataError if there is none."""
     return evaluate_robot(robot, scene, poses, initial, starts).states
 
 
@@ -182,13 +182,13 @@ def states_of(
 def make_rows(
     robot: Robot, scene: Scene, seen: MeasuredSurface, states: dict[int, Equilibrium], poses: list[FloatArray]
 ) -> Scene:
-    """Return the scene of a recording's clouds: one row for each point of the surface whose normal the measured surface crosses.
+    """Return the scene of a recording's clouds: one row per surface point whose normal crosses the measured surface.
 
     Arguments:
-        robot: with points of its surface.
-        scene: of the recording; its frames count, its rows do not.
-        seen: what was measured.
-        states: of each frame, as the model has them.
+        robot: with surface points.
+        scene: provides the recording and its frames; its rows are ignored.
+        seen: the measured surface.
+        states: model states by frame.
         poses: of the cameras.
 
     Raises:
@@ -203,7 +203,7 @@ def make_rows(
             every.append((np.full(len(numbers), k), len(robot.glued_names) + numbers, np.full(len(numbers), v), heights, own))
     if not every:
         raise DataError(
-            f"the measured surface lies nowhere within {1e3 * REACH * diagonal_of(robot):.0f} mm of the model's: check T_robot_camera and the inputs"
+            f"no part of the measured surface lies within {1e3 * REACH * diagonal_of(robot):.0f} mm of the model's: check T_robot_camera and the inputs"
         )
     frame, marker, view = (np.concatenate([e[i] for e in every]) for i in range(3))
     heights = np.concatenate([e[3] for e in every])
@@ -278,7 +278,7 @@ def surface_normals(robot: Robot, positions: FloatArray) -> FloatArray:
 
 
 def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
-    """Leave out rows that lie apart from their neighbours in the frame: another limb, a cable, a flying pixel."""
+    """Exclude rows that deviate from their neighbours in the frame: another limb, a cable, a flying pixel."""
     apart = np.zeros(len(heights))
     for k in scene.frames:
         rows = np.flatnonzero(scene.frame == k)
@@ -293,7 +293,7 @@ def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
 def renewed_rows(
     robot: Robot, scene: Scene, seen: MeasuredSurface, states: dict[int, Equilibrium], poses: list[FloatArray]
 ) -> Scene:
-    """Return the same rows with what the model rounds off counted anew where it now has the surface."""
+    """Return the same rows with the rounding recomputed at the present surface of the model."""
     assert scene.crossings is not None
     robot, rounded = robot.in_recording(scene.recording.label), scene.crossings.rounded.copy()
     for i, (k, v) in enumerate(seen.points):

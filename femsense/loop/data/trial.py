@@ -1,4 +1,4 @@
-"""A trial: one recording as the fit sees it, its markers or its clouds, and what its rows have in common."""
+"""A trial: the markers or the clouds of one recording, as the fit uses them, with the grouping of their rows."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ COMPONENTS = ("white", "state", "marker", "frame", "sweep")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Groups:
-    """What the rows of a recording's residual have in common; one number a row, shape (k,)."""
+    """Groups of correlated rows of a recording: one group number per row, shape (k,)."""
 
     marker: IntArray
     frame: IntArray
     sweep: IntArray
     state: IntArray
-    """Marker within a state (same inputs and loads)."""
+    """Marker and state (same inputs and loads)."""
     surface: SurfaceRows | None = None
-    """Where the rows lie if they are points of a surface; None: they are markers, three axes each."""
+    """Position of the rows on the body if they are points of a surface; None: markers, with three axes each."""
     turns: FloatArray | None = None
-    """By how much a marker moves if its place on the body at rest does, shape (k, 3, 3), by the axes of that place last; None: as if it did not turn."""
+    """∂(marker position)/∂(its place on the body at rest), shape (k, 3, 3), axes of the place last; None: the identity."""
 
     @property
     def placements(self) -> FloatArray | None:
-        """The fields of markers that sit elsewhere by a unit, shape (k, 3, 3 markers); None: not known."""
+        """The displacements of markers per unit of misplacement, shape (k, 3, 3 markers); None: unknown."""
         if self.turns is None:
             return None
         count = int(self.marker.max(initial=-1)) + 1
@@ -47,7 +47,7 @@ class Groups:
         return fields.reshape(len(self.marker), 3, 3 * count)
 
     def shared(self, name: str) -> FloatArray:
-        """Return how much of a component each two rows have in common, shape (k, k)."""
+        """Return the correlation of a noise component between every two rows, shape (k, k)."""
         if name == "white":
             return np.eye(len(self.marker))
         labels = getattr(self, name)
@@ -56,7 +56,7 @@ class Groups:
         return self.surface.shared(name, labels)
 
     def of_rows(self, rows: BoolArray | IntArray) -> Groups:
-        """Return the groups of some rows."""
+        """Return the groups of a selection of rows."""
         marker, frame, sweep, state = (
             np.unique(labels[rows], return_inverse=True)[1] for labels in (self.marker, self.frame, self.sweep, self.state)
         )
@@ -65,18 +65,18 @@ class Groups:
 
     @property
     def observations(self) -> int:
-        """Number of independent observations, as BIC counts them: coordinates of markers, or crossings of a surface, in distinct states."""
+        """Number of independent observations, as BIC counts them: marker coordinates, or cells of the surface, in distinct states."""
         if self.surface is None:
             return 3 * (int(self.state.max(initial=-1)) + 1)
         return self.surface.cells()
 
     def members(self) -> dict[str, IntArray]:
-        """Return the groupings that are distinguishable here: each has groups of several rows, and several groups."""
+        """Return the groupings that can be estimated: those with several groups, of which some have several rows."""
         result: dict[str, IntArray] = {}
         for name in COMPONENTS[1:]:
             labels = getattr(self, name)
             count = np.bincount(labels)
-            always = name == "state" and self.surface is not None  # neighbours repeat each other's error
+            always = name == "state" and self.surface is not None  # errors of neighbouring points are correlated within a state
             if always or ((count > 1).any() and len(count) > 1):
                 result[name] = labels
         return result
@@ -84,10 +84,10 @@ class Groups:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SurfaceRows:
-    """Rows of a cloud: where they lie on the body, and along which normals they are measured."""
+    """Position and normals of the rows of a cloud."""
 
     points: FloatArray
-    """At rest [m], shape (k, 3)."""
+    """Position on the body at rest [m], shape (k, 3)."""
     normals: FloatArray
     """Measured, shape (k, 3)."""
     rest_normals: FloatArray
@@ -95,10 +95,10 @@ class SurfaceRows:
     states: IntArray
     """Which state (same inputs and loads) each row was measured in, shape (k,)."""
     length: float
-    """ℓ: errors of the model, of the shape and of the camera go together over this distance [m]."""
+    """ℓ, correlation length of errors of the model, the shape and the camera [m]."""
 
     def shared(self, name: str, labels: IntArray) -> FloatArray:
-        """Return how much of a component each two rows have in common, shape (k, k)."""
+        """Return the correlation of a noise component between every two rows, shape (k, k)."""
         of_body = name in ("state", "marker")
         normals = self.rest_normals if of_body else self.normals
         alike = normals @ normals.T
@@ -112,43 +112,43 @@ class SurfaceRows:
         return np.asarray(alike * (groups[:, None] == groups[None, :]))
 
     def of_rows(self, rows: BoolArray | IntArray) -> SurfaceRows:
-        """Return some of the rows."""
+        """Return a selection of the rows."""
         return SurfaceRows(self.points[rows], self.normals[rows], self.rest_normals[rows], self.states[rows], self.length)
 
     def cells(self) -> int:
-        """Return the number of cells of the size of ℓ that are seen, summed over states."""
+        """Return the number of observed cells of edge ℓ, summed over states."""
         cells = np.floor(self.points / self.length).astype(np.int64)
         return len(np.unique(np.column_stack([cells, self.states]), axis=0))
 
 
 States = dict[int, Equilibrium]
-"""Frame → the state that was solved last."""
+"""Frame → its last solved state."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Trial:
-    """One recording as the fit sees it: its markers, or its clouds."""
+    """The markers, or the clouds, of one recording, as the fit uses them."""
 
     scene: Scene
     groups: Groups
     poses: tuple[FloatArray, ...]
-    """Where the fit starts; pose steps are counted from here."""
+    """Starting values; pose increments are relative to them."""
     initial: FloatArray | None
-    """Start of the initial inputs; None where they are known."""
+    """Starting values of the initial inputs; None if these are known."""
     input_low: FloatArray
     input_high: FloatArray
     starts: dict[int, tuple[TetMesh, States]]
-    """States of earlier evaluations, frame by frame, for each mesh."""
+    """States of earlier evaluations by frame, for each mesh; they serve as warm starts."""
     mesh_error: FloatArray | None = None
-    """Fields of what a finer mesh would move the markers by [m], shape (k, c, b); each counts as noise of its size (`loop.fit.discretisation_error`)."""
+    """Fields of the discretisation error of the markers [m], shape (k, c, b), each scaled to one standard deviation (`loop.fit.discretisation_error`)."""
     mesh_moves: Sampled | None = None
-    """By how much a finer mesh moves the robot's markers in the states in which that was computed [m], each (m, 3)."""
+    """Displacement of the robot's markers by a finer mesh in the states in which it was computed [m], each (m, 3)."""
     together: bool = False
-    """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
+    """Whether these are the clouds of the recording whose markers are the previous trial: pose and initial inputs are shared."""
     seen: MeasuredSurface | None = None
-    """What the cameras measured of the robot; only of clouds."""
+    """The measured surface of the robot; None for markers."""
     frames: IntArray | None = None
-    """All frames of the recording that are fitted (or held out) with these, markers and clouds; None: those of the scene."""
+    """All fitted (or held-out) frames of the recording, markers and clouds together; None: those of the scene."""
 
     @property
     def size(self) -> int:
@@ -157,27 +157,27 @@ class Trial:
 
     @property
     def error_by_sweep(self) -> FloatArray | None:
-        """The fields of the mesh's error that are large: of all sweeps together and of each by itself. Small ones follow, which are not worth a
-        degree of freedom each where the noise is estimated from few states."""
+        """The fields of the discretisation error that get a degree of freedom when the noise is estimated: common to all sweeps, and one per sweep. The
+        rotated fields are small and are left out."""
         return None if self.mesh_error is None else self.mesh_error[:, :, : 1 + len(np.unique(self.groups.sweep))]
 
     def part(self, frames: IntArray) -> Trial:
-        """Return the trial with some of its frames only."""
+        """Return the trial restricted to some frames."""
         rows = np.isin(self.scene.frame, frames)
         return replace(self, scene=self.scene.pick(frames), groups=self.groups.of_rows(rows), mesh_error=None)
 
     def starts_on(self, mesh: TetMesh) -> States:
-        """Return the states of earlier evaluations on a mesh (bodies of another size share its elements)."""
+        """Return the warm starts on a mesh; bodies of another size share its elements."""
         return self.starts.setdefault(id(mesh.tets), (mesh, {}))[1]
 
     def place(self, own: FloatArray, pivot: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
-        """Return poses and initial inputs for the trial's own parameters."""
+        """Return poses and initial inputs from the trial's own parameters."""
         at = 6 * len(self.poses)
         return moved_poses(self.poses, own[:at], pivot), None if self.initial is None else own[at:]
 
 
 def spans_of(trials: Sequence[Trial]) -> list[slice]:
-    """Return where the parameters of each trial's recording stand in θ."""
+    """Return the slice of θ that each trial's recording owns."""
     spans: list[slice] = []
     at = 0
     for trial in trials:
@@ -195,12 +195,12 @@ def numbers_of(trials: Sequence[Trial]) -> list[int]:
 
 
 def heads_of(trials: Sequence[Trial]) -> list[int]:
-    """Return the index of the trial of each recording that speaks for it: its markers, where there are any, else its clouds."""
+    """Return the index of the trial that represents each recording: its markers if it has any, else its clouds."""
     return [i for i, t in enumerate(trials) if not t.together]
 
 
 def vectors_of(trial: Trial, residual: FloatArray, poses: Sequence[FloatArray] | None = None) -> FloatArray:
-    """Return a residual (k, c) [m] as vectors of the robot frame, shape (k, 3): those of clouds along the measured normals."""
+    """Return a residual (k, c) [m] as vectors in the robot frame, shape (k, 3); those of clouds point along the measured normals."""
     if trial.scene.crossings is None:
         return residual
     return residual * normals_of(trial.scene, trial.poses if poses is None else poses)
@@ -214,12 +214,12 @@ def normals_of(scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
 
 
 def rms_of(residuals: list[FloatArray]) -> float:
-    """Return the root mean square 3-D length of the residuals of markers (k, 3) [m]; where there are none, of clouds (k, 1)."""
+    """Return the root mean square 3-D length of the residuals of markers (k, 3) [m]; if there are none, the rms of those of clouds (k, 1)."""
     kind = max(r.shape[1] for r in residuals)
     return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals if r.shape[1] == kind]))))
 
 
 def normal_rms_of(residuals: list[FloatArray]) -> float | None:
-    """Return the root mean square of the residuals of clouds (k, 1) [m]; None where there are none."""
+    """Return the root mean square of the residuals of clouds (k, 1) [m]; None without clouds."""
     own = [r.ravel() for r in residuals if r.shape[1] == 1]
     return float(np.sqrt(np.mean(np.concatenate(own) ** 2))) if own else None

@@ -1,1 +1,1 @@
-"""Experiments: what they could show, and which to record next."""
+"""Experiments: identifiability of effects, and proposals."""

@@ -1,4 +1,4 @@
-"""A plan in words: tables for people, and the next experiment that a finished loop asks for."""
+"""Plans as text, and the next experiment after a finished loop."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from femsense.model.robot import Robot
 
 
 def identifiability_text(identifiability: Identifiability, before: Identifiability | None = None) -> str:
-    """Return what an experiment could show as a table; with what came before beside it."""
+    """Return the identifiability of an experiment as a table, compared with `before` if given."""
     first = {r.label: r for r in before.rows} if before is not None else {}
     wide = max(len(r.label) for r in identifiability.rows) + 2
-    head = f"{'effect':{wide}}{'left by calibration':>22}{'smallest seen':>32}{'dBIC at plausible size':>26}"
+    head = f"{'effect':{wide}}{'retained share':>22}{'smallest detectable':>32}{'dBIC at plausible size':>26}"
     lines = [head, "-" * len(head)]
     for r in identifiability.rows:
         old = first.get(r.label)
@@ -38,7 +38,7 @@ def identifiability_text(identifiability: Identifiability, before: Identifiabili
         cells.append(_arrow(None if old is None else old.dbic, r.dbic, "{:.0f}"))
         lines.append(f"{r.label:{wide}}{cells[0]:>22}{cells[1]:>32}{cells[2]:>26}  {_verdict(r)}")
     for label in (k for k in first if k not in {r.label for r in identifiability.rows}):
-        lines.append(f"{label:{wide}}measured by rest.csv, no longer in question")
+        lines.append(f"{label:{wide}}measured by rest.csv, no longer fitted")
     return "\n".join([*lines, "", *_summary(identifiability, before)])
 
 
@@ -54,7 +54,7 @@ def _both(old: Row | None, new: Row) -> str:
 
 
 def _smallest(r: Row, *, bare: bool = False) -> str:
-    """Return the smallest size of the effect's middle parameter in its own unit."""
+    """Return the median of the smallest detectable sizes of an effect's first key, in its unit."""
     of = [i for i, p in enumerate(r.form.parameters) if p.key == r.form.parameters[0].key]
     size = float(np.sort(r.smallest[of])[(len(of) - 1) // 2])
     p = r.form.parameters[0]
@@ -71,7 +71,7 @@ def _smallest(r: Row, *, bare: bool = False) -> str:
 
 
 def _verdict(r: Row) -> str:
-    return "" if r.seen else "too small to be seen" if r.testable else "not testable"
+    return "" if r.seen else "not detectable" if r.testable else "not testable"
 
 
 def _summary(identifiability: Identifiability, before: Identifiability | None) -> list[str]:
@@ -84,8 +84,8 @@ def _summary(identifiability: Identifiability, before: Identifiability | None) -
 
     apart = " → ".join("{} of {}".format(*o.distinguished()) for o in (before, identifiability) if o is not None)
     lines = [
-        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be distinguished: {apart}",
-        f"pairs that would both be seen and look alike: {count('confused')}",
+        f"not testable: {count('untestable')}; not detectable: {count('unseen')}; pairs of effects that would be distinguished: {apart}",
+        f"pairs that would be detectable and collinear: {count('confused')}",
     ]
     for i, j, share, gap in sorted(identifiability.confused(), key=lambda p: p[3])[:12]:
         names = f"{identifiability.rows[i].label} / {identifiability.rows[j].label}"
@@ -94,16 +94,16 @@ def _summary(identifiability: Identifiability, before: Identifiability | None) -
 
 
 def proposal_text(proposal: Proposal) -> str:
-    """Return a proposal in words and its table."""
+    """Return a proposal as text with its table."""
     brings = {s.element.key: s.better for s in proposal.steps}
     frames, seconds = sum(e.frames for e in proposal.elements), sum(e.seconds for e in proposal.elements)
     lines = [f"What to record ({frames} frames, {seconds / 60:.1f} minutes of motion; every item starts and ends at rest):", ""]
     for i, e in enumerate(proposal.elements):
-        how = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
-        lines.append(f"{i + 1:3d}. {e.words}{how}")
+        effort = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
+        lines.append(f"{i + 1:3d}. {e.words}{effort}")
         lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
     if not proposal.steps:
-        lines.append("none of the candidate experiments helps within these frames")
+        lines.append("no candidate experiment helps within these frames")
     lines += [f"left out: {text}" for text in proposal.left_out]
     title = f"Predicted, before → after, {1e3 * proposal.noise:g} mm noise a coordinate, on the declared robot:"
     note = (
@@ -112,25 +112,25 @@ def proposal_text(proposal: Proposal) -> str:
     return "\n".join([*lines, "", note, "", title, "", identifiability_text(proposal.after, proposal.before)])
 
 
-# What a finished loop asks for
+# The next experiment after a loop
 
 
 def next_element(
     data: Data, fit: JointFit, noise: Noise, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
 ) -> list[tuple[str, str, float, float]]:
-    """Return which candidate experiment would help most with what the data leave open, and by how much.
+    """Return the candidate experiments that would help most with the open questions of the data, and by how much.
 
     Arguments:
-        data: of the loop; few of its frames are looked at.
+        data: of the loop, thinned to a few frames.
         fit: the model.
         noise: of the data.
         confounded: pairs of effects that the data cannot distinguish.
-        not_testable: effects that they cannot show.
+        not_testable: effects that calibration absorbs in these data.
 
     Returns:
-        (what to do, the open question that gains most by it, the expected evidence on it before and after), the best first; empty where nothing
-        brings any question towards an answer or where it would take too long. What an item is worth is the evidence between 0 and
-        what decides that it adds to each question: below 0 the wrong answer is expected, and less wrong is no better.
+        (what to do, the open question that gains most, the expected evidence on it before and after), the best first; empty if no
+            experiment helps or if the prediction would take too long. The value of an experiment is the evidence that it adds to all questions,
+            counted between 0 and `evidence`: below 0 the wrong answer is expected, and less of it is no improvement.
     """
     robot = fit.hypothesis.robot_at(fit.coordinates)
     names = {n for pair in confounded for n in pair} | set(not_testable)
@@ -142,7 +142,7 @@ def next_element(
         return []
     try:
         zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
-        marked = robot.without_surface_points() if robot.glued_names else robot  # what an experiment would have on it
+        marked = robot.without_surface_points() if robot.glued_names else robot  # an experiment has the declared markers only
         setup = setup_for(marked, data.control, zero, most=data.input_scale)
         forms = _open_forms(robot, data, names)
         shares = [len(cases.scene.frames) / len(t.scene.frames) for cases, t in zip(trials, data.train)]
@@ -152,9 +152,9 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms, decides=data.thresholds), _most_frames(data, tets)
+    judge, left = Judge(forms, thresholds=data.thresholds), _most_frames(data, tets)
     now = _open(judge.judge(have), confounded, not_testable)
-    questions = [*(f"tell {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
+    questions = [*(f"distinguish {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
     chosen = []
     for element in _one_of_each_first(candidate_experiments(setup)):
         if element.sweeps and element.frames < left:
@@ -180,7 +180,7 @@ def next_element(
 
 
 def _most_frames(data: Data, tets: int) -> int:
-    """Return how many frames items may cost as advice after a loop, a few seconds' worth; the recordings may cost twice that."""
+    """Return the number of frames that candidates may take after a loop, a few seconds of work; the recordings may take twice that."""
     return min(3 * data.effort.work // (2 * tets), FRAMES)
 
 
@@ -192,7 +192,7 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
 def _representative(trial: Trial) -> Trial:
     frames = trial.scene.frames
     every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_EACH, len(frames))).round().astype(int))
-    return replace(trial.part(frames[every]), together=False)  # it goes by its number with the markers of its recording
+    return replace(trial.part(frames[every]), together=False)  # the recording number links it to its markers
 
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
@@ -207,13 +207,13 @@ def _trial_block(trial: Trial, robot: Robot, forms: list[Form], noise: float, ke
 
 
 def _open(identifiability: Identifiability, pairs: Sequence[tuple[str, str]], not_testable: Sequence[str]) -> FloatArray:
-    """Return the expected evidence on each open question: the gap of a pair, or of an effect over no effect."""
+    """Return the expected evidence on each open question: the dBIC gap of a pair, or of an effect over none."""
     of = {
         frozenset({identifiability.rows[i].name, identifiability.rows[j].name}): gap
         for i, j, _, gap in reversed(identifiability.pairs())
     }
     alone = {r.name: r.dbic for r in reversed(identifiability.rows)}
-    wanted = identifiability.decides.evidence
+    wanted = identifiability.thresholds.evidence
     answers: list[Any] = [of.get(frozenset(p), wanted) for p in pairs]
     answers += [alone.get(n, wanted) for n in not_testable]
     return np.array(answers or [wanted])

@@ -1,7 +1,7 @@
-"""Candidate experiments: what a person can do with a robot and a camera, each item as sweeps of a script.
+"""Candidate experiments with a robot and a camera, each as sweeps of a script.
 
-An item starts and ends at rest, so that items can follow each other in any order and be judged one by one. How far to
-pull comes from the declared robot: as far as moves its markers by a quarter of its length, within what a cable bears.
+A candidate starts and ends at rest, so that candidates can be combined in any order and analysed one by one. The size of a pull follows from the
+declared robot: it moves a marker by a quarter of the robot's length, within the limits of the cable.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from femsense.rig.scene import body_shape
 from femsense.rig.script import FORMAT, SceneTable, ViewTable
 
 BEND = 0.25
-"""A full pull moves a marker by this share of the robot's length."""
+"""Displacement of a marker by a full pull, as a share of the robot's length."""
 SAG = 0.08
-"""A weight moves one by this share."""
+"""Displacement of the tip by a weight, as a share of the robot's length."""
 BEARABLE = 0.9
-"""Share of the largest tension or pressure that a pull uses at most."""
+"""Largest pull as a share of the maximum tension or pressure."""
 TOGETHER = 0.6
-"""Each of two cables that are pulled together goes to this share of its height."""
+"""Share of a full pull for each of two cables that are pulled together."""
 STEP_S = 1.0
 SLOW_S = 10.0
 HOLD_S = 15.0
-"""Time from frame to frame [s]: usual, slow, and while holding."""
+"""Time between frames [s]: usual, slow, and while holding."""
 MOST_EACH = 6
-"""Pairs of cables, seeds of an effect and frames of a recording that are looked at, the most spread ones first."""
+"""Maximum number of pairs of cables, of seeds of an effect and of frames of a recording, the most different ones first."""
 FAR = 1.6
-"""The second camera stands so many times as far away."""
+"""Distance of the second camera position relative to the first."""
 DOWN = np.array([0.0, 0.0, -1.0])
-"""Where weight points on a robot that declares none."""
+"""Direction of the weight of a robot that declares none."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,7 +60,7 @@ class Pull:
     """A full pull [N], [m] or [Pa]."""
     unit: str
     move: FloatArray
-    """Where a full pull moves the marker that moves most, to first order [m], shape (3,)."""
+    """Displacement of the marker that moves most by a full pull, to first order [m], shape (3,)."""
 
     def words(self, share: float = 1.0) -> str:
         size = {"N": 1.0, "m": 1e3, "Pa": 1e-3}[self.unit] * share * self.height
@@ -69,7 +69,7 @@ class Pull:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Setup:
-    """A robot with what an experiment on it can use."""
+    """A robot with the parameters of its experiments."""
 
     robot: Robot
     control: str
@@ -77,13 +77,13 @@ class Setup:
     """"absolute" or "unknown"."""
     pulls: tuple[Pull, ...]
     tip: FloatArray
-    """Where a weight hangs [m], shape (3,)."""
+    """Place of a weight at the tip [m], shape (3,)."""
     middle: FloatArray
-    """Half way to it [m], shape (3,)."""
+    """Place of a weight half way to the tip [m], shape (3,)."""
     weight: float
-    """Of what hangs at the tip [N]."""
+    """Weight at the tip [N]."""
     gravity: FloatArray
-    """Of the base as it stands [m/s²], shape (3,)."""
+    """Gravity with the base in its present orientation [m/s²], shape (3,)."""
     view: dict[str, Any]
     """The table [camera] of a script."""
     distance: float
@@ -104,9 +104,9 @@ class Element:
     sweeps: tuple[dict[str, Any], ...] = ()
     loads: tuple[dict[str, Any], ...] = ()
     far: bool = False
-    """Seen by the camera at a second distance, in a recording of its own."""
+    """Recorded with the camera at a second distance, in a separate recording."""
     rest_file: bool = False
-    """Not a sweep but rest.csv."""
+    """Not a sweep but a measurement for rest.csv."""
 
     @property
     def frames(self) -> int:
@@ -118,7 +118,7 @@ class Element:
 
 
 def script_of(setup: Setup, elements: Sequence[Element], *, noise: float, far: bool = False) -> dict[str, Any]:
-    """Return the tables of a script (femsense-script-1) of some elements, those of one camera distance."""
+    """Return the tables of a script (femsense-script-1) of some candidates, those of one camera distance."""
     chosen = [e for e in elements if e.far == far and e.sweeps]
     turned = any("gravity_m_s2" in s for e in chosen for s in e.sweeps)
     still = {"gravity_m_s2": setup.gravity.tolist()} if turned else {}
@@ -140,12 +140,12 @@ def script_of(setup: Setup, elements: Sequence[Element], *, noise: float, far: b
 
 
 def minimal(setup: Setup) -> list[Element]:
-    """Return the least that is worth recording: the robot at rest, and each cable and chamber pulled up once."""
+    """Return the minimal recording: the robot at rest, and each cable and chamber pulled up once."""
     return [Element("rest", "record the robot at rest", (_sweep("rest", [], [0.0]),)), *(_up(p) for p in setup.pulls)]
 
 
 def candidate_experiments(setup: Setup) -> list[Element]:
-    """Return what may be added, in a fixed order."""
+    """Return all other candidates, in a fixed order."""
     leads = _leads(setup.pulls)
     items = [_unload(p) for p in setup.pulls]
     items += [_together(a, b) for a, b in _pairs(setup.pulls)]
@@ -180,8 +180,8 @@ def _unload(p: Pull) -> Element:
 
 
 def _together(a: Pull, b: Pull) -> Element:
-    how = "against each other" if _cosine(a, b) < -0.5 else "together"
-    words = f"pull {a.words(TOGETHER)} and {b.words(TOGETHER)} {how}, in 2 steps"
+    direction = "against each other" if _cosine(a, b) < -0.5 else "together"
+    words = f"pull {a.words(TOGETHER)} and {b.words(TOGETHER)} {direction}, in 2 steps"
     return Element(
         f"mix:{a.name}+{b.name}", words, (_sweep(f"{a.name} and {b.name}", [(a, TOGETHER), (b, TOGETHER)], [0.5, 1.0]),)
     )
@@ -198,7 +198,7 @@ def _slowly(p: Pull) -> Element:
 
 
 def _hang(setup: Setup, where: str, pulls: Sequence[Pull]) -> Element:
-    """A weight at the tip, or twice as much half way, where it moves the body less."""
+    """Return a weight at the tip, or twice that at half the length, where it moves the body less."""
     size = setup.weight if where == "tip" else 2.0 * setup.weight
     point = setup.tip if where == "tip" else setup.middle
     force = size * setup.gravity / np.linalg.norm(setup.gravity)
@@ -210,7 +210,7 @@ def _hang(setup: Setup, where: str, pulls: Sequence[Pull]) -> Element:
 
 
 def _turn(setup: Setup, i: int, pulls: Sequence[Pull]) -> Element:
-    """The rest before the turn belongs to it: it is the difference that tells."""
+    """Return a turn of the base, with a state at rest before it: the difference shows the weight."""
     aside = _aside(setup.gravity)[i]
     words = (
         f"turn the base by 90° together with its camera, so that weight points along [{_place(aside)}] "
@@ -229,14 +229,14 @@ def _farther(setup: Setup, pulls: Sequence[Pull]) -> Element:
 
 
 def _leads(pulls: Sequence[Pull]) -> list[Pull]:
-    """Return the first pull and the one that moves the body most across it."""
+    """Return the first pull and the one most perpendicular to it."""
     if len(pulls) < 2:
         return list(pulls)
     return [pulls[0], min(pulls[1:], key=lambda p: abs(_cosine(pulls[0], p)))]
 
 
 def _pairs(pulls: Sequence[Pull]) -> list[tuple[Pull, Pull]]:
-    """Return pairs, opposite ones first, each pull in turn."""
+    """Return pairs of pulls, the most opposite ones first."""
     every = sorted(combinations(pulls, 2), key=lambda ab: _cosine(*ab))
     return every[:MOST_EACH]
 
@@ -246,7 +246,7 @@ def _cosine(a: Pull, b: Pull) -> float:
 
 
 def _aside(gravity: FloatArray) -> FloatArray:
-    """Return two unit vectors across gravity and each other, shape (2, 3)."""
+    """Return two unit vectors perpendicular to gravity and to each other, shape (2, 3)."""
     down = gravity / np.linalg.norm(gravity)
     first = np.eye(3)[int(np.argmin(np.abs(down)))]
     first = first - (first @ down) * down
@@ -258,17 +258,17 @@ def _place(point: FloatArray) -> str:
     return ", ".join(f"{v:.3g}" for v in np.round(point, 4) + 0.0)
 
 
-# How far to pull, and where the camera stands
+# Size of pulls, and place of the camera
 
 
 def setup_for(robot: Robot, control: str, zero: str = "absolute", *, most: FloatArray | None = None) -> Setup:
-    """Return what an experiment can use.
+    """Return the parameters of the experiments on a robot.
 
     Arguments:
         robot: the declared robot.
         control: "tension" or "displacement".
         zero: "absolute" or "unknown".
-        most: heights of the cables, where a recording has shown them [N] or [m], shape (a,).
+        most: full pulls of the cables, if a recording has shown them [N] or [m], shape (a,).
 
     Raises:
         DataError: the robot has no equilibrium at rest.
@@ -326,7 +326,7 @@ def _still(robot: Robot, control: str, inputs: FloatArray, loads: LoadRows | Non
 
 
 def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravity: FloatArray) -> tuple[FloatArray, float]:
-    """Return how small steps of each pull move the marker that moves most (d, 3), and how far 1 N at the tip does, to first order."""
+    """Return the displacement of the most affected marker by a small step of each pull (d, 3), and that by 1 N at the tip [m], to first order."""
     push = 1e-3 * gravity / np.linalg.norm(gravity)
     inputs = np.vstack([np.zeros(len(small)), np.diag(small), np.zeros(len(small))])
     loads = LoadRows([len(inputs) - 1], tip[None], push[None])
@@ -346,7 +346,7 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
 
 
 def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> float:
-    """Return a height at which the robot still finds its equilibrium, in few steps."""
+    """Return a pull, reduced until the robot has an equilibrium within few steps."""
     soon = SolveOptions(single=True, newton=NewtonOptions(most_steps=LOOKED_AT))
     for _ in range(5):
         inputs = np.zeros((1, count))
@@ -358,7 +358,7 @@ def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> 
 
 
 def _camera(robot: Robot) -> tuple[dict[str, Any], float]:
-    """Return the camera that sees most markers from beside or above, and its distance [m]."""
+    """Return the camera that sees most markers, from the side or from above, and its distance [m]."""
     target = np.round(robot.marker_points.mean(axis=0), 4)
     distance = float(f"{max(3.5 * robot.body.reach, 0.25):.2g}")
     shape = body_shape(robot, robot.body.mesh.nodes, SceneTable.model_validate({}))

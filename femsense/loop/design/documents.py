@@ -1,4 +1,4 @@
-"""What an experiment could show, and a proposal, as plain tables."""
+"""Identifiability and proposals as plain tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from femsense.loop.verdict.candidate_tables import own_size
 
 
 def identifiability_document(identifiability: Identifiability) -> dict[str, Any]:
-    """Return what an experiment could show as plain tables."""
+    """Return the identifiability of an experiment as plain tables."""
     return {
         "effects": [_row_document(r) for r in identifiability.rows],
         "not_testable": identifiability.untestable,

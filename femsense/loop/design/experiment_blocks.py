@@ -1,6 +1,6 @@
-"""The parts that experiments are made of: forms of effects, and the Gram matrices of the columns that a block of frames gives.
+"""The parts of experiments: forms of effects, and the Gram matrices of a block of frames.
 
-Columns of a block belong to its recording alone (pose, initial inputs), or are shared by all recordings (calibration and effects).
+Columns of a block belong to its recording alone (pose, initial inputs), or are shared by all recordings (nuisance and effects).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Form:
     """An effect with a seed and its columns."""
 
     label: str
-    """What the table calls it: the effect's name, and which form where there are two."""
+    """Name of the effect in tables, with its form if there are several."""
     name: str
     effect: Effect
     seed: Entry
@@ -41,9 +41,9 @@ class Form:
     size: FloatArray
     """Plausible size of each column, in coordinates."""
     at: int
-    """Where its columns start."""
+    """Index of its first column."""
     known: FloatArray
-    """How well calibration knows each column beforehand, in coordinates, shape (q,); empty for what is sought."""
+    """Prior standard deviation of each column of a nuisance effect, in coordinates, shape (q,); empty for others."""
 
     @property
     def columns(self) -> slice:
@@ -51,7 +51,7 @@ class Form:
 
 
 def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[str] | None = None) -> list[Form]:
-    """Return the forms to judge.
+    """Return the forms of effects to analyse.
 
     Arguments:
         robot: the declared robot.
@@ -74,7 +74,7 @@ def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[
 
 
 def _kinds(robot: Robot) -> list[tuple[Effect, str]]:
-    """Return the forms of the effects in which experiments are planned for them, with their labels."""
+    """Return the forms of the effects that planning uses, with their labels."""
     result = []
     for effect in EFFECTS:
         forms = [("", effect)] if effect.planned is None else effect.planned(robot)
@@ -98,7 +98,7 @@ def _plausible(parameters: Sequence[Parameter], robot: Robot, ranges: FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Gram:
-    """Products of whitened columns: own ones of the recording (w of them) and shared ones (e)."""
+    """Products of whitened columns: w own ones of the recording and e shared ones."""
 
     own: FloatArray
     """Shape (w, w)."""
@@ -116,11 +116,11 @@ class Block:
     """Blocks of one recording share its pose."""
     gram: Gram
     rested: Gram | None
-    """The same with rest.csv; None where it was not asked for."""
+    """The same with rest.csv; None if not requested."""
     placements: Gram
-    """What rest.csv says, once a recording."""
+    """Rows of rest.csv, one set per recording."""
     states: int
-    """Distinct states of markers."""
+    """Number of distinct states of markers."""
     rows: int
 
 
@@ -136,16 +136,16 @@ def make_block(
     measured: bool = False,
     with_rest: bool = False,
 ) -> Block:
-    """Return a block.
+    """Return the Gram matrices of a block of frames.
 
     Arguments:
         trial: inputs, loads and camera; unless `measured`, its marker positions are replaced by those of the robot.
         robot: the declared robot.
-        forms: whose columns are wanted.
+        forms: forms of effects, one column per parameter.
         recording: its key.
         noise: standard deviation of a marker's coordinate [m].
-        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is that times gravity as declared.
-        see: leave out markers that the camera does not see.
+        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is the rotation times the declared gravity.
+        see: exclude markers hidden from the camera.
         measured: the trial's markers are real.
         with_rest: also with rest.csv.
 
@@ -162,7 +162,7 @@ def make_block(
         return Block(recording, gram, None, placements, distinct, int(rows.sum()))
     placed = _with_rest(trial, robot)
     jet = _jet(placed, robot, jet.states)
-    moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured placements where they are
+    moved = [f for f in forms if f.effect.moves_rest]  # only these change the measured placements
     fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
@@ -184,7 +184,7 @@ def _start(trial: Trial) -> FloatArray:
 
 
 def _as_expected(trial: Trial, robot: Robot) -> tuple[Trial, States]:
-    """Return the trial with its markers where the declared robot would have the camera measure them, and the states of that robot."""
+    """Return the trial with markers at the positions predicted by the declared robot, as measured by the camera, and the states of that robot."""
     probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
     states = probe.jet(trial, _start(trial), np.zeros(0), False).states
     places = {k: robot.markers.positions(state.positions) for k, state in states.items()}
@@ -200,7 +200,7 @@ def _with_rest(trial: Trial, robot: Robot) -> Trial:
 
 
 def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
-    """Return which rows the camera sees, shape (k,)."""
+    """Return which rows are visible to the camera, shape (k,)."""
     camera, table, scene = trial.scene.recording.cameras[0], SceneTable.model_validate({}), trial.scene
     assert camera is not None
     visible = {}
@@ -213,8 +213,8 @@ def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
 def _columns(
     trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured placements (r, 3, e); zero where a form cannot
-    act or finds no equilibrium."""
+    """Return the columns of forms [m], of markers (k, c, e) and of measured placements (r, 3, e); zero if a form cannot act or has no
+    equilibrium."""
     result, rest = np.zeros((*jet.residual.shape, width)), np.zeros((len(jet.rest), 3, width))
     if not forms:
         return result, rest
@@ -238,7 +238,7 @@ def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
 
 
 def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
-    """Return what measured placements say; they are trusted as markers are, but not better than 0.1 mm."""
+    """Return the Gram matrices of measured placements; their σ is that of markers, at least 0.1 mm."""
     r = len(jet.rest)
     own = np.concatenate(
         [jet.rest_by_pose.reshape(r, 3, jet.by_pose.shape[2]), np.zeros((r, 3, jet.by_initial.shape[2]))], axis=2
@@ -247,7 +247,7 @@ def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
 
 
 def turns_of(gravity: FloatArray | None, declared: FloatArray) -> FloatArray | None:
-    """Return the smallest rotations that turn gravity as declared into that of each frame, shape (F, 3, 3); None without turns."""
+    """Return the smallest rotations from the declared gravity to that of each frame, shape (F, 3, 3); None if gravity is constant."""
     if gravity is None:
         return None
     first = declared if np.any(declared) else gravity[0]

@@ -1,13 +1,13 @@
-"""What an experiment could show, before it is made: linear theory on the declared robot, no noise drawn.
+"""Identifiability of effects before an experiment: linear theory on the declared robot, without random noise.
 
-Each part of an experiment (a block of frames) gives the Gram matrices of its columns: of what belongs to its recording alone
-(pose, initial inputs), and of what all recordings share (calibration and effects). Blocks add up, so that any experiment made of
-them is judged by linear algebra alone. With G the sum and N the columns of calibration,
+Each part of an experiment (a block of frames) gives the Gram matrices of its columns: those of its recording alone (pose, initial inputs), and
+those shared by all recordings (nuisance N and effects e). Blocks add up, so that every combination is analysed by linear algebra alone. With G
+the sum,
 
-    S = G_ee − G_eN G_NN⁻¹ G_Ne      (what calibration cannot absorb, Frisch–Waugh–Lovell)
+    S = G_ee − G_eN G_NN⁻¹ G_Ne      (after calibration is projected out, Frisch–Waugh–Lovell theorem).
 
-holds everything: an effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b takes back tr(D_a S_ab S_bb⁻¹ S_ba D_a).
-Effects of several parameters count with independent ones of plausible size. This is what `screen` computes from data.
+An effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b fits tr(D_a S_ab S_bb⁻¹ S_ba D_a).
+The parameters of one effect are treated as independent with plausible sizes. `screen` computes the same from data.
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ from femsense.loop.search.screening import penalty
 from femsense.loop.thresholds import DEFAULTS, Thresholds
 
 ABSORBED = 1e-9
-"""Share of its χ² below which a direction counts as absorbed whole."""
+"""Share of its χ² below which a direction counts as fully absorbed."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Row:
-    """What an experiment says of one effect."""
+    """Identifiability of one effect."""
 
     label: str
     name: str
     retained: float
-    """Share that calibration leaves."""
+    """Retained share ρ."""
     smallest: FloatArray
-    """Size of each parameter that would just be seen, in coordinates."""
+    """Smallest detectable size of each parameter, in coordinates, shape (q,)."""
     form: Form
     dbic: float
-    """Expected at plausible size."""
-    decides: Thresholds
+    """Expected dBIC at plausible size."""
+    thresholds: Thresholds
 
     @property
     def testable(self) -> bool:
-        return self.retained >= self.decides.testable
+        return self.retained >= self.thresholds.testable
 
     @property
     def seen(self) -> bool:
-        return self.testable and self.dbic >= self.decides.evidence
+        return self.testable and self.dbic >= self.thresholds.evidence
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Identifiability:
-    """What an experiment could show."""
+    """Identifiability of all effects in an experiment."""
 
     rows: tuple[Row, ...]
     confounding: FloatArray
-    """How much of effect i (row) is collinear with effect j, calibration refitted, shape (r, r)."""
+    """Share of effect i (row) that is collinear with effect j, calibration refitted, shape (r, r)."""
     gap: FloatArray
-    """Expected dBIC of i over j where i is the truth at plausible size, shape (r, r); inf between forms of one effect."""
-    decides: Thresholds = DEFAULTS
+    """Expected dBIC of i over j if i is true at plausible size, shape (r, r); inf between forms of one effect."""
+    thresholds: Thresholds = DEFAULTS
 
     def pairs(self) -> list[tuple[int, int, float, float]]:
-        """Return (i, j, confounding, gap) of all pairs of effects, the weaker direction of each."""
+        """Return (i, j, collinearity, gap) of all pairs of effects, the less favourable direction of each."""
         count = len(self.rows)
         every = [(i, j) for i in range(count) for j in range(i + 1, count) if self.rows[i].name != self.rows[j].name]
         return [
@@ -72,16 +72,16 @@ class Identifiability:
         ]
 
     def confused(self) -> list[tuple[int, int, float, float]]:
-        """Return pairs of effects that would both be seen and cannot be distinguished."""
+        """Return the pairs of detectable effects that cannot be distinguished."""
         seen = [r.seen for r in self.rows]
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and self.cannot_distinguish(p)]
 
     def cannot_distinguish(self, pair: tuple[int, int, float, float]) -> bool:
-        """Return whether a pair as of `pairs` is too collinear, or too close in evidence."""
-        return pair[2] > self.decides.alike or pair[3] < self.decides.evidence
+        """Return whether a pair as of `pairs` is collinear (above `alike`) or too close in evidence."""
+        return pair[2] > self.thresholds.alike or pair[3] < self.thresholds.evidence
 
     def distinguished(self) -> tuple[int, int]:
-        """Return the number of pairs of effects that would both be seen and distinguished, and of all pairs."""
+        """Return the number of pairs of detectable effects that are distinguished, and the number of all pairs."""
         pairs = self.pairs()
         seen = sum(self.rows[i].seen and self.rows[j].seen for i, j, *_ in pairs)
         return seen - len(self.confused()), len(pairs)
@@ -92,13 +92,13 @@ class Identifiability:
 
     @property
     def unseen(self) -> list[str]:
-        """Effects that could be tested but whose plausible size is too small to be seen."""
+        """Testable effects whose plausible size is not detectable."""
         return [r.label for r in self.rows if r.testable and not r.seen]
 
     @property
     def confusion(self) -> float:
-        """What a plan lowers: shortfalls of pairs and of effects, each between 0 and 1; also those not counted yet because of another."""
-        least, alike, wanted = self.decides.testable, self.decides.alike, self.decides.evidence
+        """The objective of planning: the sum of the shortfalls of effects and pairs, each between 0 and 1."""
+        least, alike, wanted = self.thresholds.testable, self.thresholds.alike, self.thresholds.evidence
         missing = sum(max(0.0, 1.0 - r.retained / least) + np.clip(1.0 - r.dbic / wanted, 0.0, 1.0) for r in self.rows)
         pairs = sum(
             np.clip(1.0 - gap / wanted, 0.0, 1.0) + np.clip((share - alike) / (1 - alike), 0, 1)
@@ -109,11 +109,11 @@ class Identifiability:
 
 @dataclass(eq=False, slots=True)
 class Judge:
-    """Judges experiments made of blocks."""
+    """Analyses experiments made of blocks."""
 
     forms: list[Form]
     calibrated: tuple[str, ...] = NUISANCE
-    decides: Thresholds = DEFAULTS
+    thresholds: Thresholds = DEFAULTS
     _by_label: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,7 +121,7 @@ class Judge:
             self._by_label.setdefault(f.label, []).append(i)
 
     def judge(self, blocks: Sequence[Block], *, rest: bool = False) -> Identifiability:
-        """Return what an experiment could show.
+        """Return the identifiability of effects in an experiment.
 
         Arguments:
             blocks: its parts.
@@ -140,7 +140,7 @@ class Judge:
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
                     confounding[i, j], gap[i, j] = left.alternative(self.forms.index(a.form), self._by_label[b.label])
-        return Identifiability(tuple(rows), confounding, gap, self.decides)
+        return Identifiability(tuple(rows), confounding, gap, self.thresholds)
 
     def _dropped(self, label: str) -> frozenset[str]:
         return frozenset({label} & set(self.calibrated))
@@ -153,7 +153,7 @@ class Judge:
         return [f for f in self.forms if f.name in self.calibrated and f.name not in drop]
 
     def _shared(self, blocks: Sequence[Block], rest: bool) -> tuple[FloatArray, FloatArray]:
-        """Return the products of shared columns with each recording's own ones projected out, and without that, (e, e)."""
+        """Return the Gram matrix of the shared columns with each recording's own ones projected out, and without that, (e, e)."""
         left, whole = 0.0, 0.0
         for key in dict.fromkeys(b.recording for b in blocks):
             mine = [b for b in blocks if b.recording == key]
@@ -164,19 +164,19 @@ class Judge:
         return np.asarray(left), np.asarray(whole)
 
     def _row(self, label: str, left: _Left, whole: FloatArray, count: float) -> Row:
-        """Return the row of an effect, at the seed in the middle of all."""
+        """Return the row of an effect, at the seed with the median dBIC."""
         tried = sorted(self._by_label[label], key=lambda i: left.dbic(i))
         f = self.forms[tried[(len(tried) - 1) // 2]]
         at = f.columns
         size, total = np.diag(left.S)[at], np.diag(whole)[at]
         retained = float(np.sqrt(max(size.sum(), 0.0) / total.sum())) if total.sum() > 0 else 0.0
-        needed = np.sqrt(self.decides.evidence + len(f.parameters) * np.log(count))
+        needed = np.sqrt(self.thresholds.evidence + len(f.parameters) * np.log(count))
         smallest = np.where(size > ABSORBED * np.maximum(total, 1e-300), needed / np.sqrt(np.maximum(size, 1e-300)), np.inf)
-        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)), self.decides)
+        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)), self.thresholds)
 
 
 class _Left:
-    """What some calibration leaves of every form, and how much of one another explains."""
+    """The columns of all forms after projection, and their mutual overlap."""
 
     def __init__(self, judge: Judge, shared: FloatArray, scale: FloatArray, kept: list[Form], count: float, names: int) -> None:
         self.forms, self.count, self.names = judge.forms, count, names
@@ -197,7 +197,7 @@ class _Left:
         return float(self.gain[i]) - self._price(self.forms[i])
 
     def alternative(self, i: int, others: list[int]) -> tuple[float, float]:
-        """Return how much of a form is collinear with the best of others, and the expected dBIC over it."""
+        """Return the share of a form that is collinear with the best of others, and the expected dBIC over it."""
         a, gain = self.forms[i], float(self.gain[i])
         if gain <= 1e-12:
             return 0.0, 0.0
@@ -216,7 +216,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _root(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return R with R Rᵀ the pseudo-inverse of a block; directions that calibration absorbs whole are left out."""
+    """Return R with R Rᵀ the pseudo-inverse of a block, without directions that calibration absorbs."""
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     good = values > ABSORBED
     return np.asarray(vectors / scale[:, None] * np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0))

@@ -1,4 +1,4 @@
-"""What to record next, in words."""
+"""The proposed next recording, in words."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from femsense.model.recording import Recording
 def next_experiment(
     data: Data, final: FittedModel, noise: Noise, confounded: Sequence[ConfoundedPair], not_testable: Sequence[Untestable]
 ) -> str:
-    """Return in words what to record to distinguish what these data cannot: as predicted where that is cheap, else by rule."""
+    """Return recordings that distinguish the confounded effects, in words: by prediction if that is cheap, otherwise by rules."""
     pairs = [pair.pair for pair in confounded]
     predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:
         said = [
-            f"{words} (would {what}: evidence {round(before)} → {round(after)}, where {data.thresholds.evidence:.0f} decides)"
+            f"{words} (would {what}: evidence {round(before)} → {round(after)}, threshold {data.thresholds.evidence:.0f})"
             for words, what, before, after in predicted[:2]
         ]
         loaded = any(len(t.scene.recording.load_frame) for t in data.train)
@@ -38,13 +38,13 @@ def next_experiment(
 
 
 def _against_aliases(forms: Sequence[Effect], pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return what tells effects that look alike whatever the data are, once each, for pairs that are in question."""
+    """Return the experiments that distinguish effects that are always collinear, once each, for the pairs in question."""
     told = {alias.told_by: {form.name, alias.name} for form in forms for alias in form.aliases if alias.told_by}
     return [words for words, pair in told.items() if any(set(p) == pair for p in pairs)]
 
 
 def _in_words(experiment: Experiment, data: Data, recordings: Sequence[Recording]) -> str:
-    """Return an experiment in words, beyond what is recorded already; nothing where it cannot be made."""
+    """Return an experiment in words, without parts already recorded; empty if it is not possible."""
     if experiment is Experiment.TURN_THE_BASE:
         return "turn the base by 90° between frames, camera fixed (gravity_*_m_s2 in frames.csv): weight then changes direction and the pose does not"
     if experiment is Experiment.LOAD_UNLOAD_AND_HOLD and any(_goes_up_and_down(r) for r in recordings):

@@ -1,8 +1,8 @@
-"""What a person can do next where an error is left or causes are confounded: weigh the body, rest, hang a weight, pull cables together; and what
-each of these would bring.
+"""Next steps if an error remains or causes are confounded: weigh the body, record at rest, hang a weight, pull cables together; with their predicted
+benefit.
 
-The gain is that of a parameter's standard deviation in the fit as it is, with the weight of the body open besides (a density is seldom known
-better than to WEIGHED), once rows of one more state are added as often as one holds it (Bayesian linear design: Chaloner & Verdinelli 1995).
+The benefit is the reduction of a parameter's standard deviation in the current fit, with the weight of the body as a free parameter (prior WEIGHED),
+after rows of one more state are added HOLDS times (Bayesian linear design: Chaloner & Verdinelli 1995).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from femsense.model.recording_parts import Drives, LoadRows, MarkerRows, Timelin
 from femsense.model.robot import Robot
 
 WEIGHED = 0.1
-"""Density is known beforehand to about this share: between a data sheet and a body with pigment, glue and markers on it."""
+"""Prior standard deviation of the density, as a share: data-sheet value against a body with pigment, glue and markers."""
 HOLDS = 5
-"""Times that a state of an experiment is reached."""
+"""Number of times that a state of an experiment is recorded."""
 BRINGS = 0.8
-"""An experiment is proposed for a parameter whose standard deviation falls below this share."""
+"""An experiment is proposed for a parameter whose standard deviation falls below this share of the current one."""
 AT_REST, TOGETHER = 0.02, 0.25
 """Inputs below the first share of their ranges are at rest; two above the second pull together."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
-    """Something to do, as one state of the robot."""
+    """An action, as one state of the robot."""
 
     words: str
     inputs: FloatArray | None
@@ -50,24 +50,24 @@ class Step:
 
 
 def next_steps(data: Data, fitted: FittedModel, noise: Noise, *, noise_is_measured: bool) -> list[str]:
-    """Return in words what to do next, what brings most first, each with what it brings.
+    """Return the next steps in words, the most beneficial first, each with its benefit.
 
     Arguments:
         data: of the loop.
-        fitted: the model with all that was found.
-        noise: with all that varies with the state, so that a state more is not believed too much.
+        fitted: the model with all effects that were found.
+        noise: including the components that vary with the state, so that one more state is not overrated.
         noise_is_measured: whether states repeat or the noise is declared.
     """
     steps = _possible(data)
     gains = _gains(data, fitted, noise, steps)
     order = sorted(range(len(steps)), key=lambda i: gains[i][0])
     said = [steps[i].words + gains[i][1] for i in order]
-    repeat = "reach three of the states again, or declare marker_noise_m: noise and errors of the model then come apart"
+    repeat = "repeat three of the states, or declare marker_noise_m: this separates noise from model error"
     return said if noise_is_measured else [repeat, *said]
 
 
 def _possible(data: Data) -> list[Step]:
-    """Return what these recordings lack of what distinguishes weight, modulus and inputs."""
+    """Return the actions that would add information on weight, modulus and inputs to these recordings."""
     recordings = [data.train[i].scene.recording for i in heads_of(data.train)]
     share = np.abs(np.concatenate([r.inputs for r in recordings])) / np.maximum(data.input_scale, 1e-12)
     count, steps = share.shape[1], list[Step]()
@@ -95,12 +95,12 @@ def _setup(data: Data) -> Setup | None:
 
 
 def _gains(data: Data, fitted: FittedModel, noise: Noise, steps: Sequence[Step]) -> list[tuple[float, str]]:
-    """Return for each step by which share the standard deviation falls that falls most, and that in words."""
+    """Return for each step the ratio of the standard deviation that decreases most, and that in words."""
     nothing = [(1.0, "")] * len(steps)
     hypothesis = fitted.fit.hypothesis
     if (
         len(hypothesis.robot.body.mesh.tets) * sum(len(t.scene.frames) for t in data.train) > 2 * data.effort.work
-    ):  # nothing is predicted then
+    ):  # too large to predict
         return nothing
     try:
         J, open_model = _with_weight(data, fitted, noise)
@@ -110,8 +110,8 @@ def _gains(data: Data, fitted: FittedModel, noise: Noise, steps: Sequence[Step])
 
 
 def _with_weight(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FloatArray, Hypothesis]:
-    """Return the whitened Jacobian of a fit with a column for the weight of the body behind the others, and what is known of that beforehand as the
-    last row; and the hypothesis with it."""
+    """Return the whitened Jacobian of a fit with a last column for the weight of the body and a last row for its prior; and the hypothesis with
+    that parameter."""
     fit = fitted.fit
     parameter = Parameter("scale", None, "1", 0.0, -2.0, 2.0, 1e-3, "log", known=WEIGHED)
     open_model = replace(fit.hypothesis, terms=(*fit.hypothesis.terms, (WEIGHT, {}, (parameter,))))
@@ -129,7 +129,7 @@ def _with_weight(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FloatAr
 
 
 def _gain(data: Data, fitted: FittedModel, noise: Noise, J: FloatArray, open_model: Hypothesis, step: Step) -> tuple[float, str]:
-    """Return by which share the standard deviation falls that falls most, and that in words."""
+    """Return the ratio of the standard deviation that decreases most, and that in words."""
     if step.inputs is None:
         more = np.zeros((1, J.shape[1]))
         more[0, -1] = 1.0 / (0.1 * WEIGHED)
@@ -148,11 +148,11 @@ def _gain(data: Data, fitted: FittedModel, noise: Noise, J: FloatArray, open_mod
     unit, size = (" %", 100.0) if p.scale == "log" else ("" if p.unit == "1" else f" {p.unit}", 1.0)
     return float(
         share[best]
-    ), f" ({names[best]} is then known to ±{size * after[best]:.2g}{unit} instead of ±{size * before[best]:.2g}{unit})"
+    ), f" (the standard deviation of {names[best]} falls from {size * before[best]:.2g}{unit} to {size * after[best]:.2g}{unit})"
 
 
 def _rows(data: Data, fitted: FittedModel, noise: Noise, open_model: Hypothesis, step: Step, count: int) -> FloatArray:
-    """Return the whitened rows of a state that is reached HOLDS times, by all parameters of the fit, shape (3 m, p)."""
+    """Return the whitened rows of a state recorded HOLDS times, by all parameters of the fit, shape (3 m, p)."""
     robot, fit, head = data.declared, fitted.fit, heads_of(data.train)[0]
     names = robot.glued_names
     loads = [] if step.load is None else [step.load]
@@ -196,9 +196,9 @@ def _rows(data: Data, fitted: FittedModel, noise: Noise, open_model: Hypothesis,
 
 
 def _heavier(robot: Robot, entry: Entry) -> Robot:
-    """Return the robot with so many times its weight."""
+    """Return the robot with its weight scaled."""
     return robot.with_body(robot.body.with_gravity(number(entry, "scale", "weight", low=1e-3) * robot.body.gravity))
 
 
 WEIGHT = Effect("weight", "its own weight", lambda robot, control: (), _heavier, keys=("scale",))
-"""The weight of the body as a parameter of a plan: no effect of the list."""
+"""The weight of the body as a parameter of planning; not an effect of the list."""

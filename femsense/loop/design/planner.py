@@ -1,8 +1,8 @@
-"""The experiment advisor: which recording makes effects distinguishable, with the predicted confusion before and after.
+"""Experiment design: the recording that makes effects identifiable, with the predicted identifiability before and after.
 
-Columns of every candidate experiment are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
-the least that is worth recording, or from a recording that exists, and adds what lowers the confusion most, as long as anything
-does and the frames suffice.
+The columns of every candidate experiment are computed once (`identifiability`); the search over combinations is linear algebra only. It starts from
+the minimal recording, or from an existing one, and greedily adds the candidate that lowers `Identifiability.confusion` most, while that
+falls by WORTH and the budget of frames allows it.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ from femsense.rig.plan import Plan, plan_script
 from femsense.rig.script import ScriptTable, check_script
 
 NOISE_M = 2e-4
-"""Standard deviation of each coordinate of a marker, if nothing else is known: a depth camera at half a metre [m]."""
+"""Default standard deviation of each coordinate of a marker [m]: a depth camera at half a metre."""
 FRAMES = 60
-"""Of a proposal at most; of a recording that exists so many are looked at: more are thinned out evenly and count for those between them."""
+"""Maximum number of frames of a proposal; an existing recording is thinned to this number, with weights for the frames left out."""
 WORTH = 0.05
-"""An item must lower the confusion by this to be added."""
+"""Minimum decrease of the confusion by an added candidate."""
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
-    """One item that was added."""
+    """One candidate that was added."""
 
     element: Element
     confusion: float
     """Before it."""
     better: tuple[str, ...]
-    """What it brings, in words."""
+    """Its benefits, in words."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
-    """An experiment, and what it could show."""
+    """An experiment with its identifiability."""
 
     setup: Setup
     noise: float
     """[m]."""
     start: tuple[Element, ...]
-    """The least that is worth recording; empty where a recording is given."""
+    """The minimal recording; empty if a recording is given."""
     steps: tuple[Step, ...]
     left_out: tuple[str, ...]
-    """Items without an equilibrium on the declared robot."""
+    """Candidates without an equilibrium on the declared robot."""
     before: Identifiability
     after: Identifiability
 
@@ -73,7 +73,7 @@ class Proposal:
         return (*self.start, *(s.element for s in self.steps))
 
     def scripts(self) -> dict[str, dict[str, Any]]:
-        """Return the scripts of the experiment: "" for the camera where it stands, "-far" for its second distance, if it has one."""
+        """Return the scripts of the experiment: "" for the camera at its place, "-far" for a second distance, if it has one."""
         made = {name: script_of(self.setup, self.elements, noise=self.noise, far=bool(name)) for name in ("", "-far")}
         return {name: script for name, script in made.items() if script["sweeps"]}
 
@@ -88,16 +88,16 @@ def plan_experiment(
     progress: Progress | None = None,
     only: Collection[str] | None = None,
 ) -> Proposal:
-    """Return the recording that makes the effects distinguishable, on the declared robot and to first order.
+    """Return the recording that makes the effects identifiable, to first order on the declared robot.
 
     Arguments:
         robot: the declared robot.
-        control: "tension" or "displacement"; a given recording says it itself.
+        control: "tension" or "displacement"; ignored with a given recording.
         noise: standard deviation of each coordinate of each marker in each frame [m].
         frames: budget of new frames.
-        given: a recording that exists; without it the proposal starts from the least that is worth recording.
-        progress: told (items done, items in all).
-        only: keys of the candidate experiments that can be done; by default all.
+        given: an existing recording; without it the proposal starts from the minimal one.
+        progress: called with (candidates done, all candidates).
+        only: keys of the possible candidate experiments; by default all.
 
     Raises:
         InputError: no markers, no budget. DataError: the declared robot has no equilibrium.
@@ -116,7 +116,7 @@ def plan_experiment(
             "too few frames",
             where="--frames",
             found=frames,
-            expected=f"at least {sum(e.frames for e in start)}, for the least that is worth recording",
+            expected=f"at least {sum(e.frames for e in start)}, for the minimal recording",
         )
     blocks, left_out = _blocks(setup, forms, [*start, *extras], noise, progress)
     if not all(e.key in blocks for e in start):
@@ -135,12 +135,12 @@ def plan_experiment(
 def identifiability_of_script(
     robot: Robot, script: ScriptTable, where: Path = Path("script"), *, noise: float = NOISE_M
 ) -> Identifiability:
-    """Return what the experiment of a script could show, if it is recorded and closes the loop with all its free frames.
+    """Return the identifiability of a script's experiment, if it is recorded and the loop uses all its contact-free frames.
 
     Arguments:
-        robot: the declared robot; effects, mesh and law of the script's truth count for nothing.
+        robot: the declared robot; effects, mesh and law of the script's truth are ignored.
         script: its sweeps, loads, markers and first camera are used.
-        where: what messages name.
+        where: for error messages.
         noise: standard deviation of each coordinate of each marker [m].
 
     Raises:
@@ -176,7 +176,7 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
     if zero == "absolute":
         return forms
     kept, at = [], 0
-    for f in forms:  # unknown offsets are fitted with the pose
+    for f in forms:  # unknown initial inputs are fitted with the pose, instead of offsets
         if f.name not in OF_INPUTS:
             kept.append(replace(f, at=at))
             at += len(f.size)
@@ -189,7 +189,7 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
 def _blocks(
     setup: Setup, forms: list[Form], elements: Sequence[Element], noise: float, progress: Progress | None
 ) -> tuple[dict[str, Block], list[str]]:
-    """Return the block of each element that has an equilibrium, and in words which have none."""
+    """Return the block of each element that has an equilibrium, and the others in words."""
     blocks, left_out = dict[str, Block](), list[str]()
     todo = [e for e in elements if e.sweeps]
     for i, element in enumerate(todo):
@@ -203,13 +203,15 @@ def _blocks(
 
 
 def element_block(setup: Setup, forms: Sequence[Form], element: Element, noise: float, *, with_rest: bool = True) -> Block:
-    """Return the block of an element. Raises DataError where the declared robot has no equilibrium in it."""
+    """Return the block of an element. Raises DataError if the declared robot has no equilibrium in it."""
     script = check_script(script_of(setup, [element], noise=noise, far=element.far))
     robot, turns = setup.robot, None
     if any(s.gravity_m_s2 is not None for s in script.sweeps):
         rows = [np.array(s.gravity_m_s2) for s in script.sweeps for _ in s.profile()]
         turns = turns_of(np.array([rows[0], *rows]), setup.gravity)
-        if not np.any(robot.body.gravity):  # a weightless robot stays so: turns only say where its weight would point
+        if not np.any(
+            robot.body.gravity
+        ):  # a weightless robot remains weightless: a rotation only sets the direction of its weight
             script = script.model_copy(update={"sweeps": [s.model_copy(update={"gravity_m_s2": None}) for s in script.sweeps]})
     trial = trial_of(robot, script, plan_script(script, robot), lead=True)
     key = "new, far" if element.far else "new"
@@ -217,12 +219,12 @@ def element_block(setup: Setup, forms: Sequence[Form], element: Element, noise: 
 
 
 def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = False) -> Trial:
-    """Return the frames of a script as the loop would see them, marker positions left open.
+    """Return the frames of a script as the loop would fit them, with marker positions undefined.
 
     Arguments:
         robot: the declared robot.
         script, plan: the script and its frames.
-        lead: whether the robot rests before the first frame, unrecorded (friction and creep start from there).
+        lead: whether the robot rests before the first frame, unrecorded (friction and creep start there).
     """
     head, first_view = 1 if lead else 0, next(iter(script.views.values()))
     recorded = plan.commanded + (plan.initial if script.actuation_zero == "absolute" else 0.0)
@@ -261,7 +263,7 @@ def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = Fals
 
 
 def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: float) -> Block:
-    """Return the block of a recording that exists, calibrated."""
+    """Return the block of an existing recording, calibrated."""
     frames = marked_frames(recording)
     thin = int(np.ceil(len(frames) / FRAMES))
     calibration = calibrate(robot, recording, frames=frames[::thin].tolist())
@@ -282,7 +284,7 @@ def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: f
 def _grow(
     judge: Judge, have: list[Block], blocks: dict[str, Block], extras: list[Element], start: Identifiability, budget: int
 ) -> tuple[list[Step], Identifiability]:
-    """Return what is added, in order, and what all of it could show."""
+    """Return the added candidates in order, and the identifiability with all of them."""
     steps, now, rest = list[Step](), start, False
     while True:
         best: tuple[float, Element, Identifiability] | None = None
@@ -301,7 +303,7 @@ def _grow(
 
 
 def _better(before: Identifiability, after: Identifiability) -> list[str]:
-    """Return in words what an experiment shows that another does not."""
+    """Return the improvements of one experiment over another, in words."""
     then = {r.label: r for r in after.rows}
     words = []
     for r in before.rows:
@@ -309,9 +311,9 @@ def _better(before: Identifiability, after: Identifiability) -> list[str]:
         if new is None:
             words.append(f"{r.label} is measured instead of fitted")
         elif new.testable and not r.testable:
-            words.append(f"{r.label} becomes testable ({100 * r.retained:.1f} → {100 * new.retained:.0f} % left by calibration)")
+            words.append(f"{r.label} becomes testable ({100 * r.retained:.1f} → {100 * new.retained:.0f} % retained)")
         elif new.seen and not r.seen:
-            words.append(f"{r.label} becomes visible (dBIC {r.dbic:.0f} → {new.dbic:.0f})")
+            words.append(f"{r.label} becomes detectable (dBIC {r.dbic:.0f} → {new.dbic:.0f})")
     old = {pair_labels(before, p): p for p in before.pairs()}
     for p in after.pairs():
         was = old.get(pair_labels(after, p))
@@ -322,7 +324,7 @@ def _better(before: Identifiability, after: Identifiability) -> list[str]:
             and then[pair_labels(after, p)[0]].seen
             and then[pair_labels(after, p)[1]].seen
         ):
-            words.append(f"{' and '.join(pair_labels(after, p))} come apart (dBIC gap {was[3]:.0f} → {p[3]:.0f})")
+            words.append(f"{' and '.join(pair_labels(after, p))} become distinguishable (dBIC gap {was[3]:.0f} → {p[3]:.0f})")
     return words
 
 

@@ -1,10 +1,11 @@
-"""An empirical correction of what no effect explains: how far markers are from the model, as a smooth function of the inputs. It is never a cause.
+"""An empirical correction of the remaining residual: a smooth function of the inputs. It is not a cause.
 
     r = J β + g(u) + ε,  g ~ GP(0, s² k(u, u′)),  ε ~ N(0, σ²)
 
-r is the residual, u the inputs in units of their ranges, J what calibration and the named effects can move. J is fitted along and not predicted, so that g is
-orthogonal to it (Kennedy & O'Hagan 2001; Plumlee 2017). k is a sum of one kernel an input, which carries over from single inputs to several at once, or
-one of all inputs together; which of them, its length and s/σ come by restricted maximum likelihood. g has as many terms as stand above σ (Nyström).
+r is the residual, u the inputs in units of their ranges, J the columns of calibration and the accepted effects. J is fitted too but not predicted, so that
+g is orthogonal to it (Kennedy & O'Hagan 2001; Plumlee 2017). k is a sum of one kernel per input, which extrapolates from single inputs to
+combinations, or one kernel of all inputs; the choice, its length and s/σ maximise the restricted likelihood. g keeps the terms whose variance
+exceeds σ² (Nyström).
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.model.marker_correction import KERNELS, Correction, kernel_of, recorded_inputs
 
 LENGTHS = 0.3, 0.6, 1.2, 2.4
-"""Lengths of the kernel that are tried, in ranges of an input."""
+"""Candidate lengths of the kernel, in ranges of an input."""
 RATIOS = 1.0, 3.0, 10.0, 30.0, 100.0, 300.0
-"""Ratios s²/σ² that are tried."""
+"""Candidate ratios s²/σ²."""
 
 
 def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
-    """Return the correction that is likeliest for what a model leaves of the markers where it is fitted; None where none is likelier than chance, or where
-    there are too few states."""
+    """Return the most likely correction of the residual of the fitted markers; None if none exceeds the likelihood without correction, or if there are too
+    few states."""
     rows = _rows_of(data, fitted)
     states, number = np.unique(np.round(rows.inputs, 9), axis=0, return_inverse=True)
     if len(states) <= data.thresholds.states:
@@ -48,7 +49,7 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
             basis = vectors[:, kept] / np.sqrt(values[kept])
             found = _Model(rows, (gram @ basis)[number])
             value = found.likelihood(ratio)[0]
-            # its length and ratio are chosen, and a kernel of each input by itself carries over to inputs that were not pulled together
+            # length and ratio were selected, and the sum of kernels is preferred: it predicts inputs that were not pulled together
             if value > best + (likelier if chosen is None or chosen[0] != kernel else 0.0):
                 best, chosen = value, (kernel, length, ratio, basis, found)
     if chosen is None:
@@ -75,7 +76,7 @@ class _Rows:
     residual: FloatArray
     """[m], shape (k, 3)."""
     columns: FloatArray
-    """What is fitted along, shape (k, 3, p)."""
+    """Columns of calibration and effects, shape (k, 3, p)."""
 
 
 def _rows_of(data: Data, fitted: FittedModel) -> _Rows:
@@ -91,7 +92,7 @@ def _rows_of(data: Data, fitted: FittedModel) -> _Rows:
 
 
 def _ranges(data: Data) -> FloatArray:
-    """Return the largest value of each input where it is fitted [N], [m] or [Pa], shape (a,); of one that rests in all frames that of the largest."""
+    """Return the largest fitted value of each input [N], [m] or [Pa], shape (a,); for an input that never moves, that of the largest one."""
     largest = np.max([np.abs(inputs_of(t)).max(axis=0) for t in data.train], axis=0)
     return np.asarray(np.where(largest > 0, largest, max(largest.max(initial=0.0), 1e-12)))
 
@@ -102,7 +103,7 @@ def inputs_of(trial: Trial) -> FloatArray:
 
 
 class _Model:
-    """The likelihood of a residual with some terms for each axis of each marker, and what is fitted along."""
+    """The likelihood of a residual with some terms for each axis of each marker, and fitted columns."""
 
     def __init__(self, rows: _Rows, terms: FloatArray) -> None:
         self.rows, self.terms, self.q = rows, terms, terms.shape[1]
@@ -110,7 +111,7 @@ class _Model:
         self.along = basis_of(flat)[0].reshape(*rows.columns.shape[:2], -1)
 
     def _groups(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Yield terms, residuals and columns for each axis of each marker: independent of each other but for the columns."""
+        """Yield terms, residuals and columns for each axis of each marker: independent except for the columns."""
         for m in range(len(self.rows.markers)):
             own = self.rows.marker == m
             for axis in range(3):
@@ -131,7 +132,7 @@ class _Model:
         return log_det, normal, right, parts
 
     def likelihood(self, ratio: float) -> tuple[float, float]:
-        """Return the restricted log-likelihood at its best σ², and that [m²]."""
+        """Return the restricted log-likelihood at the optimal σ², and that σ² [m²]."""
         log_det, normal, right, parts = self._solved(ratio)
         beta = np.linalg.solve(normal, right)
         residuals = [r for _, r, _ in self._groups()]
@@ -141,7 +142,7 @@ class _Model:
         return -0.5 * (log_det + float(np.linalg.slogdet(normal)[1]) + freedom * float(np.log(variance))), variance
 
     def weights(self, ratio: float) -> tuple[FloatArray, FloatArray]:
-        """Return the weights [m], shape (q, m, 3), and the largest covariance of those of one axis [m²], shape (q, q)."""
+        """Return the weights [m], shape (q, m, 3), and the largest of the covariances of one axis [m²], shape (q, q)."""
         _, normal, right, parts = self._solved(ratio)
         beta, variance = np.linalg.solve(normal, right), self.likelihood(ratio)[1]
         values = [ratio * F.T @ (v - X @ beta) for X, v, F in parts]
@@ -152,6 +153,6 @@ class _Model:
 
 
 def rows_of(correction: Correction, trial: Trial) -> tuple[FloatArray, FloatArray]:
-    """Return what a correction says of the rows of a trial, robot frame [m], shape (k, 3), and its standard deviation, shape (k,)."""
+    """Return the correction of the rows of a trial, robot frame [m], shape (k, 3), and its standard deviation, shape (k,)."""
     shifts, std = correction.shifts(inputs_of(trial))
     return shifts[np.arange(len(shifts)), trial.scene.marker], std

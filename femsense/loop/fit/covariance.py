@@ -1,12 +1,12 @@
-"""How far the values of a fit may be off, where (JᵀJ)⁻¹ says too little.
+"""Standard deviations of fitted values, where (JᵀJ)⁻¹ is too optimistic.
 
-* A model that leaves more than the noise was fitted with weights that are too large: all variances grow by the factor by which it does
-  (Birge 1932).
-* Where sweeps disagree by more than their noise, each sweep's own pull on the parameters shows it (cluster-robust covariance with half
-  leverage: Bell & McCaffrey 2002).
-* A time or a place that was chosen from a few seeds and held still while the rest was fitted is not known exactly.
-* The size of gravity is known, so that its direction lives on a sphere: where the data see one component only, the tangent to the sphere
-  bounds the others, although a whole circle is as likely. Second moments about the estimate over the sphere, weighted by the likelihood, say so.
+* If the residual exceeds the noise, the weights were too large: all variances are multiplied by the ratio of mean squares (Birge 1932).
+* If sweeps disagree by more than their noise, their separate gradients show it (cluster-robust covariance with half leverage: Bell &
+  McCaffrey 2002).
+* A time or a place that was selected from a few seeds and held fixed during the fit is uncertain.
+* The magnitude of gravity is known, so that its direction lies on a sphere. If the data determine one component only, the tangent plane
+  understates the others, which may lie anywhere on a circle. The second moment about the estimate is therefore computed over the sphere,
+  weighted by the likelihood.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from femsense.loop.fit.noise_components import NEAR_STD, Noise
 from femsense.model.effects.base import KnownLength, known_length
 
 RINGS, SPOKES = 160, 48
-"""Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
+"""Directions of the quadrature: rings about the estimate, denser close to it, and points on each ring."""
 
 
 def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[str, FloatArray]) -> dict[str, FloatArray]:
@@ -34,7 +34,7 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
 
     Arguments:
         data, fitted, noise: of the final fit.
-        seed_std: effect → scatter of its coordinates over seeds that explain as much.
+        seed_std: effect → scatter of its coordinates over seeds that fit equally well.
     """
     own = fitted.fit.own
     std = np.maximum.reduce(
@@ -51,7 +51,7 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
 
 
 def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArray:
-    """Return standard deviations of the coordinates of a hypothesis about their estimates, shape (p,)."""
+    """Return the standard deviations of the coordinates of a hypothesis, shape (p,)."""
     growth = misfit(fit, trials, noise)
     std = growth * fit.std
     vector = known_length(fit.hypothesis.parameters)
@@ -63,9 +63,9 @@ def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArr
 
 
 def misfit(fit: JointFit, trials: list[Trial], noise: Noise) -> float:
-    """Return by which factor the residual exceeds the noise, at least 1.
+    """Return the ratio of the residual to the noise, √(χ²/ν) ≥ 1.
 
-    States that repeat count once: with n state means of markers in three axes (of clouds along normals) and p parameters it is √(Σ|r̄|² / (n − p) / σ²).
+    States that repeat count once. With n state means r̄ of markers in three axes (of clouds along normals) and p parameters, it is √(Σ|r̄|² / (n − p) / σ²).
     """
     square, count, expected = 0.0, 0, 0.0
     for trial, jet in zip(trials, fit.jets):
@@ -88,8 +88,8 @@ def _variance(std: dict[str, float]) -> float:
 
 
 def _over_the_sphere(fit: JointFit, at: IntArray, length: KnownLength, growth: float) -> FloatArray:
-    """Return root mean squares about the estimate when a vector of known length roams its sphere and all else follows, shape (p,)."""
-    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # the last row is what is known of its length
+    """Return the rms deviation from the estimate, when a vector of known length moves over its sphere and the others are refitted, shape (p,)."""
+    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # without the last row, the prior of the length
     residual = np.asarray(fit.fit.residual)[:-1] / growth
     normal, slope = rows.T @ rows, rows.T @ residual
     own = np.asarray(at) + fit.own
@@ -100,7 +100,7 @@ def _over_the_sphere(fit: JointFit, at: IntArray, length: KnownLength, growth: f
     pull = slope[own] - gain.T @ slope[rest]
     towards, area = _directions(np.asarray(fit.coordinates)[at])
     moves = length.value * towards - np.asarray(fit.coordinates)[at]
-    # along each direction the size is Gaussian: curvature, slope, and χ² at its best
+    # the length along each direction is Gaussian: curvature, slope, and χ² at its optimum
     curve = np.einsum("ki,ij,kj->k", towards, inner, towards) + 1.0 / length.std**2
     rise = np.einsum("ki,ki->k", towards, moves @ inner + pull)
     chi2 = np.einsum("ki,ki->k", moves @ inner + 2.0 * pull, moves) - rise**2 / curve
@@ -115,7 +115,7 @@ def _over_the_sphere(fit: JointFit, at: IntArray, length: KnownLength, growth: f
 
 
 def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors all over the sphere (k, 3), dense about an estimate, with their areas (k,)."""
+    """Return unit vectors over the sphere (k, 3), dense about an estimate, with their areas (k,)."""
     axis = estimate / np.linalg.norm(estimate)
     side = np.linalg.svd(axis[None])[2][1:]
     edge = np.pi * np.linspace(0.0, 1.0, RINGS + 1) ** 3
@@ -126,7 +126,7 @@ def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def std_by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
-    """Return the standard deviations of all parameters that the disagreement of sweeps shows, shape (p,)."""
+    """Return the cluster-robust standard deviations of all parameters, with sweeps as clusters, shape (p,); zero for too few sweeps."""
     J, r = np.asarray(fitted.fit.fit.jacobian), np.asarray(fitted.fit.fit.residual)
     sweeps = sweep_rows(data.train, fitted.fit)
     if len(sweeps) < LEAST_SWEEPS:
@@ -142,7 +142,7 @@ def std_by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
 
 
 def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArray:
-    """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
+    """Return the standard deviations of the coordinates if the selected numbers of the seeds are fitted too, shape (p,)."""
     hypothesis = fitted.fit.hypothesis
     terms, null, moving, known = [], [], [], []
     for effect, seed, parameters, span in terms_of(fitted.fit):

@@ -1,12 +1,11 @@
-"""Discretisation error: how far a mesh of half the size would move the markers, in every state; where it is linear,
-quadratic elements.
+"""Discretisation error: the displacement of the markers by a mesh of half the size, in every state; for linear elements, by
+quadratic ones of the same size.
 
-A residual of that shape says nothing of the robot, whatever its size:
-how much of it a body shows is not known (a cable that is tied to points sinks the deeper the finer the mesh is), but it is the
-same share in all sweeps, but for what directions and sweeps differ by. So it counts as noise, once for all sweeps together
-(`mesh_share` of `Thresholds`), once for each by itself (`mesh_varies`) and turned (`mesh_turns`), so that no effect is named for
-what a finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give
-it (a hierarchical estimate: Bank & Smith 1993).
+A residual of this shape is not evidence for an effect. The amplitude is uncertain (a cable tied to points indents the body
+more, the finer the mesh), but nearly the same in all sweeps. The error therefore enters the noise as random fields: one common to
+all sweeps (`mesh_share` of `Thresholds`), one per sweep (`mesh_varies`) and its rotations (`mesh_turns`). It is computed by a few
+Newton steps on the finer mesh, starting from the state on the declared mesh, which the finer one represents exactly
+(a hierarchical estimate: Bank & Smith 1993).
 """
 
 from __future__ import annotations
@@ -41,14 +40,14 @@ from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.robot import Robot
 
 MOST_WORK = 100_000
-"""Tetrahedra × states; beyond it the errors of other states are interpolated between those that were computed."""
+"""Maximum number of tetrahedra × states; beyond it the error is interpolated between computed states."""
 PULLING = "cables", "cable_slots"
-"""What of a body only tells how its cables pull."""
+"""Fields of a body that only affect the cable forces."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Part:
-    """What is asked of one recording."""
+    """The trials of one recording."""
 
     trials: list[Trial]
     poses: Sequence[FloatArray]
@@ -69,16 +68,16 @@ class _Part:
 
     @property
     def kind(self) -> int:
-        """The same for recordings whose states lie between each other's: known inputs, and as many numbers that drive them."""
+        """A number that is equal for recordings whose states can be interpolated jointly: known inputs, and the same number of drives."""
         apart = self.initial is not None or any(t.scene.crossings is not None for t in self.trials)
         return -id(self) if apart else self.drives.shape[1]
 
 
 def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
-    """Return the data with the error of the mesh at a fitted model; with a note why not where the mesh is huge, or linear and `discretisation` among
-    the effects that are tried, or where no state settles on a finer one; and beside a reference, which shares it."""
+    """Return the data with the discretisation error at a fitted model. `mesh_note` states why it is unknown: the mesh is too large, linear elements are
+    tested by the effect `discretisation`, no state converges on the finer mesh, or a reference cancels it."""
     if data.relative:
-        return replace(data, mesh_note="beside a reference it drops out")
+        return replace(data, mesh_note="it cancels against the reference")
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     alike: dict[int, list[_Part]] = {}
     for part in _parts(data, fitted):
@@ -91,13 +90,13 @@ def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> D
         sampled = [(part, moves) for parts in alike.values() for moves in [_moves(robot, fine, parts)] for part in parts]
     except FemsenseError as error:
         known_before = bool(mesh_errors(data))
-        return data if known_before else replace(data, mesh_note=f"no state settles on a finer mesh ({error})")
+        return data if known_before else replace(data, mesh_note=f"no state converges on a finer mesh ({error})")
     moves_of = {id(trial): moves for part, moves in sampled for trial in part.trials}
     return _by_moves(replace(data.with_trials(lambda t: replace(t, mesh_moves=moves_of[id(t)])), mesh_note=""), fitted)
 
 
 def with_mesh_errors_of(data: Data, some: Data, fitted: FittedModel) -> Data:
-    """Return the data with the error of the mesh that was computed in some of their states, in between in the others."""
+    """Return the data with the discretisation error interpolated from that computed in some of their states."""
     train, held = (
         [replace(t, mesh_moves=s.mesh_moves) for t, s in zip(trials, known)]
         for trials, known in ((data.train, some.train), (data.held, some.held))
@@ -106,19 +105,19 @@ def with_mesh_errors_of(data: Data, some: Data, fitted: FittedModel) -> Data:
 
 
 def as_shown(data: Data, fitted: FittedModel) -> Data:
-    """Return the data with so much of the error of the mesh as a fitted model leaves of it, where that is asked (`Data.mesh_as_shown`): what experience says of
-    other bodies is too much where calibration has shown that the mesh errs by little."""
+    """Return the data with the discretisation error scaled to the share in the residual of a fitted model, if `Data.mesh_as_shown`: the default amplitudes
+    are too large if calibration has shown that the mesh error is small. The scale is at most 1."""
     errors = mesh_errors(data)
     if not data.mesh_as_shown or not errors:
         return data
     shares = np.concatenate([_shares(t, jet, error) for t, jet, error in zip(data.train, fitted.fit.jets, errors)])
-    decides = data.thresholds
-    size = max(float(abs(shares.mean())) / decides.mesh_share, float(shares.std()) / decides.mesh_varies)
+    thresholds = data.thresholds
+    size = max(float(abs(shares.mean())) / thresholds.mesh_share, float(shares.std()) / thresholds.mesh_varies)
     return data.with_trials(lambda t: t if t.mesh_error is None else replace(t, mesh_error=min(size, 1.0) * t.mesh_error))
 
 
 def _shares(trial: Trial, jet: SceneJet, error: FloatArray) -> FloatArray:
-    """Return how much of the mesh's error (k, c) a residual holds in each sweep beside what calibration moves, shape (s,)."""
+    """Return the amplitude of the discretisation error (k, c) in the residual of each sweep, fitted jointly with the nuisance parameters, shape (s,)."""
     moves = np.concatenate([jet.by_pose, jet.by_initial, jet.by_effect], axis=2).reshape(error.size, -1)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     own = np.zeros((*error.shape, int(number.max()) + 1))
@@ -130,7 +129,7 @@ def _shares(trial: Trial, jet: SceneJet, error: FloatArray) -> FloatArray:
 
 
 def _parts(data: Data, fitted: FittedModel) -> list[_Part]:
-    """Return the trials, with what is held out of a recording beside what is fitted of it."""
+    """Return the trials by recording, each fitted one with its held-out ones."""
     parts = [
         _Part([trial, *(h for h, of in zip(data.held, data.held_of) if of == i)], poses, initial)
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, poses_and_inputs(data, fitted.fit)))
@@ -139,7 +138,7 @@ def _parts(data: Data, fitted: FittedModel) -> list[_Part]:
 
 
 def _by_moves(data: Data, fitted: FittedModel) -> Data:
-    """Return the data with the fields of the mesh's error, from what its moves are in some of the states."""
+    """Return the data with the fields of the discretisation error, interpolated from `mesh_moves`."""
     errors = {
         id(trial): None
         if trial.mesh_moves is None
@@ -150,9 +149,8 @@ def _by_moves(data: Data, fitted: FittedModel) -> Data:
     return data.with_trials(lambda t: replace(t, mesh_error=errors[id(t)]))
 
 
-def errs_alike(before: FittedModel, after: FittedModel) -> bool:
-    """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
-    pull, or what the camera sees."""
+def same_mesh_error(before: FittedModel, after: FittedModel) -> bool:
+    """Return whether the discretisation error after an added effect equals that before: the effect changes only cable forces, or the camera."""
     old = before.fit.hypothesis
     added, _, mask = some_terms(after, [name for name in after.fit.hypothesis.names if name not in old.names])
     robot = added.robot_at(after.fit.coordinates[mask])
@@ -161,15 +159,15 @@ def errs_alike(before: FittedModel, after: FittedModel) -> bool:
 
 
 def _on_firm_clamp(robot: Robot) -> Robot:
-    """Return the robot on a clamp that does not give: on the finer mesh a plate that turns stays where the state on the declared one has it, since how
-    much it turns is fitted."""
+    """Return the robot with a rigid clamp: on the finer mesh a compliant clamp keeps its position from the declared mesh, because its compliance is
+    fitted."""
     body = robot.body
     return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
 
 
 def on_its_clamp(robot: Robot, fine: Robot) -> Robot:
-    """Return the robot on the finer mesh with the springs of its clamp, where it has them, shared out over all clamped nodes, so that they resist turning
-    alike: between the springs of few nodes a body bulges as none does that is held by a face."""
+    """Return the robot on the finer mesh with its clamp springs, if it has them, distributed over all clamped nodes so that their rotational stiffness is
+    equal: between few springs the surface would bulge, unlike that of a body held by a face."""
     body, finer = robot.body, fine.body
     if np.isinf(body.clamp_stiffness):
         return fine
@@ -183,24 +181,24 @@ def on_its_clamp(robot: Robot, fine: Robot) -> Robot:
 
 
 def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
-    """Return the mesh that tells the discretisation error of a mesh: one of half the size, or of quadratic elements where it is linear. None where that takes
-    too long, or where a linear mesh is asked about as an effect."""
+    """Return the mesh for the estimate: of half the size, or quadratic elements for a linear mesh. None if it would be too large, or if the order of a linear
+    mesh is tested as an effect."""
     if mesh.is_quadratic:
         return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
     return finer_mesh(mesh, "tet10", 0) if MESH.name not in tried and len(mesh.tets) <= MOST_TETS else None
 
 
 def _why_not(mesh: TetMesh, tried: Sequence[str]) -> str:
-    """Return in words why a finer mesh is not asked."""
+    """Return in words why there is no finer mesh."""
     if not mesh.is_quadratic and MESH.name in tried:
         return f"linear elements were compared with quadratic ones ({MESH.name})"
     return f"a mesh of half the size has more than {MOST_TETS} elements"
 
 
 def make_finer(robot: Robot, tried: Sequence[str]) -> None:
-    """Make what `with_mesh_errors` needs of the finer mesh whatever the material, beside other work: what is made is kept.
+    """Compute the parts of the finer mesh that do not depend on the material, concurrently with other work; the results are cached.
 
-    A mesh that cannot be had is none here; it is asked for again where it is needed.
+    Errors are ignored here and raised where the mesh is needed.
     """
     with contextlib.suppress(FemsenseError):
         finer = _finer(robot.body.mesh, tried)
@@ -211,43 +209,45 @@ def make_finer(robot: Robot, tried: Sequence[str]) -> None:
 
 @functools.lru_cache(maxsize=2)
 def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
-    """Return how the nodes of a finer mesh go with a mesh."""
+    """Return the embedding of the nodes of a finer mesh in a mesh."""
     return embed_points(mesh, fine.nodes)
 
 
-def _by_sweep(trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence[FloatArray], decides: Thresholds) -> FloatArray:
-    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation; moves (f, m, 3) are those of the frames (f,).
+def _by_sweep(
+    trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence[FloatArray], thresholds: Thresholds
+) -> FloatArray:
+    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each scaled to one standard deviation; moves (f, m, 3) belong to the frames (f,).
 
-    Shares of the error of all sweeps together, of that of each sweep, and of each of its axes along each axis.
+    In order: the error of all sweeps, of each sweep, and each of its components along each axis (rotation and stretch).
     """
     error = moves[np.searchsorted(frames, trial.scene.frame), trial.scene.marker]
     along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
     if trial.scene.crossings is not None:
         along = normals_of(trial.scene, poses)[:, None, :]
-    turned = decides.mesh_turns * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
+    turned = thresholds.mesh_turns * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
     error = np.einsum("kca,ka->kc", along, error)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
     by_sweep[np.arange(len(error)), :, number] = (
-        decides.mesh_varies_held if trial.scene.recording.actuation == "displacement" else decides.mesh_varies
+        thresholds.mesh_varies_held if trial.scene.recording.actuation == "displacement" else thresholds.mesh_varies
     ) * error
-    return np.concatenate([decides.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
+    return np.concatenate([thresholds.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
 
 
 def mesh_errors(data: Data) -> list[FloatArray]:
-    """Return the error of the mesh in the rows of each fitted trial [m], (k, c); none where one is not known."""
+    """Return the discretisation error of the rows of each fitted trial [m], (k, c); empty if one is unknown."""
     known = [t.mesh_error[:, :, 0] / data.thresholds.mesh_share for t in data.train if t.mesh_error is not None]
     return known if len(known) == len(data.train) else []
 
 
 def representative_frames(trial: Trial, tets: int) -> IntArray:
-    """Return the frames of a trial in which the error of a mesh of so many elements would be computed, ascending."""
+    """Return the frames of a trial in which the error of a mesh with `tets` elements would be computed, ascending."""
     frames = trial.scene.frames
     return np.asarray(frames[np.sort(_chosen(state_vectors(trial.scene.recording, frames), 8 * tets))])
 
 
 def _moves(robot: Robot, fine: Robot, parts: Sequence[_Part]) -> Sampled:
-    """Return by how much the finer mesh moves the markers [m], (m, 3), in some of the states of recordings. Raises DataError."""
+    """Return the displacement of the markers by the finer mesh [m], (m, 3), in some states of recordings. Raises DataError."""
     share_on_finer(fine.body)
     table = np.vstack([part.drives for part in parts])
     vectors, owner = (table - table[0]) / ranges(table), np.repeat(np.arange(len(parts)), [len(part.frames) for part in parts])
@@ -256,12 +256,12 @@ def _moves(robot: Robot, fine: Robot, parts: Sequence[_Part]) -> Sampled:
     found = [_moves_in(robot, fine, part, part.frames[chosen[owner == i]]) for i, part in enumerate(parts)]
     drives = np.vstack([drive_table(part.recording, frames) for part, (frames, _) in zip(parts, found)])
     if not len(drives):
-        raise DataError("no state settles on the finer mesh")
+        raise DataError("no state converges on the finer mesh")
     return Sampled(drives, np.concatenate([moves for _, moves in found]), ranges(table))
 
 
 def _moves_in(robot: Robot, fine: Robot, part: _Part, frames: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the frames, of these, that settle on the finer mesh, and by how much that moves the markers in each [m], (n, m, 3)."""
+    """Return those of the frames that converge on the finer mesh, and the displacement of the markers in each [m], (n, m, 3)."""
     recording, starts = part.recording, part.trials[0].starts_on(robot.body.mesh)
     places = placements(robot, part.trials[0].scene, part.poses)
     coarse_driven = DrivenRobot(robot, drive_of(robot, recording, initial=part.initial))
@@ -272,7 +272,7 @@ def _moves_in(robot: Robot, fine: Robot, part: _Part, frames: IntArray) -> tuple
     def finer_at(k: int) -> FloatArray | None:
         try:
             return finer_state(coarse_driven, fine_driven, k, states[k], ties)
-        except FemsenseError:  # it folds there
+        except FemsenseError:  # no equilibrium on the finer mesh
             return None
 
     moves: dict[int, FloatArray] = {}
@@ -284,12 +284,12 @@ def _moves_in(robot: Robot, fine: Robot, part: _Part, frames: IntArray) -> tuple
 
 
 def _chosen(vectors: FloatArray, tets: int) -> IntArray:
-    """Return indices of distinct states in which a finer mesh of so many elements is asked."""
+    """Return indices of distinct states for the estimate, given the number of elements of the finer mesh."""
     return representatives(vectors, max(8, MOST_WORK // tets))
 
 
 def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_placements: bool = False) -> FloatArray:
-    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_placements`: nor that of placements that turn."""
+    """Return the residual [m], (k, c), minus the most likely discretisation error; `nor_placements`: and minus that of rotating marker placements."""
     placements = noise.placements(trial.groups)
     mesh = np.zeros((*residual.shape, 0)) if trial.mesh_error is None else trial.mesh_error
     fields = np.concatenate([mesh, placements], axis=2)
@@ -301,11 +301,11 @@ def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_
 
 
 def beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
-    """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
+    """Return the root mean square [m] of residuals minus the most likely discretisation error."""
     return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])
 
 
 def mesh_error_rms(data: Data) -> float | None:
-    """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
+    """Return the rms displacement of the markers by a finer mesh [m]; None if it was not computed."""
     errors = mesh_errors(data)
     return rms_of(errors) if errors else None

@@ -1,4 +1,4 @@
-"""Fitted models: a model, fitted jointly, with its error on held-out data, its noise and the fields of what it may lack."""
+"""Fitted models: a joint fit with its held-out error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.joint_fit import FitOptions, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
@@ -21,21 +21,21 @@ from femsense.model.observation import Hypothesis, SceneJet
 from femsense.model.robot import Robot
 
 ROUGHLY = 4
-"""Steps of a fit that only has to come near: one that tells the noise by its residual, or part of a model."""
+"""Number of steps of a rough fit, for example one whose residual is only used to estimate the noise."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldOut:
-    """What a model makes of a held-out trial."""
+    """The prediction of a held-out trial."""
 
     jet: SceneJet
-    """Residuals and states, no derivatives."""
+    """Residuals and states, without derivatives."""
     poses: list[FloatArray]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FittedModel:
-    """A model with its fit and its error on held-out data."""
+    """A fitted model with its held-out error."""
 
     fit: JointFit
     held: list[HeldOut]
@@ -43,13 +43,13 @@ class FittedModel:
 
     @property
     def held_residuals(self) -> list[FloatArray]:
-        """Residuals of the held-out data [m], (k, c) a trial."""
+        """Residuals of the held-out data [m], (k, c) per trial."""
         return [h.jet.residual for h in self.held]
 
 
 def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
-    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the input offsets. Beside a
-    reference it is nothing."""
+    """Return a robot, by default that of the data, with the nuisance effects: the modulus and, if the inputs are absolute, the input offsets. With a
+    reference there are none."""
     terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
     std: list[float] = []
     for name in () if data.relative else NUISANCE:
@@ -73,30 +73,30 @@ def fit_model(
     prior: Prior,
     noise: Noise,
     coordinates: FloatArray,
-    **how: Unpack[FitHow],
+    **options: Unpack[FitOptions],
 ) -> FittedModel:
-    """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
-    fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **how)
+    """Return the fit of a hypothesis with its held-out data; arguments as of `fit_jointly`."""
+    fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **options)
     held = held_out(data, fit, noise)
     return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
 
 
 def jets_without(fitted: FittedModel, keep: BoolArray) -> list[SceneJet]:
-    """Return the jets of a fitted model with the columns of some coordinates only."""
+    """Return the jets of a fitted model with the columns of some coordinates."""
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in fitted.fit.jets]
 
 
 def keeping(data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, *, worth: float = np.inf) -> FittedModel:
-    """Return a fitted model with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
+    """Return a fitted model with some of its terms, refitted (roughly if χ² stays above `worth`). Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
     start, near = fitted.fit.coordinates[mask], jets_without(fitted, mask)
     return fit_model(data, hypothesis, prior, noise, start, own=own_of(fitted), near=near, worth=worth)
 
 
 def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
-    """Return a fitted model whose places and times, which were fitted along at last, are part of the seeds, as they are there.
+    """Return a fitted model whose fitted places and times become part of the seeds, at their current values.
 
-    A time that data see the beginning of only runs off to the end of its range where the rest is fitted again.
+    A time constant of which the data contain only the beginning would otherwise drift to the end of its range when the rest is refitted.
     """
     fit, terms, keep = fitted.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
     for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
@@ -121,7 +121,7 @@ def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
 
 
 def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
-    """Return the hypothesis and prior of a fitted model with some of its terms only, and which coordinates these have."""
+    """Return the hypothesis and prior of a fitted model with some of its terms, and the mask of their coordinates."""
     terms = fitted.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
     hypothesis = replace(fitted.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
@@ -133,19 +133,19 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
 def roughly_keeping(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]
 ) -> FittedModel:
-    """Return a fitted model with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
+    """Return a fitted model with some of its terms, refitted in a few steps to some frames of each trial, without held-out data. Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
     part = replace(data, train=[t.part(f) for t, f in zip(data.train, frames)], held=[], held_of=[])
     return fit_model(part, hypothesis, prior, noise, fitted.fit.coordinates[mask], own=own_of(fitted), max_iterations=ROUGHLY)
 
 
 def found_in(fitted: FittedModel) -> list[str]:
-    """Return the effects of a fitted model beside what calibration may move and quadratic elements."""
+    """Return the effects of a fitted model, without nuisance effects and quadratic elements."""
     return [name for name in fitted.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
 
 
 def terms_of(fit: JointFit) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ...], slice]]:
-    """Yield each effect of a fit with its seed, its parameters, and where its coordinates stand."""
+    """Yield each effect of a fit with its seed, its parameters, and the slice of its coordinates."""
     at = 0
     for effect, seed, parameters in fit.hypothesis.terms:
         yield effect, seed, parameters, slice(at, at + len(parameters))
@@ -153,7 +153,7 @@ def terms_of(fit: JointFit) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ..
 
 
 def span_of(fit: JointFit, name: str) -> slice:
-    """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
+    """Return the slice of an effect's coordinates in a fit; empty if the fit lacks it."""
     return next((span for effect, _, _, span in terms_of(fit) if effect.name == name), slice(0, 0))
 
 
@@ -162,7 +162,7 @@ def own_of(fitted: FittedModel) -> FloatArray:
 
 
 def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
-    """Return what a fit makes of each held-out trial; a recording of its own gets its own pose from its first frames."""
+    """Return the predictions of the held-out trials; a held-out recording gets its own pose, fitted to its first frames."""
     robot = fit.hypothesis.robot_at(fit.coordinates)
     result: list[HeldOut] = []
     for trial, (poses, initial) in zip(data.held, held_poses_and_inputs(data, fit, noise)):
@@ -202,33 +202,33 @@ def _pose_on_first_frames(
 
 
 def poses_and_inputs(data: Data, fit: JointFit) -> list[PosesAndInputs]:
-    """Return poses and initial inputs of each training trial at a fit."""
+    """Return poses and initial inputs of each training trial in a fit."""
     pivot = data.robot.marker_points.mean(axis=0)
     return [t.place(fit.fit.theta[span], pivot) for t, span in zip(data.train, spans_of(data.train))]
 
 
-def rematched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> Data:
-    """Return the data with what clouds round off counted anew where a fitted model has the surface; with `anew` it is asked again which rows there are."""
+def rematched(data: Data, fitted: FittedModel, noise: Noise, *, reselect: bool = False) -> Data:
+    """Return the data with the rounding of cloud rows recomputed in the states of a fitted model; with `reselect` the rows are selected again too."""
     if "clouds" not in data.measured:
         return data
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
-    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, poses_and_inputs(data, fitted.fit))]
-    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, held_poses_and_inputs(data, fitted.fit, noise))]
+    train = [_rematched(robot, t, *own, reselect) for t, own in zip(data.train, poses_and_inputs(data, fitted.fit))]
+    held = [_rematched(robot, t, *own, reselect) for t, own in zip(data.held, held_poses_and_inputs(data, fitted.fit, noise))]
     return replace(data, train=train, held=held)
 
 
-def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, anew: bool) -> Trial:
+def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, reselect: bool) -> Trial:
     if trial.seen is None:
         return trial
     states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
-    if not anew:
+    if not reselect:
         return replace(trial, scene=renewed_rows(robot, trial.scene, trial.seen, states, poses))
     scene = make_rows(robot, trial.scene, trial.seen, states, poses)
     return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
 def whitened(trial: Trial, residual: FloatArray, noise: Noise) -> FloatArray:
-    """Return rows of a trial, shape (k, c, …), in units of what they may hold by chance, shape (c k, …)."""
+    """Return whitened rows of a trial, (k, c, …) → (c k, …)."""
     return whiten(noise.whitener(trial.groups, trial.mesh_error), residual)
 
 
@@ -238,7 +238,7 @@ def held_chi2(data: Data, fitted: FittedModel, noise: Noise) -> float:
 
 
 def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
-    """Return the mean square of whitened residuals; 1 is noise."""
+    """Return the mean square of whitened residuals; its expectation is 1 for noise."""
     rows = [whitened(t, r, noise) for t, r in zip(trials, residuals)]
     return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
@@ -254,7 +254,7 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
 
 
 def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:
-    """Return a fit, from where it is, with other weights or rows (nonsmoothness is left as they are); jets: those of the rows."""
+    """Return a fit with other weights or rows, at its current values, with the `jets` of the rows; its nonsmoothness is not recomputed."""
     residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
     assert jacobian is not None
     return replace(fit, fit=replace(fit.fit, residual=residual, jacobian=jacobian), chi2=float(residual @ residual), jets=jets)

@@ -24,9 +24,9 @@ from femsense.model.path_solver import PathSolver
 from femsense.model.quasi_static_path import has_given
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
-"""How far a declared pose is trusted [rad, m] where there are clouds alone …"""
+"""Prior standard deviation of a declared pose [rad, m] for clouds alone …"""
 BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
-"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend input offsets."""
+"""… and with markers, which determine the pose better: with the tighter prior, a pose wrong by 1 mm and ½° would bias the input offsets."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,9 +35,9 @@ class Prior:
 
     mean: FloatArray
     std: FloatArray
-    """inf: none."""
+    """inf: no prior."""
     others: Rows | None = None
-    """What recordings that are not fitted here say of the first of the coordinates."""
+    """Linearised rows of recordings that are not part of this fit, in the first coordinates."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,15 +50,15 @@ class Jets:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JointFit:
-    """The outcome of a joint fit."""
+    """The result of a joint fit."""
 
     hypothesis: Hypothesis
     prior: Prior
     fit: FitResult
     own: int
-    """Number of parameters that belong to recordings; those of the hypothesis follow."""
+    """Number of parameters that belong to recordings; the coordinates of the hypothesis follow."""
     chi2: float
-    """Whitened sum of squares of markers and priors."""
+    """Sum of squares of all whitened rows, priors included."""
     jets: list[SceneJet]
 
     @property
@@ -73,7 +73,7 @@ class JointFit:
 
     @property
     def rms(self) -> float:
-        """Root mean square residual [m]: 3-D of the markers, where there are none along the normals of the clouds."""
+        """Root mean square residual [m]: 3-D of the markers; without markers, along the normals of the clouds."""
         return rms_of([jet.residual for jet in self.jets])
 
     @property
@@ -84,7 +84,7 @@ class JointFit:
 
 @dataclass(eq=False, slots=True)
 class JointProblem:
-    """Whitened residual and Jacobian over trials; remembers the last jets."""
+    """Whitened residual and Jacobian over trials; keeps the last jets."""
 
     hypothesis: Hypothesis
     prior: Prior
@@ -92,22 +92,22 @@ class JointProblem:
     factors: list[Whitener]
     placement_std: float
     last: Jets | None = None
-    """With derivatives."""
+    """The last evaluation with derivatives."""
     seen: Jets | None = None
-    """Without derivatives."""
+    """The last evaluation without derivatives."""
     tried: tuple[FloatArray, list[States]] | None = None
-    """The step that was tried last, and its states."""
+    """The last trial step, and its states."""
     near: list[SceneJet] | None = None
-    """Derivatives from near the start, until there are own ones."""
+    """Derivatives from a fit close by, used until the first own ones."""
     scale: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """How much the residual answers to each parameter, shape (p,)."""
+    """Norm of each column of the Jacobian, shape (p,)."""
 
     @property
     def own(self) -> int:
         return sum(t.size for t in self.trials if not t.together)
 
     def start(self, coordinates: FloatArray) -> FloatArray:
-        """Return θ at the trials' starts."""
+        """Return θ at the starting values of the trials."""
         parts = [
             np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)])
             for t in self.trials
@@ -128,8 +128,8 @@ class JointProblem:
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, placements, declared poses, priors.
 
-        What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
-        the fit goes there.
+        After the first evaluation, one without derivative is a trial step: its states are solved to a loose tolerance, and kept only if the
+        step is accepted.
         """
         rough = not derivative and (self.last is not None or self.near is not None)
         try:
@@ -137,7 +137,7 @@ class JointProblem:
         except DataError:
             if self.last is not None or self.seen is not None or not rough:
                 raise
-            rough = False  # the start is far from the states that are known
+            rough = False  # the start is too far from known states for the loose tolerance
             starts, jets = self._jets(theta, derivative, rough)
         if rough:
             self.tried = (np.array(theta), starts)
@@ -150,7 +150,7 @@ class JointProblem:
         return rows
 
     def _jets(self, theta: FloatArray, derivative: bool, rough: bool) -> tuple[list[States], list[SceneJet]]:
-        """Return the states and the jets of all trials at θ."""
+        """Return the warm starts and the jets of all trials at θ."""
         starts, spans, before = self.starts(theta, rough), spans_of(self.trials), self.last or self.seen
         jets = []
         for i, (trial, span) in enumerate(zip(self.trials, spans)):
@@ -160,7 +160,7 @@ class JointProblem:
         return starts, jets
 
     def nonsmooth(self, theta: FloatArray) -> Nonsmoothness | None:
-        """Return where tensions that end at 0 bend the residual near θ, as far as the derivatives that were computed last tell."""
+        """Return where cable tensions that reach 0 make the residual nonsmooth near θ, from the last derivatives."""
         jets = self.near if self.last is None else self.last.jets
         if jets is None or not any(jet.by_input.shape[2] for jet in jets):
             return None
@@ -174,23 +174,23 @@ class JointProblem:
         return joined(parts, rows, len(theta)) if parts else None
 
     def outcome(self, fit: FitResult) -> JointFit:
-        """Return the joint fit that ends where a fit of this problem did: with derivatives of its end, or of before where these are believed."""
+        """Return the result of a fit of this problem, with derivatives at its end, or earlier ones if the fit has accepted these."""
         at_end = self.last is not None and np.array_equal(self.last.theta, fit.theta)
-        was_seen = self.seen is not None and np.array_equal(self.seen.theta, fit.theta)  # otherwise a step further was tried
+        was_seen = self.seen is not None and np.array_equal(self.seen.theta, fit.theta)  # otherwise a later step was rejected
         if not at_end and (fit.own or not was_seen):
             self.evaluate(fit.theta, fit.own)
         jets = self.last.jets if self.last is not None and (at_end or fit.own) else self._settled()
         return JointFit(self.hypothesis, self.prior, fit, self.own, float(fit.residual @ fit.residual), jets)
 
     def _settled(self) -> list[SceneJet]:
-        """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
+        """Return the last residuals with the earlier derivatives; the states of the former become warm starts."""
         derivatives = self.near if self.last is None else self.last.jets
         assert self.seen is not None and derivatives is not None
         self.starts(self.seen.theta, False)
         return [replace(d, residual=s.residual, rest=s.rest, states=s.states) for d, s in zip(derivatives, self.seen.jets)]
 
     def starts(self, theta: FloatArray, rough: bool) -> list[States]:
-        """Return the states to start from, of each trial: those of the step that was tried last where it is nearer."""
+        """Return the warm starts of each trial: the states of the last trial step if these are closer in the scaled parameters."""
         kept = [t.starts_on(self.hypothesis.robot.body.mesh) for t in self.trials]
         if not rough:
             for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
@@ -210,7 +210,7 @@ class JointProblem:
         return [dict(s) for s in (states if nearer else kept)]
 
     def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Return what `evaluate` makes of the jets of all trials at θ."""
+        """Return residual and Jacobian as of `evaluate`, from the jets of all trials at θ."""
         rows, blocks = [], []
         for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
             r, J = self._scene_rows(trial, factor, jet, theta[span], span.start, len(theta), derivative)
@@ -234,8 +234,8 @@ class JointProblem:
         answers: dict[int, AtPoints] | None = None,
         solver: PathSolver | None = None,
     ) -> SceneJet:
-        """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`, or whose
-        `answers` are, solved with a `solver`."""
+        """Return residuals and derivatives of one trial, from its own warm starts or `starts`; at `known` states nothing is solved, and with `answers`
+        nothing is factorised. `solver` replaces the default path solver."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         _, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
@@ -297,17 +297,17 @@ class JointProblem:
 
 
 def _as_near(kept: States, near: States, body: BodyModel) -> States:
-    """Return states of a body to start from: those of a fit near by where they are on the same mesh, since others may have gone far since
-    then, unless it is those whose clamp has given way, or not, as this body's does. What is kept lends them its factors."""
+    """Return warm starts for a body: the states of a fit close by, if they are on the same mesh, because kept states may be from a distant trial step.
+    The factorisations of the kept states are reused. States of another kind of clamp (rigid or compliant) are not used."""
     shape = next(iter(near.values())).positions.shape
     if any(state.positions.shape != shape for state in kept.values()):
         return dict(kept)
-    return {**kept, **{k: lent_start(kept.get(k), state, body) for k, state in near.items()}}
+    return {**kept, **{k: nearby_start(kept.get(k), state, body) for k, state in near.items()}}
 
 
-def lent_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
-    """Return the state that a frame starts from, of one that is kept and one of a fit near by."""
-    if kept is None or kept.positions is state.positions:  # such states have their factors
+def nearby_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
+    """Return the warm start of a frame, from a kept state and that of a fit close by."""
+    if kept is None or kept.positions is state.positions:  # such a state has its own factorisation
         return state if kept is None else kept
     gives, gave = has_given(body, state), has_given(body, kept)
     if gives == body.clamp_is_rigid and gave != body.clamp_is_rigid:
@@ -317,17 +317,17 @@ def lent_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) ->
 
 
 NEAR = 1e-2
-"""A factor serves for a state that differs by less than this share of the body."""
+"""A factorisation is reused for a state whose nodes differ by less than this share of the body's reach."""
 TRUSTED = 0.02
-"""Derivatives that missed less than this share of every step since they were computed are believed that nothing is left to gain."""
+"""Derivatives whose prediction erred by less than this share in every step are accepted at the end of the fit."""
 GAIN = 0.5
-"""What counts as a gain of a step in χ², where a fit goes on by little: half of what a parameter of noise brings."""
+"""Smallest predicted decrease of χ² of a step that continues the fit: half the expected gain of a parameter that fits noise."""
 SERVES = 0.25
-"""Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
+"""Derivatives are reused for another step if their prediction of the residual erred by less than this share of its change."""
 
 
-class FitHow(TypedDict, total=False):
-    """From where a fit begins and how far it goes: keyword arguments of `fit_jointly`."""
+class FitOptions(TypedDict, total=False):
+    """Start and limits of a fit: keyword arguments of `fit_jointly`."""
 
     own: FloatArray | None
     max_iterations: int
@@ -350,19 +350,21 @@ def fit_jointly(
     near: list[SceneJet] | None = None,
     worth: float = np.inf,
 ) -> JointFit:
-    """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
+    """Fit poses, initial inputs and the coordinates of a hypothesis jointly, with the full nonlinear equilibrium.
+
+    Minimises χ² = Σ |L⁻¹ r|² over the rows of markers, clouds, placements, declared poses and priors by Gauss–Newton within bounds.
 
     Arguments:
-        hypothesis, prior: what is fitted, and what is known of it beforehand.
+        hypothesis, prior: the parameters and their priors.
         trials: the recordings.
         noise: weights of the residuals.
-        placement_std: of placements measured by rest.csv against their declared places [m].
-        coordinates: start of the hypothesis, shape (p,).
-        own: start of the recordings' own parameters; by default where the trials start.
-        max_iterations: Gauss–Newton steps.
-        known: residuals and derivatives at the start, one jet a trial, where they are known.
-        near: derivatives from near the start, to begin with.
-        worth: χ² above which the fit is not worth derivatives of its own at the end.
+        placement_std: σ of places measured by rest.csv relative to the declared ones [m].
+        coordinates: starting values of the hypothesis, shape (p,).
+        own: starting values of the recordings' own parameters; by default those of the trials.
+        max_iterations: maximum number of Gauss–Newton steps.
+        known: residuals and derivatives at the start, one jet per trial, if available.
+        near: derivatives from a fit close by, used for the first steps.
+        worth: χ² above which no derivatives are computed at the end.
 
     Raises:
         DataError: no equilibrium at the start.

@@ -1,7 +1,7 @@
-"""Marker placement: a marker that is glued elsewhere than declared, or a dot that is found a little beside its middle, turns with the body.
+"""Marker placement: the error of a marker's declared place rotates with the body.
 
-Where a body bends by 60°, the error of a place turns by as much: what is the same vector in all frames on the body is none in space. Taken for one, it
-leaves residuals that go with the bending, and these look like a marker that is far off, or like anything else.
+If the body bends by 60°, so does the placement error: constant in body coordinates, it is not constant in space. Treated as a constant vector it
+would leave residuals correlated with the bending, which resemble other effects.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from femsense.model.robot import Robot
 
 
 def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
-    """Return the data with how the places of markers turn where a fitted model has the body; nothing is solved."""
+    """Return the data with the rotation of marker placements in the states of a fitted model; nothing is solved."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     train = [
         _turned(robot, t, poses, j.states)
@@ -33,7 +33,7 @@ def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
 
 
 def _turned(robot: Robot, trial: Trial, poses: Sequence[FloatArray], states: Mapping[int, Equilibrium]) -> Trial:
-    """Return the markers of a trial with how their places turn; clouds as they are."""
+    """Return the markers of a trial with the rotation of their placements; clouds unchanged."""
     if trial.scene.crossings is not None:
         return trial
     places = placements(robot, trial.scene, poses)
@@ -43,8 +43,8 @@ def _turned(robot: Robot, trial: Trial, poses: Sequence[FloatArray], states: Map
 
 
 def placement_turns(robot: Robot, places: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return by how much the markers of a robot move if their places at rest [m], shape (m, 3), do, for node positions [m], shape (n, 3): the
-    deformation gradient there, shape (m, 3, 3), axes of the place last."""
+    """Return ∂(marker position)/∂(its place at rest), shape (m, 3, 3), axes of the place last, for node positions [m], shape (n, 3): the deformation
+    gradient at the markers, places [m], shape (m, 3)."""
     mesh = robot.body.mesh
     ties = robot.tie_markers(places)
     gradient = np.einsum("pkc,pka->pca", positions[ties.nodes], weight_slopes(mesh, ties, places))

@@ -1,4 +1,4 @@
-"""What a model leaves beyond the noise, the placement of markers and the discretisation error: its own error."""
+"""The model error: the residual beyond noise, marker placement and discretisation error."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from femsense.loop.result.records import ModelError
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """Root mean squares [m] over what repeats and what markers are placed to, less the likeliest share of the discretisation error."""
+    """Root mean square residuals [m] beyond noise and marker placement, with the most likely share of the discretisation error subtracted."""
 
     left: float
-    """What the final model leaves where it is fitted."""
+    """Of the final model, fitted data."""
     held: float
-    """What the model that is handed back leaves of held-out data."""
+    """Of the returned model, held-out data."""
     floor: float
-    """Noise with the placement of markers."""
+    """Noise and marker placement together."""
     mesh: float
-    """Discretisation error; 0 where it is not known."""
+    """Discretisation error; 0 if unknown."""
     believed: float
-    """The noise that is believed: what repeats or, where nothing does, no more than a share of the body."""
+    """The noise used: the measured repeatability or, if none was measured, the assumed one up to `resolved` of the body's reach."""
     explained: float
-    """Share of the mean square beyond the floor that the effects took away: where fitted by all that was found, on held-out data by what is
-    handed back; the smaller one."""
+    """Share of the mean square beyond `floor` that the effects removed: the smaller of that of the final model in the fitted data and that of the
+    returned model in the held-out data."""
 
     @property
     def is_large(self) -> bool:
-        """Whether it is larger than the noise and the discretisation error together, so that nothing of it is noise."""
+        """Whether the model error exceeds noise and discretisation error together."""
         return self.left > float(np.hypot(self.believed, self.mesh))
 
 
 def excess_of(
     data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise, measured: Repeatability
 ) -> Excess:
-    """Return what models leave: `before`, with all that was found (`final`), and that is handed back (`back`)."""
+    """Return the residuals of three models: `before`, the final one, and the returned one (`back`)."""
     believed = measured.total if measured.known else min(measured.total, data.thresholds.resolved * data.robot.body.reach)
     floor = float(np.hypot(believed, placement_rms(data, noise)))
     fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
@@ -51,7 +51,7 @@ def excess_of(
 
 
 def model_error(data: Data, excess: Excess, noise: Noise, measured: Repeatability) -> ModelError:
-    """Return what the held-out error consists of, as a record."""
+    """Return the parts of the held-out error as a record."""
     return ModelError(
         fitted_m=excess.left,
         held_out_m=excess.held,
@@ -65,7 +65,7 @@ def model_error(data: Data, excess: Excess, noise: Noise, measured: Repeatabilit
 
 
 def placement_rms(data: Data, noise: Noise) -> float:
-    """Return how far markers are likely to sit from where they are declared [m]: as far as the data say, and no farther than is known beforehand."""
+    """Return the rms error of the declared marker positions [m]: the estimate from the data, at most the prior."""
     return float(np.sqrt(3.0)) * min(noise.std.get("marker", 0.0), data.placement_std)
 
 
@@ -74,5 +74,5 @@ def _beyond(value: float, floor: float) -> float:
 
 
 def _taken_away(before: float, after: float, floor: float) -> float:
-    """Return the share of the mean square beyond the floor that is gone; all of it where nothing is left beyond."""
+    """Return the removed share of the mean square beyond the floor; 1 if nothing remains beyond it."""
     return 1.0 if after <= floor else float((before**2 - after**2) / max(before**2 - floor**2, 1e-18))

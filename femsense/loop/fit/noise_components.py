@@ -1,9 +1,11 @@
-"""The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left (docs/method/closing-the-loop.md, 4).
+"""The noise of marker residuals: components common to a marker, a frame, a sweep and a repeated state, and white noise.
+
+The model (docs/method/closing-the-loop.md, section 4) is
 
     Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 
-The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the richest linear model leaves, so that no
-effect under test counts as noise.
+The variances are estimated by restricted maximum likelihood (Patterson & Thompson 1971) from the residual of the richest linear model, so that
+effects under test do not count as noise.
 """
 
 from __future__ import annotations
@@ -25,11 +27,11 @@ from femsense.core.parallel import each
 from femsense.loop.data.trial import COMPONENTS, Groups, Trial
 
 ROUNDING = 1e-12
-"""Directions of fields with less of the largest square are rounding."""
+"""Directions of the fields with less than this share of the largest square are rounding errors."""
 FLOOR = 2e-6
-"""No camera's markers are better than this [m]."""
+"""Smallest noise of a marker [m]."""
 UNTOLD = 5e-4
-"""Noise until it is estimated [m]: of a marker along each axis, of clouds along the normal."""
+"""Noise before it is estimated [m]: of a marker along each axis, of clouds along the normal."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,27 +41,27 @@ class Noise:
     std: dict[str, float]
     """Of markers, along each axis."""
     source: str
-    """Where they come from, in words."""
+    """The source, in words."""
     surface: dict[str, float] = field(default_factory=lambda: {"white": UNTOLD})
     """Of clouds, along the normal."""
     assumed: float | None = None
-    """What a marker is taken to repeat to along each axis where nothing tells it [m]; None: its white part."""
+    """Repeatability of a marker along each axis if it was not measured [m]; None: the white component."""
 
     def components(self, groups: Groups) -> dict[str, float]:
-        """Return the standard deviations that hold for rows with these groups [m]."""
+        """Return the standard deviations of the components of rows with these groups [m]."""
         return self.std if groups.surface is None else self.surface
 
     def joined(self, estimate: Noise, clouds: bool) -> Noise:
-        """Return this noise with what was estimated of markers, or of clouds."""
+        """Return this noise with an estimate for markers, or for clouds."""
         source = "; ".join(dict.fromkeys(s for s in (self.source, estimate.source) if s))
         return replace(self, source=source, surface=estimate.std) if clouds else replace(self, source=source, std=estimate.std)
 
     def row_std(self, groups: Groups) -> float:
-        """Return the standard deviation of a row with these groups [m]: of a coordinate of a marker, or of a cloud along the normal."""
+        """Return the standard deviation of a row with these groups [m]: of a marker coordinate, or of a cloud along the normal."""
         return float(np.sqrt(sum(v**2 for v in self.components(groups).values())))
 
     def covariance(self, groups: Groups) -> FloatArray:
-        """Return the covariance of the rows of one axis [m²], shape (k, k), but for placements that turn."""
+        """Return the covariance of the rows of one axis [m²], shape (k, k), without the rotating placements."""
         std = self.components(groups)
         sigma = np.eye(len(groups.marker)) * std["white"] ** 2
         for name in COMPONENTS[1:]:
@@ -68,29 +70,29 @@ class Noise:
         return sigma
 
     def placements(self, groups: Groups) -> FloatArray:
-        """Return the fields of markers that sit elsewhere [m], each of one standard deviation, shape (k, c, b); none where they do not turn."""
+        """Return the fields of misplaced markers [m], scaled to one standard deviation, shape (k, c, b); empty if they do not rotate."""
         fields = groups.placements
         none = np.zeros((len(groups.marker), 3 if groups.surface is None else 1, 0))
         return none if fields is None or not self.std.get("marker", 0.0) else self.std["marker"] * fields
 
     def plain_whitener(self, groups: Groups) -> Whitener:
-        """Return what whitens rows with these groups, but for placements that turn."""
+        """Return the whitener of rows with these groups, without the rotating placements."""
         return Whitener(_lower(self, groups), np.zeros((0, 0)), np.zeros(0))
 
     def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
-        """Return what whitens rows with these groups.
+        """Return the whitener of rows with these groups.
 
-        `error` (k, c, b) are fields [m] that the residual may hold by chance besides, each with a standard deviation of once its size.
+        `error` (k, c, b) are additional random fields [m], each scaled to one standard deviation.
         """
         return _whitener(self, groups, _Same(error))
 
     def whiteners(self, trials: Sequence[Trial]) -> list[Whitener]:
-        """Return what whitens the rows of each trial, the fields of its mesh's error among them."""
+        """Return the whitener of each trial, with its discretisation error."""
         return [self.whitener(t.groups, t.mesh_error) for t in trials]
 
     @property
     def total(self) -> float:
-        """Root mean square 3-D noise of a marker [m]; where there are only clouds, of a cloud along the normal."""
+        """Root mean square 3-D noise of a marker [m]; with clouds only, that of a cloud along the normal."""
         if not self.std:
             return self.along_normals
         return float(np.sqrt(3.0 * sum(v**2 for v in self.std.values())))
@@ -103,7 +105,7 @@ class Noise:
 
 @lru_cache(maxsize=4)
 def _lower(noise: Noise, groups: Groups) -> FloatArray:
-    """Return the Cholesky factor of the covariance of the rows of one axis [m], shape (k, k); fit after fit asks for the same one."""
+    """Return the Cholesky factor of the covariance of the rows of one axis [m], shape (k, k); cached, because consecutive fits need the same one."""
     lower = np.asarray(cholesky(noise.covariance(groups), lower=True))
     lower.flags.writeable = False
     return lower
@@ -111,7 +113,7 @@ def _lower(noise: Noise, groups: Groups) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Same:
-    """An array that a cache knows again by being the same one."""
+    """An array compared by identity, as a key of a cache."""
 
     array: FloatArray | None
 
@@ -124,7 +126,7 @@ class _Same:
 
 @lru_cache(maxsize=8)
 def _whitener(noise: Noise, groups: Groups, error: _Same) -> Whitener:
-    """Return what `Noise.whitener` is after; fit after fit asks for the same one."""
+    """Return the result of `Noise.whitener`; cached, because consecutive fits need the same one."""
     plain, placements = noise.plain_whitener(groups), noise.placements(groups)
     fields = placements if error.array is None else np.concatenate([error.array, placements], axis=2)
     if not fields.shape[2]:
@@ -160,11 +162,11 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
 
 
 NEAR_STD = float(np.log(2.0))
-"""What is known beforehand is known to a factor of two: the logarithm of that."""
+"""Prior of the components of a repeated estimate: a factor of two, as the σ of their logarithm."""
 FLAT = 1e-6
-"""Relative decrease of the likelihood at which the estimate of the noise ends: a hundredth of a log-likelihood of ten thousand."""
+"""Relative decrease of the likelihood at which its maximisation ends: 0.01 in a log-likelihood of ten thousand."""
 MAX_REML_ROWS = 500
-"""Rows that the estimate of the noise uses at most; more are thinned out by whole frames, of clouds by points as well."""
+"""Maximum number of rows for the estimate; beyond it whole frames are left out, and points of clouds."""
 
 
 def estimate_noise(
@@ -179,11 +181,11 @@ def estimate_noise(
 
     Arguments:
         residuals: of each recording [m], shape (k, c): of markers (c = 3), or of clouds (c = 1).
-        nuisance: columns of what is fitted, shape (k, c, p), the same p everywhere.
-        extra: columns of what might be in the data besides, shape (k, c, q), the likeliest first; these count as explained.
+        nuisance: columns of the fitted parameters, shape (k, c, p), the same p everywhere.
+        extra: columns of possible effects, shape (k, c, q), the best first; they are projected out.
         groups: of each recording.
-        before: components [m] of an earlier estimate with a poorer model; the new one stays near it (a factor of two, softly), where the data leave it open.
-        most: component → what it may be at most [m].
+        before: components [m] of an earlier estimate with a smaller model; prior of the new one (a factor of two).
+        most: component → its upper bound [m].
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
@@ -205,20 +207,20 @@ def estimate_noise(
     best = min(each(from_start, starting_points(names, scale, jitter, near)), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
-    how = "with states that are reached again" if "state" in names else "no repeated state: assumed from the residual"
-    return Noise(std, f"restricted maximum likelihood, {how}")
+    origin = "from repeated states" if "state" in names else "no repeated state: assumed from the residual"
+    return Noise(std, f"restricted maximum likelihood, {origin}")
 
 
 def starting_points(names: Sequence[str], scale: float, jitter: float, near: FloatArray | None) -> list[FloatArray]:
-    """Return logarithms of standard deviations [m] that the likelihood is climbed from.
+    """Return starting values of the maximisation: logarithms of standard deviations [m].
 
     Arguments:
         names: of the components.
         scale: rms of the residuals [m].
-        jitter: scatter of repeated states [m], 0 where there are none.
-        near: logarithms of an earlier estimate; it is begun there.
+        jitter: scatter of repeated states [m], 0 without any.
+        near: logarithms of an earlier estimate.
     """
-    if near is not None:  # what was none before would stay none, since its logarithm has no slope there: it is lifted once
+    if near is not None:  # a component estimated as zero has no gradient in its logarithm and would stay zero: raise it once
         return [near, np.maximum(near, np.log(0.3 * scale))]
     whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
     return [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
@@ -227,9 +229,12 @@ def starting_points(names: Sequence[str], scale: float, jitter: float, near: Flo
 class Likelihood:
     """Minus the restricted log-likelihood of log standard deviations, with its gradient.
 
-    2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,  ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r,  P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,  V = Σ v_i V_i, the
-    same for each axis and block-diagonal over recordings. Placements that turn are random effects u beside the fixed ones (Henderson 1975): with
-    X extended by their fields and 1/m² added to their part of the normal matrix N, all of this holds as it stands, but for n log m², and
+    With V = Σ v_i V_i, the same for each axis and block-diagonal over recordings, and P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,
+
+        2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,    ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r.
+
+    Rotating placements are random effects u in addition to the fixed ones (Henderson 1975): X is extended by their fields and 1/m² is added to
+    their part of the normal matrix N. The same expressions hold, plus n log m² in the value, and
     ∂(2 L)/∂m² = n/m² − (tr N⁻¹ᵤᵤ + |û|²)/m⁴.
     """
 
@@ -291,7 +296,7 @@ class Likelihood:
 
 
 def _beside_each_other(blocks: list[FloatArray]) -> list[FloatArray]:
-    """Return columns (k, c, q) of several recordings, each with columns of its own and zeros in those of the others."""
+    """Return the columns (k, c, q) of several recordings block-diagonally: each has its own, and zeros in those of the others."""
     ends = np.cumsum([0, *(b.shape[2] for b in blocks)])
     return [np.pad(b, ((0, 0), (0, 0), (a, ends[-1] - a - b.shape[2]))) for b, a in zip(blocks, ends)]
 
@@ -329,7 +334,7 @@ def _thinned(
 
 
 def _spread_rows(groups: Groups, step: int) -> BoolArray:
-    """Return about one in so many rows: whole frames, of clouds points in the same way."""
+    """Return about every `step`-th row: whole frames, and points of clouds too."""
     if groups.surface is None:
         return np.asarray(groups.frame % step == 0)
     points = int(np.ceil(np.sqrt(step)))
@@ -337,9 +342,9 @@ def _spread_rows(groups: Groups, step: int) -> BoolArray:
 
 
 def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int) -> list[FloatArray]:
-    """Return an orthonormal basis of the nuisance and of what might be there besides, the first columns of `extra` first.
+    """Return an orthonormal basis of the nuisance columns and of `extra`, in its order.
 
-    The latter take at most a third of the degrees of freedom that the nuisance leaves, so that some are left for the noise.
+    `extra` takes at most a third of the remaining degrees of freedom, so that enough are left for the noise.
     """
     basis = list(basis_of(_stacked(nuisance))[0].T)
     spare = max((distinct - len(basis)) // 3, 0)
@@ -348,7 +353,7 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
             break
         left = column - np.transpose(basis) @ (np.array(basis) @ column)
         size = float(np.linalg.norm(left))
-        if size > 0.02:  # not just what is there already
+        if size > 0.02:  # linearly independent of the basis
             basis.append(left / size)
             spare -= 1
     Q = np.transpose(basis)
@@ -357,7 +362,7 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
 
 
 def _stacked(columns: list[FloatArray]) -> FloatArray:
-    """Return columns of all recordings below each other with unit length, shape (c Σk, p)."""
+    """Return the columns of all recordings stacked, scaled to unit length, shape (c Σk, p)."""
     flat = np.vstack([c.reshape(c.shape[0] * c.shape[1], c.shape[2]) for c in columns])
     norm = np.linalg.norm(flat, axis=0)
     return np.asarray(flat[:, norm > 0] / norm[norm > 0])

@@ -1,11 +1,11 @@
-"""Normal equations of one recording in the parameters that all recordings share, which add up over recordings.
+"""Normal equations of one recording in the shared parameters; they add up over recordings.
 
 Near shared parameters β, with the parameters aᵢ of recording i alone (camera poses, initial inputs) at their optimum, its whitened residual is
 rᵢ + Aᵢ δaᵢ + Bᵢ δβ. With Pᵢ the projector on the orthogonal complement of Aᵢ, all recordings together have
 
     χ²(β + δβ) = Σᵢ rᵢᵀPᵢrᵢ + 2 δβᵀ g + δβᵀ N δβ,    N = Σᵢ BᵢᵀPᵢBᵢ,    g = Σᵢ BᵢᵀPᵢrᵢ,
 
-so that a recording may be forgotten once its N and g are known: block elimination, as in bundle adjustment (Triggs et al. 2000), of a separable
+so that a recording can be released once its N and g are known: block elimination, as in bundle adjustment (Triggs et al. 2000), of a separable
 problem (Golub & Pereyra 1973). The columns of an effect that is not in the model yet are reduced in the same way; its score needs its own block and
 that with β.
 """
@@ -20,12 +20,12 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 
 ROUNDING = 1e-12
-"""Directions with less of the largest curvature are rounding."""
+"""Directions with less than this share of the largest curvature are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Block:
-    """Normal equations of the columns C of a candidate, P C and P r taken as in the module."""
+    """Normal equations of the columns C of a candidate, with P and r as in the module docstring."""
 
     own: FloatArray
     """CᵀPC, shape (q, q)."""
@@ -40,7 +40,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Squares:
-    """Sums of squared marker residuals and their numbers."""
+    """Sums of squared marker residuals and numbers of rows."""
 
     fitted: float = 0.0
     """[m²]"""
@@ -65,7 +65,7 @@ class Squares:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NormalEquations:
-    """Of one recording, or of several, added up."""
+    """Normal equations of one recording, or the sum of several."""
 
     normal: FloatArray
     """N, shape (p, p)."""
@@ -74,18 +74,18 @@ class NormalEquations:
     chi2: float
     """Σ rᵀPr."""
     observations: float
-    """Independent observations, as BIC counts them."""
+    """Number of independent observations, as BIC counts them."""
     before: Squares
-    """Residuals of the declared model, its camera calibrated."""
+    """Residuals of the declared model, camera calibrated."""
     after: Squares
     """Of the model at β."""
     candidates: Mapping[str, Block]
     """By key."""
     count: int = 1
-    """Recordings."""
+    """Number of recordings."""
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
-        both = self.candidates.keys() & other.candidates.keys()  # one that cannot act in a recording has no columns there
+        both = self.candidates.keys() & other.candidates.keys()  # a candidate that cannot act in a recording has no columns there
         return NormalEquations(
             self.normal + other.normal,
             self.slope + other.slope,
@@ -101,7 +101,7 @@ class NormalEquations:
         )
 
     def rows(self, coordinates: FloatArray) -> Rows:
-        """Return rows whose sum of squares is χ² near β = `coordinates`, shape (p,), but for a constant."""
+        """Return rows whose sum of squares equals χ² near β = `coordinates`, shape (p,), up to a constant."""
         size, turn = np.linalg.eigh(self.normal)
         seen = size > ROUNDING * max(float(size.max(initial=0.0)), 1e-300)
         root = np.sqrt(size[seen])
@@ -109,10 +109,10 @@ class NormalEquations:
         return Rows(matrix, turn[:, seen].T @ self.slope / root - matrix @ coordinates)
 
     def beside(self, key: str, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return R and s of a candidate whose χ² is ‖R x + s‖², the shared parameters being fitted along, but for a constant.
+        """Return R and s such that χ² = ‖R x + s‖² + const for a candidate with coordinates x, shape (q,), the shared parameters refitted.
 
         Arguments:
-            key: of the candidate, whose coordinates from the null are x, shape (q,).
+            key: of the candidate; x is relative to its null.
             prior: 1/σ² of the shared parameters, shape (p,); they are at their optimum.
         """
         block = self.candidates[key]
@@ -125,7 +125,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rows:
-    """Rows M β + d of a least-squares problem that stand for other recordings."""
+    """Rows M β + d of a least-squares problem that represent other recordings."""
 
     matrix: FloatArray
     """Shape (m, p)."""
@@ -133,9 +133,9 @@ class Rows:
     """Shape (m,)."""
 
     def at(self, coordinates: FloatArray) -> FloatArray:
-        """Return the residual at coordinates, shape (p or more,); of those beyond p the recordings say nothing."""
+        """Return the residual at coordinates, shape (≥ p,); the rows do not depend on those beyond p."""
         return np.asarray(self.matrix @ coordinates[: self.matrix.shape[1]] + self.offset)
 
     def keeping(self, keep: BoolArray, still: FloatArray) -> Rows:
-        """Return the rows in some of the coordinates, `keep` (p,), where the others are held at values `still`, shape (p,)."""
+        """Return the rows in some of the coordinates, `keep` (p,), with the others fixed at `still`, shape (p,)."""
         return Rows(self.matrix[:, keep], self.offset + self.matrix[:, ~keep] @ still[: len(keep)][~keep])

@@ -1,4 +1,4 @@
-"""The noise of the data: what a marker repeats to in a state that is reached again. What varies with the state is an error of the model."""
+"""The noise of the data: the repeatability of a marker in a repeated state. Errors that vary with the state are model errors."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from femsense.model.repeats import LEAST_REPEATS
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Repeatability:
-    """What a row repeats to."""
+    """Repeatability of a row."""
 
     std: float
-    """Of a marker along each axis, where there are only clouds along their normals [m]."""
+    """σ of a marker along each axis; with clouds only, along their normals [m]."""
     axes: int
-    """Numbers that a point has: 3 of a marker, 1 of a cloud."""
+    """Number of rows per point: 3 for a marker, 1 for a cloud."""
     known: bool
-    """Whether it is declared or measured, not assumed."""
+    """Whether it is declared or measured, and not assumed."""
     source: str
-    """Where it comes from, in words."""
+    """The source, in words."""
 
     @property
     def total(self) -> float:
@@ -36,9 +36,9 @@ class Repeatability:
 
 
 def repeatability(data: Data, fitted: FittedModel, noise: Noise) -> Repeatability:
-    """Return the noise: as recording.toml declares it, else from states that are reached again, else from rest.csv.
+    """Return the noise: declared in recording.toml, else from repeated states, else from rest.csv.
 
-    Where none of them tells it, it is assumed to be the part of the residual that no two rows share.
+    If none of these is available, the uncorrelated part of the residual is assumed.
     """
     axes = 3 if noise.std else 1
     pairs = [(t, j.residual) for t, j in zip(data.train, fitted.fit.jets) if j.residual.shape[1] == axes]
@@ -48,24 +48,22 @@ def repeatability(data: Data, fitted: FittedModel, noise: Noise) -> Repeatabilit
         return Repeatability(declared, axes, True, "marker_noise_m of recording.toml")
     scatter, freedom = scatter_of_repeats(trials, [r for _, r in pairs])
     if freedom >= LEAST_REPEATS:
-        return Repeatability(scatter, axes, True, f"states that are reached again ({freedom} degrees of freedom)")
+        return Repeatability(scatter, axes, True, f"repeated states ({freedom} degrees of freedom)")
     at_rest = _at_rest(trials) if axes == 3 else None
     if at_rest is not None:
         return Repeatability(at_rest, axes, True, "std_m of rest.csv")
     white = noise.assumed or (noise.std or noise.surface)["white"]
-    return Repeatability(
-        white, axes, False, "assumed from the residual: no state is reached again, and marker_noise_m is not declared"
-    )
+    return Repeatability(white, axes, False, "assumed from the residual: no state repeats, and marker_noise_m is not declared")
 
 
 def _declared(trials: Sequence[Trial]) -> float | None:
-    """Return what recordings declare [m], root mean square; None where none does."""
+    """Return the root mean square of the declared noise [m]; None if no recording declares one."""
     known = [t.scene.recording.marker_noise_m for t in trials if t.scene.recording.marker_noise_m is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
 def _at_rest(trials: Sequence[Trial]) -> float | None:
-    """Return what markers measured at rest repeat to [m], root mean square; None where that is not known."""
+    """Return the root mean square of the standard deviations in rest.csv [m]; None if there are none."""
     stds = [t.scene.recording.rest.std for t in trials if t.scene.recording.rest is not None]
     known: FloatArray = np.concatenate([s[np.isfinite(s)] for s in stds]) if stds else np.zeros(0)
     return float(np.sqrt(np.mean(known**2))) if known.size else None

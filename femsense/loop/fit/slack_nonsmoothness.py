@@ -1,7 +1,7 @@
-"""Where residuals bend because a cable cannot push: tensions that offset, gain and log let come out below 0.
+"""Nonsmooth residuals of slack cables: the tension is max(0, recorded, with offset and gain).
 
-Where a log says 0 for every cable that is not used, all these frames bend at once as its offset goes through 0, and a fit that believes
-in straight lines overshoots again and again. What makes them bend is known without solving anything: the tension that drives each frame.
+If unused cables are recorded as 0, all their frames become slack or taut together when the offset crosses 0, and a Gauss–Newton step overshoots
+repeatedly. The points of nonsmoothness follow from the recorded tensions without solving equilibria.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from femsense.loop.data.trial import Trial
 
 NEAR_ZERO = 0.25
-"""Tensions below this share of the largest one may come to 0 in a step."""
+"""Tensions below this share of the largest one may reach 0 within a step."""
 ALIKE = 0.01
-"""Tensions that differ by less than this share of the largest one count as one: logs are noisy where cables are idle."""
+"""Tensions that differ by less than this share of the largest one are grouped: recordings of idle cables are noisy."""
 
 
 Part = tuple[slice, IntArray, Nonsmoothness]
-"""Rows of a trial, which parameters its slopes are by, and its nonsmoothness."""
+"""Rows of a trial, the parameters of its slopes, and its nonsmoothness."""
 
 
 def trial_nonsmoothness(
     hypothesis: Hypothesis, trial: Trial, jet: SceneJet, factor: Whitener, own: FloatArray, coordinates: FloatArray
 ) -> Nonsmoothness | None:
-    """Return where the residual rows of a trial bend near a point; its slopes are by the trial's own parameters, then the coordinates.
+    """Return the nonsmoothness of the residual rows of a trial near a point; slopes are by the trial's own parameters, then the coordinates.
 
-    Frames in which a cable is driven alike bend together.
+    Frames with the same tension of a cable become slack together.
     """
     if trial.scene.recording.actuation != "tension" or not jet.by_input.shape[2]:
         return None
@@ -50,7 +50,7 @@ def trial_nonsmoothness(
     _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
     share = np.zeros((len(count), len(frame)))
     share[group.ravel(), np.arange(len(frame))] = 1.0
-    weight = response[:, frame] @ share.T  # what drives each frame by what is wanted in all frames of a group
+    weight = response[:, frame] @ share.T  # effect of a group of frames on the tension of every frame (creep)
     first = share.argmax(axis=1)
     field = jet.by_input[:, :, cable[first]] * weight[trial.scene.frame][:, None, :]
     some = np.abs(field).max(axis=(0, 1)) > 0
@@ -59,7 +59,7 @@ def trial_nonsmoothness(
 
 
 def joined(parts: Sequence[Part], rows: int, width: int) -> Nonsmoothness:
-    """Return the nonsmoothness of several trials together, for so many rows and parameters."""
+    """Return the nonsmoothness of several trials together, given the total number of rows and parameters."""
     columns, slopes = list[FloatArray](), list[FloatArray]()
     for own, by, part in parts:
         columns.append(np.zeros((rows, len(part.value))))
@@ -73,8 +73,8 @@ def joined(parts: Sequence[Part], rows: int, width: int) -> Nonsmoothness:
 def _wanted(
     hypothesis: Hypothesis, trial: Trial, own: FloatArray, coordinates: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the tensions that are wanted [N], (F, a), their derivatives by all parameters, (F, a, p), and what each frame is driven by
-    of those of all frames, (F, F)."""
+    """Return the commanded tensions before the limit at 0 [N], (F, a), their derivatives by all parameters, (F, a, p), and the weights of all frames'
+    commands in the drive of each frame (creep), (F, F)."""
     recording = trial.scene.recording
     poses = 6 * len(trial.poses)
     initial = None if trial.initial is None else own[poses:]

@@ -1,4 +1,4 @@
-"""What the report draws and tabulates besides the verdict, so that loop.json alone is enough."""
+"""Data for the figures and tables of the report, so that loop.json alone suffices to draw it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, NAN, Columns, Number
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameTable(Columns):
-    """One row for each frame of all trials, fitted ones first, as columns of equal length."""
+    """One row per frame of all trials, fitted ones first, as columns of equal length."""
 
     recording: tuple[int, ...] = ()
     frame: tuple[int, ...] = ()
@@ -27,28 +27,28 @@ class FrameTable(Columns):
     before_rms_m: Vector = ()
     after_rms_m: Vector = ()
     score_before_m: Vector = ()
-    """How strongly a frame shows the leading pattern [m]."""
+    """Amplitude of the leading pattern in the frame [m]."""
     score_after_m: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pattern:
-    """The leading pattern of the residual before, and what its strength goes with."""
+    """The leading pattern of the residual before, and its correlations."""
 
     share: Number = NAN
-    """Share of the mean square that it holds."""
+    """Share of the mean square in this pattern."""
     pattern: Mapping[str, Vector] = field(default_factory=dict)
     """Marker → direction, (3,)."""
     goes_with_before: tuple[Correlation, ...] = ()
     goes_with_after: tuple[Correlation, ...] = ()
     covariate: str | None = None
-    """What it goes with the most."""
+    """The covariate with the strongest correlation."""
     covariate_values: Vector = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tip(Columns):
-    """The way of the marker farthest from the clamp along its main direction of motion."""
+    """Path of the marker farthest from the clamp, along its main direction of motion."""
 
     marker: str = ""
     direction: Vector = ()
@@ -61,7 +61,7 @@ class Tip(Columns):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Snapshot:
-    """The residuals in one frame, on the skin of the declared body."""
+    """The residuals of one frame, on the surface of the declared body."""
 
     title: str
     recording: int
@@ -71,12 +71,12 @@ class Snapshot:
     before_m: tuple[Triple, ...]
     after_m: tuple[Triple, ...]
     nodes_m: tuple[Triple, ...] | None = None
-    """Corners of the skin; None where they are many."""
+    """Corners of the surface; None if there are too many."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraPlace:
-    """Where a camera stands and which way it looks, robot frame."""
+    """Position and viewing direction of a camera, robot frame."""
 
     axis: Triple
     position_m: Vector = ()
@@ -84,7 +84,7 @@ class CameraPlace:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pictures:
-    """Some frames, with the skin's triangles (None where they are many) and the cameras."""
+    """Some frames, with the triangles of the surface (None if there are too many) and the cameras."""
 
     triangles: tuple[tuple[int, ...], ...] | None = None
     frames: tuple[Snapshot, ...] = ()
@@ -113,12 +113,12 @@ class Ranked:
 
     parameters: tuple[Estimate, ...] = ()
     first_share: float | None = None
-    """How often it comes first when sweeps are drawn again; None: too few sweeps."""
+    """Share of bootstrap draws of sweeps in which it has the best score; None: too few sweeps."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ConfoundingMap:
-    """How much of each effect's field (row) is collinear with that of another one (column), calibration projected out."""
+    """Share of each effect's field (row) that is collinear with that of another one (column), calibration projected out."""
 
     names: tuple[str, ...] = ()
     share: tuple[Vector, ...] = ()
@@ -126,7 +126,7 @@ class ConfoundingMap:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseShift:
-    """How a camera's pose moved, by model; the declared one stands at zero."""
+    """Change of a camera pose by model, relative to the declared model."""
 
     recording: int
     camera: int
@@ -148,7 +148,7 @@ class InputShift:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TermShift:
-    """A value that calibration may move, by model: (value, standard deviation)."""
+    """A nuisance value by model: (value, standard deviation)."""
 
     label: str
     unit: str = "1"
@@ -158,7 +158,7 @@ class TermShift:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationShift:
-    """What calibration says before, with all it may move, and beside the effects."""
+    """Calibration results of the declared model, with all nuisance effects, and with the accepted effects."""
 
     poses: tuple[PoseShift, ...] = ()
     initial_inputs: tuple[InputShift, ...] = ()
@@ -178,17 +178,17 @@ class LackOfFit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tested:
-    """Tests of what a model leaves."""
+    """Tests of the residual of a model."""
 
     structure: Structure = field(default_factory=Structure)
     lack_of_fit: LackOfFit | None = None
-    """None where too little is repeated."""
+    """None if too few states repeat."""
     train_rms_m: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tests:
-    """Tests of what is left before and after."""
+    """Tests of the residual before and after."""
 
     before: Tested = field(default_factory=Tested)
     after: Tested = field(default_factory=Tested)
@@ -196,7 +196,7 @@ class Tests:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Size:
-    """The smallest change of a parameter that would have been seen."""
+    """The smallest detectable change of a parameter."""
 
     label: str
     kind: str
@@ -207,7 +207,7 @@ class Size:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadRow:
-    """The strongest declared load of a frame next to what either model senses there."""
+    """The largest declared load of a frame, and the force that each model estimates there."""
 
     recording: int
     frame: int
@@ -221,20 +221,20 @@ class LoadRow:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Softer:
-    """How the compliance of two models differs in one frame."""
+    """Ratio of the compliances of two models in one frame."""
 
     title: str
     frame: int
     ratio: Vector = ()
-    """Forces after / before at each point, for the same dent."""
+    """Forces after / before at each point, for the same indentation."""
     phantom_before_n: Number = NAN
-    """Force at the free end that the model would sense where nothing touches."""
+    """Force at the free end that the residual would be interpreted as, in a contact-free frame [N]."""
     phantom_after_n: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Compliance:
-    """How much a sensed force changes from model to model."""
+    """Change of an estimated force between the models."""
 
     points_m: tuple[Vector, ...] = ()
     frames: tuple[Softer, ...] = ()
@@ -242,7 +242,7 @@ class Compliance:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ForceImpact:
-    """What both models make of forces: at declared loads, or where there are none by their compliance."""
+    """Effect of the model change on forces: at declared loads, or if there are none, by the compliances."""
 
     loads: tuple[LoadRow, ...] | None = field(default=None, metadata=LEFT_OUT)
     compliance: Compliance | None = field(default=None, metadata=LEFT_OUT)
@@ -250,7 +250,7 @@ class ForceImpact:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ForceField:
-    """Forces on the surface that would explain the frame with the largest residual."""
+    """Surface forces that would fit the frame with the largest residual."""
 
     recording: int = 0
     frame: int | None = None
@@ -262,7 +262,7 @@ class ForceField:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evidence:
-    """What the figures and tables of the report need."""
+    """Data for the figures and tables of the report."""
 
     frames: FrameTable = field(default_factory=FrameTable)
     score: Pattern = field(default_factory=Pattern)
@@ -276,9 +276,9 @@ class Evidence:
     excluded: tuple[Mapping[str, tuple[int, ...]], ...] = ()
     """Reason → frames that are neither fitted nor held out, for each recording."""
     repeats: int | None = None
-    """Stays that repeat an earlier one."""
+    """Number of stays that repeat an earlier one."""
     forces: ForceImpact = field(default_factory=ForceImpact)
     tip: Tip | None = field(default=None, metadata=AS_EMPTY)
-    """None: clouds do not tell where a point of the surface went."""
+    """None for clouds: they do not identify a material point."""
     equivalent_forces: ForceField | None = field(default=None, metadata=AS_EMPTY)
-    """None: no frame holds more than noise."""
+    """None if no frame exceeds the noise."""

@@ -1,4 +1,4 @@
-"""What closing the loop returns."""
+"""The result of closing the loop."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from femsense.model.robot import Robot
 
 FORMAT = "femsense-loop-1"
 FOUND, NONE, UNEXPLAINED = "effects", "none", "unexplained"
-"""Verdicts: the model lacks effects; it explains the data to their noise; a residual is left that no effect explains."""
+"""Verdicts: the model lacks effects; it fits the data to their noise; a residual remains that no effect fits."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Loop:
-    """What loop.json holds: the verdict, the effects with their errors before and after, and what the data cannot say."""
+    """The content of loop.json: the verdict, the effects with errors before and after, and the limits of the data."""
 
     verdict: str = ""
     """FOUND, NONE or UNEXPLAINED."""
     sentence: str = ""
     """The verdict in words."""
     noise_m: Number = NAN
-    """Noise of the data [m]: what repeats of a state differ by."""
+    """Noise of the data [m]: the repeatability of a state."""
     before: Errors = field(default_factory=Errors)
-    """Of the declared model, calibrated."""
+    """Errors of the declared model, calibrated."""
     after: Errors = field(default_factory=Errors)
-    """Of the model that is handed back."""
+    """Errors of the returned model."""
     effects: tuple[NamedEffect, ...] = ()
     """In the order in which they were added."""
     candidates: tuple[TriedEffect, ...] = ()
@@ -57,30 +57,30 @@ class Loop:
     next_experiment: str = ""
     """What to record to distinguish them, in words."""
     not_testable: tuple[Untestable, ...] = ()
-    """Effects that the data cannot show."""
+    """Effects that calibration absorbs in these data."""
     detectable: Mapping[str, Detectable] = field(default_factory=dict)
-    """Effect that was not found → the smallest size that would have been seen."""
+    """Effect that was not found → its smallest detectable size."""
     left: Left = field(default_factory=Left)
-    """What the remaining residual looks like."""
+    """The remaining residual."""
     data: DataCard = field(default_factory=DataCard)
     model_error: ModelError | None = field(default=None, metadata=AS_EMPTY)
-    """What is left that is no noise."""
+    """The parts of the held-out error."""
     fitted_along: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
-    """What the improved robot has beside `effects`, since these were fitted with it (the modulus, input offsets) → its values. It is not named: no value
-    of it is surely away from what is declared, or held-out data do not need it."""
+    """Nuisance effects of the improved robot that are not listed in `effects` (the modulus, input offsets), with their values: they were fitted too, but do
+    not differ significantly from the declared values, or held-out data do not need them."""
     correction: CorrectionRecord | None = field(default=None, metadata=LEFT_OUT)
-    """An empirical correction of what is left, where one was asked for."""
+    """An empirical correction of the remaining residual, if requested."""
     everywhere: AllRecordings | None = field(default=None, metadata=LEFT_OUT)
-    """What all recordings say, where effects were sought in some of them."""
+    """Results in all recordings, if only some were searched."""
     residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)
-    """Held-out residuals before and after, for figures."""
+    """Held-out residuals before and after, for the figures."""
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)
-    """What the report draws and tabulates besides."""
+    """Further data for the figures and tables of the report."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SavedLoop(Loop):
-    """loop.json as it is read back: what the loop says, and what it was made from."""
+    """loop.json as read back, with the inputs it was computed from."""
 
     inputs: LoopInputs = field(default_factory=LoopInputs)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -88,14 +88,14 @@ class SavedLoop(Loop):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class LoopResult(Loop):
-    """What closing the loop returns: what loop.json holds, with the robots."""
+    """The result of `improve`: the content of loop.json, and the robots."""
 
     entries: tuple[Entry, ...]
     """The effects as tables of `[[effects]]`."""
     robot: Robot
     """The improved robot."""
     declared: Robot
-    """The robot that came in."""
+    """The declared robot."""
 
     def __repr__(self) -> str:
         named = ", ".join(effect.name for effect in self.effects) or "no effect"
@@ -109,7 +109,7 @@ class LoopResult(Loop):
 
 
 def rounded(value: Any, digits: int = 7) -> Any:
-    """Return plain tables with so many digits, NaN and infinity as null."""
+    """Round numbers in plain tables to `digits` significant digits; NaN and infinity become null."""
     if isinstance(value, dict):
         return {key: rounded(item, digits) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""What a closed loop says, piece by piece: errors, effects, candidates, and what the data cannot tell."""
+"""The parts of the result of a closed loop: errors, effects, candidates, and limits of the data."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from femsense.loop.result.tables import LEFT_OUT, NAN, Columns, Number, Triple, 
 from femsense.model.effects import Entry
 
 NAMED, PASSES = "named", "passes"
-"""What becomes of a refit that is added to the model, and of one that passes the acceptance test though another one is added."""
+"""Verdicts on a refit: added to the model; passes the acceptance test, but another one was added."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Errors:
-    """Errors of a model: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
+    """Errors of a model: of the markers, and along the normals of the clouds; without markers both are those of the clouds."""
 
     train_rms_m: Number = NAN
-    """Where it is fitted [m]."""
+    """Of the fitted data [m]."""
     validation_rms_m: Number = NAN
-    """On held-out data [m]."""
+    """Of the held-out data [m]."""
     validation_ci_m: Vector = ()
     """Its 95 % interval [m]."""
     validation_ci_by: str = ""
-    """What was drawn again for that: "sweeps" or "frames"."""
+    """Units of the bootstrap: "sweeps" or "frames"."""
     train_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Along the normals of clouds [m]; None without clouds."""
+    """Along the normals of the clouds [m]; None without clouds."""
     validation_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
     validation_normal_ci_m: Vector | None = field(default=None, metadata=LEFT_OUT)
 
@@ -40,7 +40,7 @@ class Value:
     value: Any = None
     """In `unit`."""
     std: Any = None
-    """Standard deviation of each number in the same shape; None: not fitted."""
+    """Standard deviation of each number, in the same shape; None: not fitted."""
     unit: str = "1"
 
 
@@ -59,41 +59,41 @@ class NamedEffect:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RefitRecord:
-    """What became of a candidate that was refitted together with all that the model has."""
+    """The result of refitting a candidate jointly with the whole model."""
 
     name: str
     seed: Entry = field(default_factory=dict)
-    """What was not fitted of it: a place, a radius, a time."""
+    """Numbers that were selected, not fitted: a place, a radius, a time."""
     verdict: str = ""
-    """NAMED, PASSES, or why not, in words."""
+    """NAMED, PASSES, or the reason of the rejection."""
     step: int | None = field(default=None, metadata=LEFT_OUT)
-    """Number of the model that it was tried on."""
+    """Number of the model that it extends."""
     in_place_of: str | None = field(default=None, metadata=LEFT_OUT)
-    """The effect that was taken out for it; None: it was added."""
+    """The effect that it was tried in place of; None: in addition to all."""
     dchi2: float | None = field(default=None, metadata=LEFT_OUT)
     """Decrease of χ²."""
     dbic: float | None = field(default=None, metadata=LEFT_OUT)
-    """That less the cost of its freedom."""
+    """Decrease of χ² minus the penalty."""
     validation_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
     """Held-out error with it [m]."""
     cv_gain: float | None = field(default=None, metadata=LEFT_OUT)
-    """By how much left-out sweeps are predicted better."""
+    """Gain in the log predictive density of left-out sweeps, times two."""
     cv_std: float | None = field(default=None, metadata=LEFT_OUT)
-    """Standard error of that."""
+    """Its standard error."""
     held_dchi2: float | None = field(default=None, metadata=LEFT_OUT)
     """Decrease of χ² on held-out data."""
     moved_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """How far it moves the markers beyond what calibration does [m]."""
+    """Rms displacement of the markers, calibration refitted [m]."""
     mesh_cost_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Discretisation error that calibration leaves [m]."""
+    """Discretisation error after calibration is projected out [m]."""
     takes_over: tuple[str, ...] | None = field(default=None, metadata=LEFT_OUT)
-    """Nuisances that are significant without it, and not with it."""
+    """Nuisance effects that are significant without it, and not with it."""
     seed_std: Vector | None = field(default=None, metadata=LEFT_OUT)
-    """Scatter of its coordinates over seeds that explain as much."""
+    """Standard deviation of its coordinates over seeds that fit equally well."""
 
     @property
     def passes(self) -> bool:
-        """Whether it passes the acceptance test, and another one was added instead."""
+        """Whether it passes the acceptance test although another effect was added."""
         return self.verdict == PASSES
 
     @property
@@ -103,17 +103,17 @@ class RefitRecord:
 
     @property
     def evidence(self) -> float:
-        """Its dBIC; NaN where it was stopped before it had one."""
+        """Its dBIC; NaN if the fit was stopped early."""
         return float("nan") if self.dbic is None else self.dbic
 
     def answers_as(self, other: RefitRecord) -> bool:
-        """Return whether both were made on top of the same model."""
+        """Return whether both extend the same model."""
         return (self.step, self.in_place_of) == (other.step, other.in_place_of)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TriedEffect:
-    """An effect that was tried, with its linear scores at the start and its refits."""
+    """An effect that was tried, with its linear scores and its refits."""
 
     name: str
     seed: Entry = field(default_factory=dict)
@@ -121,55 +121,55 @@ class TriedEffect:
     """Decrease of χ² by its linear step."""
     dbic: float | None = None
     retained_share: float | None = None
-    """Share of its field that calibration leaves; None: not screened."""
+    """ρ, the share of its field that calibration leaves; None: not screened."""
     dbic_at_end: float | None = None
-    """Linear dBIC beside all that is named."""
+    """Linear dBIC in addition to the accepted effects."""
     refits: tuple[RefitRecord, ...] = ()
     verdict: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ConfoundedPair:
-    """Two effects that these data cannot distinguish, and what is known of that."""
+    """Two effects that these data cannot distinguish, with the evidence for that."""
 
     pair: tuple[str, str]
     dbic_gap: float | None = field(default=None, metadata=LEFT_OUT)
-    """How far apart their refits are."""
+    """Difference between the dBIC of their refits."""
     absorbed_share: float | None = field(default=None, metadata=LEFT_OUT)
-    """How much of the one calibration absorbs, where the other is a nuisance."""
+    """√(1 − ρ²): the share of one that calibration absorbs, if the other is a nuisance effect."""
     cosine: float | None = field(default=None, metadata=LEFT_OUT)
-    """How much their fields agree, calibration projected out."""
+    """Cosine between their fields, calibration projected out."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Untestable:
-    """An effect that these data cannot show."""
+    """An effect that calibration absorbs in these data."""
 
     name: str
     absorbed_share: Number = NAN
-    """Share of its field that is absorbed by calibration."""
+    """√(1 − ρ²), the share of its field that calibration absorbs."""
     retained_share: Number = NAN
-    """Share that is left; the squares of the two add up to 1."""
+    """ρ, the share of its field that remains."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Detectable:
-    """The smallest size of an effect that would have been seen."""
+    """The smallest detectable size of an effect."""
 
     smallest: Mapping[str, float | None] = field(default_factory=dict)
-    """Label of a parameter → size in `unit`, as `kind` says; empty where the effect is there as a whole or not."""
+    """Label of a parameter → size in `unit`, of the given `kind`; empty for a discrete alternative."""
     would_be_seen: bool = True
-    """Whether any plausible size would be."""
+    """Whether a plausible size is detectable."""
     kind: str | None = field(default=None, metadata=LEFT_OUT)
     """"change", "factor" or "softer_than"."""
     unit: str | None = field(default=None, metadata=LEFT_OUT)
     share_seen: float | None = field(default=None, metadata=LEFT_OUT)
-    """Share of the whole that would be seen."""
+    """Of a discrete alternative: the share of its full change that is detectable."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Correlation:
-    """Spearman's correlation of a number a frame with a covariate."""
+    """Spearman's correlation of a number per frame with a covariate."""
 
     covariate: str
     rank_correlation: Number = NAN
@@ -180,7 +180,7 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameError:
-    """A frame and what is left in it."""
+    """A frame and its rms residual."""
 
     recording: int = 0
     frame: int | None = None
@@ -189,7 +189,7 @@ class FrameError:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WorstMarker:
-    """The marker with most of what is left."""
+    """The marker with the largest residual."""
 
     marker: str = ""
     position_m: Vector = ()
@@ -197,28 +197,28 @@ class WorstMarker:
     mean_residual_m: Vector = ()
     """[m], (3,)."""
     direction: Vector = ()
-    """The direction that holds most of its mean square, (3,); its sign is that of the mean."""
+    """First principal direction of its residuals, (3,), with the sign of the mean."""
     direction_share: Number = NAN
-    """How much it holds."""
+    """Share of its mean square along `direction`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Structure:
-    """Tests for structure in a residual; p-values as they are, not adjusted."""
+    """Tests for structure in a residual; p-values are not adjusted."""
 
     lag_one: Number = NAN
-    """Correlation of neighbouring states."""
+    """Correlation of consecutive states."""
     p_value: Number = NAN
-    """The smallest of all tests."""
+    """The smallest p-value of all tests."""
     tests: Mapping[str, Number] = field(default_factory=dict)
-    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart."""
+    """Test → p-value: `neighbours`, `pattern`, `sweep` (see `structure_tests`)."""
     significant: bool | None = None
-    """Whether any test stands after Holm's adjustment."""
+    """Whether the smallest p-value is significant after Holm's adjustment."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Left:
-    """What is left of the residual at the end: how large, where on the body, in which frames, which way, and what it goes with."""
+    """The remaining residual: its size, place, frames, direction, and correlations."""
 
     rms_m: Number = NAN
     marker_rms_m: Mapping[str, Number] = field(default_factory=dict)
@@ -226,79 +226,79 @@ class Left:
     worst_frame: FrameError = field(default_factory=FrameError)
     worst_frames: tuple[FrameError, ...] = ()
     half_in_frames: Number = NAN
-    """Share of the frames, the worst first, that hold half of the mean square."""
+    """Share of the frames, the worst first, that contribute half of the mean square."""
     goes_with: tuple[Correlation, ...] = ()
     held_out: bool = False
-    """Whether it is that of held-out data, which alone show it."""
+    """Whether it is the residual of the held-out data, because only these show it."""
     structure: Structure = field(default_factory=Structure)
     explained_share: Number = NAN
-    """Share of the mean square beyond the noise that the effects took away."""
+    """Share of the mean square beyond the noise that the effects removed."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ModelError:
-    """What the held-out error consists of: the model's own error is what is left beyond noise, placements and discretisation, in squares.
+    """The parts of the held-out error. The squared model error is the squared residual minus those of noise, marker placement and discretisation.
 
-    Root mean squares [m] over all axes of a marker; where there are only clouds, along their normals.
+    Root mean squares [m] over all axes of a marker; with clouds only, along their normals.
     """
 
     fitted_m: Number = NAN
-    """The model's own error where it is fitted, with all that was found."""
+    """Model error of the fitted data, with all effects that were found."""
     held_out_m: Number = NAN
-    """That of the model that is handed back, on held-out data."""
+    """Model error of the returned model on held-out data."""
     noise_m: Number = NAN
-    """What a point repeats to."""
+    """Repeatability of a point."""
     noise_is_measured: bool = True
-    """Whether that is declared or measured, not assumed."""
+    """Whether it is declared or measured, and not assumed."""
     noise_source: str = ""
-    """Where it comes from, in words."""
+    """Where the noise is taken from, in words."""
     placement_m: Number = NAN
-    """How far markers are likely to sit from where they are declared."""
+    """Standard deviation of the declared marker positions."""
     discretisation_m: float | None = None
-    """Discretisation error; None where it is not known."""
+    """Discretisation error; None if unknown."""
     discretisation_note: str = ""
-    """Why it is not known; empty where it is."""
+    """Why it is unknown; empty if it is known."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CorrectionRecord:
-    """An empirical correction: how far markers are from the model as a function of the inputs. It is no cause."""
+    """An empirical correction: the residual of the markers as a function of the inputs. It is not a cause."""
 
     accepted: bool = False
-    """Whether held-out markers are predicted better with it."""
+    """Whether it significantly improves the prediction of held-out markers."""
     verdict: str = ""
-    """Why, in words."""
+    """The reason, in words."""
     validation_rms_before_m: float | None = None
-    """Error of the markers on held-out data without it [m]."""
+    """Held-out error of the markers without it [m]."""
     validation_rms_after_m: float | None = None
-    """The same with it [m]."""
+    """Held-out error with it [m]."""
     largest_input: float | None = None
-    """Largest input of held-out data, in its range where the correction was learned."""
+    """Largest held-out input, relative to the largest fitted one."""
     kernel: str | None = None
     length: float | None = None
-    """Of the kernel, in ranges of an input."""
+    """Correlation length of the kernel, in ranges of an input."""
     terms: int | None = None
     noise_m: float | None = None
-    """What it leaves of a marker along each axis where it is fitted [m]."""
+    """Residual of a marker along each axis in the fitted data [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CloudCard:
-    """What was used of clouds."""
+    """The cloud data that were fitted."""
 
     frames: tuple[int, ...] = ()
-    """Frames of each recording."""
+    """Number of frames of each recording."""
     rows: tuple[int, ...] = ()
-    """Rows of each recording."""
+    """Number of rows of each recording."""
     points_m: Mapping[str, Triple] = field(default_factory=dict)
-    """Name of a point of the surface → its place at rest [m], (3,)."""
+    """Name of a surface point → its place at rest [m], (3,)."""
     noise_components_m: Mapping[str, Number] = field(default_factory=dict)
     noise_m: Number = NAN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Outlier:
-    """A marker in a frame that is left out."""
+    """A marker in a frame that was left out."""
 
     frame: int
     marker: str = ""
@@ -306,7 +306,7 @@ class Outlier:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DataCard:
-    """What the data are and how they were split."""
+    """The data and how they were split."""
 
     recordings: tuple[str | None, ...] = ()
     split: tuple[str, ...] = ()
@@ -319,26 +319,26 @@ class DataCard:
     noise_components_m: Mapping[str, Number] = field(default_factory=dict)
     noise_source: str = ""
     mesh_error_m: float | None = None
-    """Discretisation error [m], root mean square; None where it is not known."""
+    """Discretisation error [m], root mean square; None if it is unknown."""
     outliers: tuple[Outlier, ...] = ()
     effective_observations: Number = NAN
     nuisance_after: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
-    """What calibration moves → its values beside all effects."""
+    """Nuisance effect → its values in the final model."""
     placement_std_m: Number = NAN
-    """How well markers are placed [m]."""
+    """Standard deviation of the declared marker positions [m]."""
     seed: int | None = field(default=None, metadata=LEFT_OUT)
-    """Of the random numbers."""
+    """Seed of the random numbers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AllRecordings:
-    """What all recordings say of a model that was sought in some of them: errors of the markers, root mean squares [m]."""
+    """Results in all recordings of a model that was searched for in some: rms errors of the markers [m]."""
 
     recordings: int = 0
     searched: int = 0
-    """Recordings in which effects were sought."""
+    """Number of recordings that were searched."""
     before_train_rms_m: Number = NAN
-    """Of the declared model, the camera of each recording calibrated."""
+    """Of the declared model, with calibrated cameras."""
     before_validation_rms_m: Number = NAN
     """On held-out sweeps."""
     after_train_rms_m: Number = NAN
@@ -358,7 +358,7 @@ class Residuals(Columns):
     before_m: tuple[Triple, ...] = ()
     """Of the declared model, calibrated [m], (k, 3)."""
     after_m: tuple[Triple, ...] = ()
-    """Of the model that is handed back [m], (k, 3)."""
+    """Of the returned model [m], (k, 3)."""
 
     def known(self) -> Residuals:
         """Return the rows that are finite before and after."""
@@ -368,7 +368,7 @@ class Residuals(Columns):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class InputFile:
-    """A robot or a recording that a result was made from."""
+    """A robot or a recording that a result was computed from."""
 
     name: str | None = None
     path: str | None = None
@@ -377,7 +377,7 @@ class InputFile:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopInputs:
-    """What a loop was made from."""
+    """The inputs of a loop."""
 
     robot: InputFile = field(default_factory=InputFile)
     recordings: tuple[InputFile, ...] = ()

@@ -1,7 +1,7 @@
-"""Between the types of a result and the plain tables of loop.json.
+"""Conversion between the types of a result and the plain tables of loop.json.
 
-A type is declared once: `table_of` writes it, `read_table` reads it. A number that is not known is NaN in a type and null in a
-file. What a file does not hold keeps its default, and keys that no type has are left alone: files of other versions can be read.
+A type is declared once: `table_of` writes it, `femsense.io.tables.validated` reads it. An unknown number is NaN in a type and null in a
+file. A missing key takes its default and an unknown key is ignored, so that files of other versions can be read.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from pydantic import BeforeValidator, Field
 NONE_AS = "none_as"
 ABSENT = object()
 LEFT_OUT = {NONE_AS: ABSENT}
-"""Metadata of a field that is no key of the table where it is None …"""
+"""Metadata of a field that is left out of the table if it is None …"""
 AS_EMPTY = {NONE_AS: dict[str, Any]()}
-"""… and of one that is an empty table then."""
+"""… and of one that becomes an empty table then."""
 NAN = float("nan")
 Number = Annotated[float, BeforeValidator(lambda value: NAN if value is None else value)]
-"""NaN where it is not known."""
+"""NaN if unknown."""
 Vector = tuple[Number, ...]
 Triple = Annotated[Vector, Field(min_length=3, max_length=3)]
 
@@ -31,14 +31,14 @@ class Columns:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        """Raise ValueError where columns differ in length."""
+        """Raise ValueError if columns differ in length."""
         columns = (getattr(self, f.name) for f in fields(self) if f.name != "direction")  # type: ignore[arg-type]
         if len({len(column) for column in columns if isinstance(column, tuple)}) > 1:
             raise ValueError("the columns differ in length")
 
 
 def table_of(value: Any, *, without: Sequence[str] = ()) -> Any:
-    """Return dataclasses as tables under the names of their fields, but for some, tuples as lists; all else as it is."""
+    """Return dataclasses as tables named by their fields, except `without`, tuples as lists; other values unchanged."""
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: _own(f, getattr(value, f.name)) for f in fields(value) if f.name not in without}
         return {name: table_of(item) for name, item in own.items() if item is not ABSENT}
@@ -48,5 +48,5 @@ def table_of(value: Any, *, without: Sequence[str] = ()) -> Any:
 
 
 def _own(f: Any, value: Any) -> Any:
-    """Return what a field says in the table: itself, or what stands for None."""
+    """Return the table entry of a field, with the substitute for None."""
     return f.metadata.get(NONE_AS) if value is None else value

@@ -1,4 +1,4 @@
-"""The acceptance test: what decides that a refitted effect is added to the model."""
+"""The acceptance test of a refitted effect."""
 
 from __future__ import annotations
 
@@ -31,27 +31,41 @@ def acceptance_test(
     record: RefitRecord,
     noise: Noise,
 ) -> Refit:
-    """Return a refit with its evidence and its verdict: PASSES, or what speaks against it."""
-    decides = data.thresholds
+    """Return a refit with its evidence and its verdict: PASSES, or the first criterion that fails.
+
+    With g the evidence (decrease of χ², `refit.evidence`), c the BIC penalty, π the prior cost and h the decrease of held-out χ², an effect passes if
+
+        g − c − π > evidence,    its parameters are identifiable and inside their bounds,
+        the log predictive density of left-out sweeps rises by more than `sweeps_for` standard errors,
+        h ≥ min(held_gain · g · n_held / n_fitted,  s − 2 z √s),    g − c − π + h > evidence,
+        it moves the markers by at least `above_mesh` times the discretisation error, and the unweighted rms does not grow (`plainly_worse`).
+
+    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. Names in code style are fields of `Thresholds`.
+    """
+    thresholds = data.thresholds
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
-    # what `held` is on average for the true effect, with a variance of four times that
+    # for a true effect `held` has mean `acts` and variance 4 · acts
     acts = held_shift(data, fitted, made, noise)
-    wanted = min(decides.held_gain * gain * held_share(data), acts - 2.0 * decides.significant * float(np.sqrt(acts)))
+    wanted = min(thresholds.held_gain * gain * held_share(data), acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    fit_objection = _objection(made, candidate, score, decides)
-    if fit_objection is None and np.isfinite(std_error) and better <= decides.sweeps_for * std_error:
-        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
+    fit_objection = _objection(made, candidate, score, thresholds)
+    if fit_objection is None and np.isfinite(std_error) and better <= thresholds.sweeps_for * std_error:
+        fit_objection = f"left-out sweeps are not predicted better (log density {better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
-        fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
-    if fit_objection is None and score + held <= decides.evidence:  # what was not fitted speaks against it
-        fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
-    if fit_objection is None and moved < decides.above_mesh * mesh:
-        fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and plainly_worse(fitted, made, decides):
-        fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
+        fit_objection = (
+            f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} in the fitted data)"
+        )
+    if fit_objection is None and score + held <= thresholds.evidence:  # held-out data weaken the evidence
+        fit_objection = f"too little evidence (dBIC {score:.1f}) with the held-out data (χ² {_moves(held)} there)"
+    if fit_objection is None and moved < thresholds.above_mesh * mesh:
+        fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm; the discretisation error is {1e3 * mesh:.3f} mm"
+    if fit_objection is None and plainly_worse(fitted, made, thresholds):
+        fit_objection = (
+            f"the unweighted error of the fitted data grows (from {1e3 * fitted.fit.rms:.3f} to {1e3 * made.fit.rms:.3f} mm)"
+        )
     record = replace(
         record,
         verdict=fit_objection or PASSES,
@@ -63,7 +77,7 @@ def acceptance_test(
         held_dchi2=held,
         moved_m=moved,
         mesh_cost_m=mesh,
-        takes_over=_taken_over(fitted, made, decides),
+        takes_over=_taken_over(fitted, made, thresholds),
     )
     return Refit(candidate, made, score, record)
 
@@ -72,48 +86,48 @@ def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def plainly_worse(before: FittedModel, after: FittedModel, decides: Thresholds) -> bool:
-    """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
-    return after.fit.rms > decides.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
+def plainly_worse(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> bool:
+    """Return whether an effect enlarges the unweighted rms of the fitted data beyond `plainly_worse` and does not reduce the held-out error."""
+    return after.fit.rms > thresholds.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
 
 
 def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
-    """Return −2 log of how likely the fitted values of an effect are beforehand."""
+    """Return −2 log of the prior density of the fitted values of an effect."""
     return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
 
 
-def surely_predicts(refitted: Refit) -> float:
-    """Return the gain on left-out sweeps less its standard error, where that is known."""
+def cv_lower_bound(refitted: Refit) -> float:
+    """Return the cross-validation gain minus its standard error, if that is known."""
     gain, std = refitted.record.cv_gain, refitted.record.cv_std
     assert gain is not None and std is not None
     return gain - (std if np.isfinite(std) else 0.0)
 
 
-def _taken_over(before: FittedModel, after: FittedModel, decides: Thresholds) -> tuple[str, ...]:
-    """Return the nuisances that are significant before an effect is added, and not after."""
-    return tuple(n for n in NUISANCE if _z(before, n) > decides.significant > _z(after, n))
+def _taken_over(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> tuple[str, ...]:
+    """Return the nuisance effects that are significant before an effect is added, and not after."""
+    return tuple(n for n in NUISANCE if _z(before, n) > thresholds.significant > _z(after, n))
 
 
 def _z(fitted: FittedModel, name: str) -> float:
-    """Return by how many standard deviations the values of a nuisance differ from none, at most."""
+    """Return the largest |value| / σ of a nuisance effect."""
     part = span_of(fitted.fit, name)
     return float(np.max(np.abs(fitted.fit.coordinates[part]) / np.maximum(fitted.fit.std[part], 1e-300), initial=0.0))
 
 
 def held_share(data: Data) -> float:
-    """Return held-out rows for each fitted one."""
+    """Return the number of held-out rows per fitted row."""
     return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
 
 
 def moved_by(before: FittedModel, after: FittedModel) -> float:
-    """Return by how much an effect moves the markers beyond what calibration does [m], root mean square."""
+    """Return the rms displacement of the markers by an effect, calibration refitted [m]."""
     return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
 
 
 def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) -> float:
-    """Return the discretisation error beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
+    """Return the rms discretisation error after calibration is projected out [m], as defined by `rms_of`; 0 if it is unknown.
 
-    Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
+    With several sweeps, unless `whole`, the share common to all sweeps is projected out too, and the rotations and additions per sweep remain.
     """
     errors = mesh_errors(data)
     J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(fitted.fit.jets, errors)]
@@ -124,26 +138,26 @@ def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) 
     return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
 
 
-def _objection(made: FittedModel, candidate: Candidate, score: float, decides: Thresholds) -> str | None:
-    """Return why an effect is not accepted, or None."""
+def _objection(made: FittedModel, candidate: Candidate, score: float, thresholds: Thresholds) -> str | None:
+    """Return the criterion of evidence, identifiability or bounds that a fit violates, or None."""
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
-    if score <= decides.evidence and made.fit.fit.status == STOPPED_EARLY:
+    if score <= thresholds.evidence and made.fit.fit.status == STOPPED_EARLY:
         return "stopped early: the predicted gain of a step was too small"
-    if score <= decides.evidence:
+    if score <= thresholds.evidence:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():
         return "not identifiable: the data leave a parameter open"
     edge = at_edge(made.fit)
     if candidate.effect.name in edge:
-        return "acts like it, but its value lies at the edge of what is plausible"
+        return "fits, but its value lies at the bound of the plausible range"
     if edge:
-        return f"with it {edge[0]} goes to the edge of what is plausible"
+        return f"with it {edge[0]} reaches the bound of its plausible range"
     return None
 
 
 def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
-    """Return the effects, or the nuisances, with a value at the edge of what is plausible (a law's limit may be none at all)."""
+    """Return the effects, or the nuisances, with a value at a bound of its plausible range (a discrete alternative may take its lower one)."""
     names = []
     for effect, _, parameters, span in terms_of(fit):
         values = fit.coordinates[span]

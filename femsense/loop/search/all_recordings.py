@@ -1,10 +1,10 @@
-"""Many recordings: effects are sought in some of them, fitted to all, and screened again in all.
+"""Many recordings: effects are searched for in some of them, fitted to all, and screened again in all.
 
 A joint fit holds the states and the derivatives of all its recordings, and its Jacobian has columns for the camera of each: memory grows with the
-square of their number. So effects are sought in `Effort.recordings` of them, which differ as much as they can. The model that is found is then
-fitted to all by Gauss–Newton steps in the shared parameters: each of the other recordings is looked at by itself, gives its normal equations with its
-own parameters eliminated (`femsense.loop.fit.normal_equations`), and is forgotten. Their sum enters the joint fit as rows of it, which is that of
-all recordings once the steps have come to their end. An effect without evidence in all of them is taken out, and every other effect is screened by the
+square of their number. Effects are therefore searched for in `Effort.recordings` recordings, chosen as different as possible. The resulting model is
+fitted to all recordings by Gauss–Newton steps in the shared parameters: each other recording is processed alone, contributes its normal equations
+with its own parameters eliminated (`femsense.loop.fit.normal_equations`), and is released. Their sum enters the joint fit as rows of it; at
+convergence this is the joint fit of all recordings. An effect without evidence in all of them is removed, and every other effect is screened with the
 same sums.
 """
 
@@ -49,20 +49,20 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_points
 
 MOST_STEPS = 4
-"""Gauss–Newton steps over all recordings."""
+"""Maximum number of Gauss–Newton steps over all recordings."""
 KEY = 6
-"""Bytes of the name of a candidate."""
+"""Length of a candidate's key [bytes]."""
 STILL = 0.1
-"""They end where no shared parameter moves by more than this share of its standard error."""
+"""The steps end if no shared parameter moves by more than this share of its standard error."""
 
 
 Spread = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[Any]]
-"""Yields function(*task) of each task, in order, wherever it runs: `femsense.many.engines.spread` of an engine."""
+"""Yields function(*task) for each task, in order: `femsense.many.engines.spread` of an engine."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Question:
-    """What every recording is asked: its normal equations at a model, and those of the effects that this lacks."""
+    """The request to every recording: its normal equations at a model, and those of the effects that the model lacks."""
 
     declared: Robot
     hypothesis: Hypothesis
@@ -71,11 +71,11 @@ class Question:
     noise: Noise
     placement_std: float
     mesh_moves: Sampled | None
-    """By how much a finer mesh moves the markers; None: not known."""
+    """Displacement of the markers by a finer mesh; None: unknown."""
     mesh_as_shown: bool
     """As of `Data`."""
     names: tuple[str, ...]
-    """Effects that are screened; none: only the normal equations are wanted."""
+    """Effects to screen; empty: only the normal equations are needed."""
     thresholds: Thresholds
 
 
@@ -83,9 +83,9 @@ class Question:
 
 
 def recordings_to_search(recordings: Sequence[Recording], most: int) -> tuple[list[Recording], list[Recording]]:
-    """Return at most so many recordings, which differ in their inputs and loads as much as they can, and the others, both in order.
+    """Return at most `most` recordings with inputs and loads as different as possible, and the others, both in order.
 
-    All are searched where values of several sessions would be fitted apart, and where one has no markers: its surface depends on the model.
+    All are searched if there are several sessions, whose values are fitted separately, or if one has no markers: its surface rows depend on the model.
     """
     sessions = len({r.session for r in recordings})
     if len(recordings) <= most or sessions > 1 or not all(len(r.marker_frame) for r in recordings):
@@ -96,7 +96,7 @@ def recordings_to_search(recordings: Sequence[Recording], most: int) -> tuple[li
     ends = np.array([[table.min(axis=0), table.max(axis=0)] for table in tables]).reshape(len(tables), -1)
     unit = np.maximum(np.ptp(ends, axis=0), 1e-12)
     chosen = {int(i) for i in spread_points(ends / unit, most)}
-    chosen |= set([i for i in range(len(tables)) if i not in chosen][: most - len(chosen)])  # where several are alike
+    chosen |= set([i for i in range(len(tables)) if i not in chosen][: most - len(chosen)])  # fill up if several are identical
     return [r for i, r in enumerate(recordings) if i in chosen], [r for i, r in enumerate(recordings) if i not in chosen]
 
 
@@ -104,12 +104,12 @@ def recordings_to_search(recordings: Sequence[Recording], most: int) -> tuple[li
 
 
 def normal_equations(question: Question, recording: Recording, forms: Sequence[Effect] = FORMS) -> NormalEquations:
-    """Return the normal equations of a recording at a model, its own parameters fitted. Raises DataError, which names the recording."""
+    """Return the normal equations of a recording at a model, its own parameters fitted. Raises DataError that names the recording."""
     try:
         return _normal_equations(question, recording, forms)
     except FemsenseError as error:
         raise DataError(
-            f"{recording.folder or 'a recording'}: {error}; leave it out, or look at it with femsense calibrate"
+            f"{recording.folder or 'a recording'}: {error}; leave it out, or check it with femsense calibrate"
         ) from error
 
 
@@ -146,7 +146,7 @@ def _normal_equations(question: Question, recording: Recording, forms: Sequence[
     problem = problem_of(data, fit, question.noise)
     r, jacobian = problem.rows_of(fit.jets, fit.fit.theta, True)
     assert jacobian is not None
-    J, r = jacobian[:rows], r[:rows]  # what is known of β beforehand counts once
+    J, r = jacobian[:rows], r[:rows]  # the prior of β counts once, in the joint fit
     Q = basis_of(J[:, : fit.own])[0]
     B, r = _beside(Q, J[:, fit.own :]), _beside(Q, r)
     blocks = dict[str, Block]()
@@ -173,7 +173,7 @@ def _squares(data: Data, fitted: FittedModel) -> Squares:
 
 
 def _key(one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> str:
-    """Return the short name that a candidate has in all recordings."""
+    """Return the key of a candidate, the same in all recordings."""
     effect, seed, parameters = one
     whole = json_text(
         [effect.name, effect.discrete, plain(seed), [[p.key, str(p.part), p.scale] for p in parameters]], indent=None
@@ -189,17 +189,17 @@ Ask = Callable[[Question, Sequence[Recording]], Iterator[NormalEquations]]
 
 
 def asked_here(forms: Sequence[Effect]) -> Ask:
-    """Return what asks one recording after the other, in this process."""
+    """Return a function that processes one recording after the other, in this process."""
     return lambda question, recordings: (normal_equations(question, r, forms) for r in recordings)
 
 
 def asked_elsewhere(spread: Spread, forms: Sequence[Effect], own: Sequence[str | Path], folder: Path) -> Ask:
-    """Return what asks recordings wherever `spread` does: a task is the path of a recording, and that of a file with the question.
+    """Return a function that processes recordings by `spread`: a task is the path of a recording and of a file with the question.
 
     Arguments:
         spread: runs the tasks.
         forms: of all effects; `own`: files of a user's effects among them.
-        folder: where the file stands meanwhile; workers on other machines have to see it.
+        folder: for that file; workers on other machines must see it.
     """
 
     def ask(question: Question, recordings: Sequence[Recording]) -> Iterator[NormalEquations]:
@@ -230,25 +230,25 @@ def _question(file: str, digest: str, own: tuple[str, ...]) -> tuple[Question, t
     forms = (*FORMS, *(load_own_effect(path) for path in own))
     question = Checkpoint((file, {}), forms).kept(Question)
     if question is None or file_hash(file) != digest:
-        raise DataError(f"{file} cannot be read: do the workers run the same femsense, and see the same files?")
+        raise DataError(f"{file} cannot be read: check that the workers run the same femsense version and see the same files")
     return question, forms
 
 
 def in_all_recordings(
-    data: Data, search: Search, others: Sequence[Recording], names: Sequence[str], ask: Ask, say: Progress
+    data: Data, search: Search, others: Sequence[Recording], names: Sequence[str], ask: Ask, progress: Progress
 ) -> Search:
-    """Return a search whose last model is fitted to all recordings, less the effects that have no evidence there.
+    """Return a search whose last model is fitted to all recordings, without the effects that have no evidence there.
 
     Arguments:
-        data: the recordings that were searched; `others`: all other ones.
-        search: what was found there.
+        data: the searched recordings; `others`: all other ones.
+        search: in these.
         names: effects that are tried.
-        ask: asks the others.
-        say: told what is going on.
+        ask: returns the normal equations of the others.
+        progress: called with the name of each step.
     """
     fitted, noise = search.final, search.noise
     for step in range(MOST_STEPS):
-        say(f"fitting to all {len(others) + len(data.train)} recordings (step {step + 1})")
+        progress(f"fitting to all {len(others) + len(data.train)} recordings (step {step + 1})")
         total = reduce(add, ask(_question_of(data, fitted, noise, ()), others))
         made = _with_others(data, fitted, noise, total)
         moved = np.abs(made.fit.coordinates - fitted.fit.coordinates) / np.maximum(made.fit.std, 1e-300)
@@ -256,7 +256,7 @@ def in_all_recordings(
         if moved.max(initial=0.0) < STILL:
             break
     fitted, dropped = _with_evidence(data, fitted, search, noise)
-    say("screening effects in all recordings")
+    progress("screening effects in all recordings")
     screened = [n for n in names if n not in NUISANCE]
     here = [t.scene.recording for t in data.train]
     question = _question_of(data, fitted, noise, screened)
@@ -286,16 +286,16 @@ def _question_of(data: Data, fitted: FittedModel, noise: Noise, names: Sequence[
 
 
 def _with_others(data: Data, fitted: FittedModel, noise: Noise, total: NormalEquations) -> FittedModel:
-    """Return a model fitted with the normal equations of other recordings at where it is. Raises DataError."""
+    """Return a model fitted together with the normal equations of other recordings at its current values. Raises DataError."""
     prior = replace(fitted.fit.prior, others=total.rows(fitted.fit.coordinates))
     return fit_model(data, fitted.fit.hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
 
 
 def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise) -> tuple[FittedModel, dict[str, str]]:
-    """Return a model less the effects, the last one first, that have no evidence in all recordings, and the verdict on these."""
+    """Return a model without the effects that have no evidence in all recordings, tested from the last one on, and the verdicts on these."""
     verdicts = dict[str, str]()
     for name in reversed([effect.name for effect, _, _ in fitted.fit.hypothesis.terms if effect.name not in NUISANCE]):
-        with contextlib.suppress(FemsenseError):  # without it there is no equilibrium
+        with contextlib.suppress(FemsenseError):  # no equilibrium without it: it stays
             without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
             cost = next((c.cost for c in (*search.last, *search.first) if c.effect.name == name), 0.0)
             gain = without.fit.chi2 - fitted.fit.chi2

@@ -1,4 +1,4 @@
-"""Calibration of a model within the loop: on the declared robot, with all that it may move, and again as rows, weights and models change."""
+"""Calibration within the loop: of the declared robot with all nuisance parameters, and again when rows, weights or the model change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
-from femsense.loop.fit.joint_fit import FitHow, Prior
+from femsense.loop.fit.joint_fit import FitOptions, Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import UNTOLD, Noise
 from femsense.loop.search.search_state import Progress
@@ -24,25 +24,25 @@ from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
 
 START = Noise({"white": UNTOLD}, "start")
-"""The noise until it is estimated."""
+"""The noise before it is estimated."""
 STEPS = 12
-"""Steps of a fit with the noise that was told, at most: to the end or, on large meshes, to where what is left to gain is spared."""
+"""Maximum number of steps of a fit with an estimated noise; large meshes stop earlier, when the predicted gain is small."""
 Ready = tuple[Data, FittedModel, History]
-"""Data, the declared model with its camera calibrated, and the models that effects are sought on top of."""
+"""Data, the declared model with its camera calibrated, and the models that the search extends."""
 
 
-def calibrated(data: Data, say: Progress) -> Ready:
-    """Return the data without outliers, the declared model calibrated, and the model with all that calibration may move; before that the same on the
-    declared mesh, where it is another one."""
+def calibrated(data: Data, progress: Progress) -> Ready:
+    """Return the data without outliers, the declared model with its camera calibrated, and the fully calibrated model; preceded by the same on the
+    declared mesh if the search uses another one."""
     placed = calibrated_pose(data, data.robot, START)
     while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
         data, placed = fewer, calibrated_pose(fewer, data.robot, START)
-    say("fitting what calibration may move")
+    progress("fitting the nuisance parameters")
     base = calibrated_on(data, data.robot, placed)
     if "clouds" in data.measured:
-        say("matching the clouds again")
+        progress("recomputing the rows of the clouds")
         rough = base.fit.normal_rms
-        data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), anew=True)
+        data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), reselect=True)
         placed = calibrated_pose(data, data.robot, START, placed)
     if not data.settled:
         return data, placed, [("", base)]
@@ -52,15 +52,15 @@ def calibrated(data: Data, say: Progress) -> Ready:
 
 
 def calibrated_pose(data: Data, robot: Robot, noise: Noise, start: FittedModel | None = None) -> FittedModel:
-    """Return a robot with its camera calibrated."""
+    """Return a robot with its camera poses and initial inputs calibrated."""
     nothing = Prior(np.zeros(0), np.zeros(0))
     own = None if start is None else own_of(start)
     return fit_model(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
 
 
 def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
-    """Return a robot with all that calibration may move, fitted roughly. To begin with some of the states leads elsewhere: what the model lacks pulls
-    offsets and modulus further where fewer states hold them."""
+    """Return a robot with all nuisance parameters fitted, in a few steps, to all states. A fit to representative states would end elsewhere: with
+    fewer states the missing effects bias offsets and modulus more."""
     hypothesis, prior = with_nuisance(data, robot)
     nothing = np.zeros(len(prior.mean))
     return as_far_as_held_out_states_converge(
@@ -68,10 +68,10 @@ def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
     )
 
 
-def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
-    """Return the data with the discretisation error, and placements that turn with the body."""
-    say("estimating the discretisation error")
-    try:  # offsets may have gone far, for an effect's sake
+def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], progress: Progress) -> Data:
+    """Return the data with the discretisation error, and with marker placements that rotate with the body."""
+    progress("estimating the discretisation error")
+    try:  # the offsets of `base` may be biased by a missing effect, so only the modulus is kept
         frames = [representative_frames(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:
@@ -80,32 +80,31 @@ def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str
 
 
 def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps: int) -> FittedModel:
-    """Return a fit of so many steps, or of fewer where a held-out state collapses beyond: what calibration may move is no reason to fail, since it
-    may go far for the sake of an effect that is not found yet. Raises DataError where the start has no equilibrium either."""
+    """Return a fit with `steps` steps, or with fewer if a held-out state collapses: nuisance parameters can be biased by a missing effect, which
+    must not end the search. Raises DataError if the start has no equilibrium either."""
     for most in (steps, 2, 1):
         with contextlib.suppress(DataError):
             return fit(most)
     return fit(0)
 
 
-def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
-    """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again
-    until neither changes much: what is rounded off where the model was draws it back there.
-    With `anew` it is asked again which rows there are."""
+def matched(data: Data, fitted: FittedModel, noise: Noise, *, reselect: bool = False) -> tuple[Data, FittedModel]:
+    """Return the data with cloud rows recomputed in the fitted states, and the model fitted to these; repeated until χ² hardly changes, because the
+    rounding computed in the previous state pulls the fit back towards it. With `reselect` the rows are selected again too."""
     for _ in range(data.effort.matchings):
-        data = rematched(data, fitted, noise, anew=anew)
-        fitted = fitted_again(data, fitted, noise, near=None if anew else fitted.fit.jets)
+        data = rematched(data, fitted, noise, reselect=reselect)
+        fitted = fitted_again(data, fitted, noise, near=None if reselect else fitted.fit.jets)
         if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= data.thresholds.evidence / 2.0:
             break
     return data, fitted
 
 
-def fitted_again(data: Data, fitted: FittedModel, noise: Noise, **how: Unpack[FitHow]) -> FittedModel:
-    """Return a fitted model fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
-    fit, how["own"] = fitted.fit, own_of(fitted)
+def fitted_again(data: Data, fitted: FittedModel, noise: Noise, **options: Unpack[FitOptions]) -> FittedModel:
+    """Return a model refitted to other weights or rows, starting from its current values; derivatives known there, or close by, are reused."""
+    fit, options["own"] = fitted.fit, own_of(fitted)
 
     def refitted(steps: int) -> FittedModel:
-        how["max_iterations"] = steps
-        return fit_model(data, fit.hypothesis, fit.prior, noise, fit.coordinates, **how)
+        options["max_iterations"] = steps
+        return fit_model(data, fit.hypothesis, fit.prior, noise, fit.coordinates, **options)
 
     return as_far_as_held_out_states_converge(refitted, STEPS)

@@ -1,4 +1,4 @@
-"""What effects do to the markers at a fitted model, to first order."""
+"""Fields of effects: the displacement of the markers to first order, at a fitted model."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.robot import Robot
 
 Answers = dict[int, AtPoints]
-"""Frame → what the points of its state answer to."""
+"""Frame → the linear response of the points of its state."""
 
 
 def candidates_for(
     base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_placements: bool
 ) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
-    """Return the effects and seeds to try on top of a fitted model."""
+    """Return the effects and seeds to try in addition to a fitted model."""
     present = set(base.hypothesis.names)
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
@@ -45,7 +45,7 @@ def candidates_for(
 
 
 def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
-    """Return the parameters of each recording, cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
+    """Return the parameters grouped by recording, cable or marker, or by key: an effect may act on one of them only."""
     parts: dict[str, list[Parameter]] = {}
     for p in parameters:
         owner = p.part.recording if isinstance(p.part, InRecording) else p.part[0] if isinstance(p.part, tuple) else p.part
@@ -55,22 +55,22 @@ def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fields:
-    """What effects do to the markers at a fitted model, to first order."""
+    """Displacements of the markers by effects to first order, at a fitted model."""
 
     todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
-    """The effects and seeds that can be evaluated."""
+    """The effects and seeds that can be evaluated, with their parameters."""
     raw: list[FloatArray]
-    """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
+    """Columns [m], one array (k, c, Σq) per trial; a discrete alternative has one column, its full change."""
     rest: list[FloatArray]
-    """The same of the places that rest.csv measures [m], (r, 3, Σq) a trial."""
+    """Columns of the places measured by rest.csv [m], (r, 3, Σq) per trial."""
     model: Hypothesis
-    """The fitted model."""
+    """The model at which the fields are computed."""
 
     def beside(self, fit: JointFit) -> Fields | None:
-        """Return the fields of what a model with more effects does not have yet, or None where they say little of it: it lies on another mesh,
-        has another law, or lacks an effect of this one.
+        """Return the fields of the effects that a larger model still lacks, or None if they do not apply to it: another mesh or law, or a model without one
+        of this model's effects.
 
-        What an effect does to the markers changes little with what else the body has (`benchmarks/hints.py`).
+        The field of an effect changes little with the other effects of the body (`benchmarks/hints.py`).
         """
         new = fit.hypothesis
         if new.settled != self.model.settled or not set(self.model.names) <= set(new.names):
@@ -82,13 +82,13 @@ class Fields:
         return Fields([self.todo[i] for i in keep], raw, rest, self.model)
 
     def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return the columns of one effect in markers and placements, one array (k, c, q) and (r, 3, q) a trial."""
+        """Return the columns of one effect in markers and placements, one array (k, c, q) and (r, 3, q) per trial."""
         spans = self._spans()
         part = slice(spans[i], spans[i + 1])
         return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
 
     def _spans(self) -> IntArray:
-        """Return where the columns of each effect begin, and where the last end."""
+        """Return the first column of each effect, and the end of the last."""
         return np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
 
 
@@ -98,8 +98,8 @@ def effect_fields(
     todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
     answers: list[Answers] | None = None,
 ) -> Fields:
-    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
-    the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a quasi-static path of its own."""
+    """Return the fields of effects: those with parameters to first order, with one factorisation per frame, or none if the `answers` of each trial are
+    known from an earlier call at this fit; discrete alternatives as their full change, each along a quasi-static path of its own."""
     fixed = base.hypothesis.robot_at(base.coordinates)
     smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
     every = Hypothesis(fixed, tuple(smooth))
@@ -138,9 +138,10 @@ def _whole_change(
     one: tuple[Effect, Entry, tuple[Parameter, ...]],
     near: list[States],
 ) -> list[FloatArray] | None:
-    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
+    """Return the change of the residual of each trial by a discrete alternative [m], (k, c); None if it has no equilibrium.
 
-    It starts from states `near`, which those of another law take the place of: laws differ less from each other than from what is declared.
+    The states `near` are warm starts, and are replaced by those of an alternative that converged: constitutive laws differ less among each other than
+    from the declared one.
     """
     parameters = one[2]
     robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
@@ -161,10 +162,10 @@ def _whole_change(
 
 
 def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
-    """Return starts for a robot with another law, or on another mesh of the same body, from states of it as it was."""
+    """Return warm starts for a robot with another law, or on another mesh of the same body, from states before the change."""
     mesh = robot.body.mesh
     starts = trial.starts_on(mesh)
-    if mesh is fixed.body.mesh:  # the factors of these states are lent
+    if mesh is fixed.body.mesh:  # reuse the factorisations of these states
         return {k: replace(s, factor=starts[k].factor) if s.factor is None and k in starts else s for k, s in states.items()}
     if not states.keys() <= starts.keys():
         ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
@@ -175,7 +176,7 @@ def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> Stat
 
 
 def fields_of(data: Data, fitted: FittedModel, names: Sequence[str]) -> Fields:
-    """Return what each effect that is not in the model yet would do to the markers."""
+    """Return the field of each effect that a fitted model lacks."""
     placed_at_rest = any(len(t.scene.rest_marker) for t in data.train)
     todo = candidates_for(
         fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=placed_at_rest

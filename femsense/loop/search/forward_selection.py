@@ -1,4 +1,4 @@
-"""Growth: refit the best candidates in full nonlinearity, accept one, polish it, and drop what is no longer needed."""
+"""Forward selection: refit the best candidates with the full nonlinear equilibrium, accept one, and improve its seed and its form."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, surely_predicts
+from femsense.loop.search.acceptance import acceptance_test, cv_lower_bound
 from femsense.loop.search.location_search import climbed, lies_on_body, located
 from femsense.loop.search.refit import evidence, refit, tried, with_term, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
@@ -28,46 +28,46 @@ from femsense.loop.thresholds import Effort, Thresholds
 
 
 def select_next(
-    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
+    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, progress: Progress
 ) -> tuple[Refit | None, list[RefitRecord]]:
-    """Return the effect that comes next, or None where nothing passes; and what became of each candidate that was refitted."""
+    """Return the effect to add, or None if none passes; and the record of each refitted candidate."""
     listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
         return None, []
-    refits, records = _refitted(data, fitted, listed, noise, say)
+    refits, records = _refitted(data, fitted, listed, noise, progress)
     if not any(r.record.passes for r in refits.values()):
-        refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
-    leading = leaders(data, fitted, refits, noise, say)
+        refits = {i: _elsewhere(data, fitted, r, noise, progress) for i, r in refits.items()}
+    leading = leaders(data, fitted, refits, noise, progress)
     if not leading:
         return None, _updated(records, refits)
-    # where evidence is close, what surely predicts better
-    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]))
-    winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
+    # the highest evidence, with a bonus for a significantly better prediction, which decides if evidence is close
+    first = max(leading, key=lambda i: leading[i].score + cv_lower_bound(leading[i]))
+    winner = _enriched(data, fitted, leading[first], table, noise, progress).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
-def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, say: Progress) -> dict[int, Refit]:
-    """Return the refits that pass and are as good as the best but for `evidence`, each with its seed improved."""
+def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, progress: Progress) -> dict[int, Refit]:
+    """Return the passing refits within `evidence` of the best one, each with its seed improved."""
     passing = {i: r for i, r in refits.items() if r.record.passes}
     best = max((r.score for r in passing.values()), default=np.inf)
     near = {i: r for i, r in passing.items() if r.score > best - data.thresholds.evidence}
-    return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say) for i, r in near.items()}
+    return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, progress) for i, r in near.items()}
 
 
 def _refitted(
-    data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, say: Progress
+    data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, progress: Progress
 ) -> tuple[dict[int, Refit], list[RefitRecord]]:
-    """Return the refits of a shortlist, and what became of each candidate that was refitted: the number of a refit is that of its record."""
+    """Return the refits of a shortlist by the number of their record, and the record of each refitted candidate."""
     refits: dict[int, Refit] = {}
     records: list[RefitRecord] = []
     evident = data.thresholds.evidence
     for candidate in listed:
         name = candidate.effect.name
-        say(f"refitting with {name}")
+        progress(f"refitting with {name}")
         record = RefitRecord(name, candidate.seed)
         others = [
             r.score for r in refits.values() if r.record.passes and r.candidate.effect.name != name
-        ]  # what bends one form bends both
+        ]  # forms of one effect share their errors, so that one must not stop another early
         wanted = max([evident, *(score - 2.0 * evident for score in others)])
         try:
             made = refit(data, fitted, candidate, noise, wanted=wanted)
@@ -80,23 +80,23 @@ def _refitted(
 
 
 def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
-    """Return records with those of refits in their places."""
+    """Return the records with those of the refits in their places."""
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
-def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
+def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, progress: Progress) -> Refit:
+    """Return a refit with evidence that fails another criterion, tested again with its seed improved: the seed may be the cause."""
     if refitted.score <= data.thresholds.evidence or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
-    better = polished(data, fitted, refitted, noise, say)
+    better = polished(data, fitted, refitted, noise, progress)
     if better.fitted is refitted.fitted:
         return better
     return acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
 
 
-def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with its seed improved, and with the scatter of its coordinates over seeds that explain as much."""
-    made, scatter = _polish(data, fitted, refitted, noise, say)
+def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, progress: Progress) -> Refit:
+    """Return a refit with an improved seed, and with the scatter of its coordinates over seeds that fit equally well."""
+    made, scatter = _polish(data, fitted, refitted, noise, progress)
     record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
         return replace(refitted, record=record)
@@ -104,19 +104,19 @@ def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say
     return replace(refitted, fitted=made, score=score, record=replace(record, dbic=score, validation_rms_m=made.held_rms))
 
 
-def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
-    """Return the winner in a form with more parameters where that has `evidence` over the simple one."""
-    winner = _with_more_markers(data, fitted, winner, table, noise, say)
+def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, progress: Progress) -> Refit:
+    """Return the best refit in a form with more parameters if that has `evidence` over the simpler one."""
+    winner = _with_more_markers(data, fitted, winner, table, noise, progress)
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
-        say(_trying(form))
+        progress(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             continue
         rich = acceptance_test(data, fitted, form, made, winner.record, noise)
         if rich.record.passes:
-            rich = polished(data, fitted, rich, noise, say)
+            rich = polished(data, fitted, rich, noise, progress)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
         if rich.record.passes and more > data.thresholds.evidence:
             winner = replace(rich, record=replace(rich.record, seed=form.seed))
@@ -124,10 +124,10 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
 
 
 def _with_more_markers(
-    data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress
+    data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, progress: Progress
 ) -> Refit:
-    """Return offsets of markers with those of further markers, one after the other, as long as each has `evidence`: all of them at once cost too much.
-    Other effects are returned as they are."""
+    """Return marker offsets extended by those of further markers, one at a time while each has `evidence`: the penalty of all at once is too large.
+    Other effects are returned unchanged."""
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
@@ -135,7 +135,7 @@ def _with_more_markers(
         if max(gains) <= data.thresholds.evidence:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
-        say(_trying(form))
+        progress(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             break
@@ -153,7 +153,7 @@ def _trying(form: Candidate) -> str:
 
 
 def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:
-    """Return the fit of a richer form of the winner, started from the winner itself where its parameters are among those of the form."""
+    """Return the fit of a richer form of an effect, started from the simpler one if the form contains its parameters."""
     settled, terms = winner.fitted.fit.hypothesis.settled, winner.fitted.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}
     if settled != fitted.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
@@ -174,9 +174,9 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
         return None
 
 
-def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.evidence))
+def shortlist(table: list[Candidate], thresholds: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
+    """Return the best candidate of each effect, in its simplest form (or forms, if several are equally simple), the best first."""
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > thresholds.evidence))
     chosen: list[Candidate] = []
     for name in names[: effort.refits if first else (effort.refits + 1) // 2]:
         forms = _forms(table, name)
@@ -185,14 +185,14 @@ def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, fi
     return sorted(chosen, key=lambda c: -c.score)
 
 
-def hinted(table: list[Candidate], decides: Thresholds, effort: Effort) -> bool:
-    """Return whether candidates by fields of the model before may be worth a refit by fields of their own, since these may predict more gain."""
-    wished = [replace(c, score=c.gain / decides.hinted - c.cost) for c in table]
-    return bool(shortlist(wished, decides, effort, first=False))
+def hinted(table: list[Candidate], thresholds: Thresholds, effort: Effort) -> bool:
+    """Return whether candidates screened with fields of the previous model may gain enough with fields of the current one."""
+    wished = [replace(c, score=c.gain / thresholds.hinted - c.cost) for c in table]
+    return bool(shortlist(wished, thresholds, effort, first=False))
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
-    """Return the best candidate of each form of an effect (one cable or marker alone is a form of its own)."""
+    """Return the best candidate of each form of an effect; one cable or marker alone is a form of its own."""
     best: dict[tuple[int, int], Candidate] = {}
     for candidate in table:
         if candidate.effect.name == name:
@@ -200,26 +200,28 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
     return list(best.values())
 
 
-# --- polishing -------------------------------------------------------------------------------------------------------------
+# --- improvement of seeds --------------------------------------------------------------------------------------------------
 
 
-def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> tuple[FittedModel, Sequence[float]]:
-    """Return the winner with its seed (place, radius, time) improved, first seeds near by, then fitted along; and the scatter over the seeds."""
+def _polish(
+    data: Data, fitted: FittedModel, winner: Refit, noise: Noise, progress: Progress
+) -> tuple[FittedModel, Sequence[float]]:
+    """Return the model with its seed (place, radius, time) improved, first among neighbouring seeds, then as fitted parameters; and the scatter over seeds."""
     best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
-        say(f"looking near by for {effect.name}")
+        progress(f"trying neighbouring seeds of {effect.name}")
         ends = climbed(data, fitted, winner.candidate, noise)
         best, scatter = located(data, fitted, winner.candidate, winner.fitted, ends, noise)
-    return (_with_seed_fitted(data, best, noise, say) if winner.candidate.parameters else best), scatter
+    return (_with_seed_fitted(data, best, noise, progress) if winner.candidate.parameters else best), scatter
 
 
-def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress) -> FittedModel:
-    """Return a model whose last effect has its seed fitted along, where that explains more and stays inside the bounds."""
+def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, progress: Progress) -> FittedModel:
+    """Return a model with the seed of its last effect fitted too, if that reduces χ² and stays inside the bounds."""
     *others, (effect, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best
-    say(f"polishing {effect.name}")
+    progress(f"fitting the seed of {effect.name}")
     hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
     null = np.array([p.null for p in more])
     prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))

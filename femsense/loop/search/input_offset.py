@@ -1,4 +1,4 @@
-"""Input offsets that moved, and whether the data need them."""
+"""Input offsets: do they differ from zero, and do the data need them?"""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from femsense.model.effects.base import range_units
 
 
 def moved_nuisance(data: Data, fitted: FittedModel, name: str) -> int:
-    """Return how many values of a nuisance the data moved significantly away from what is declared, and by more than a share of it."""
+    """Return how many values of a nuisance differ from the declared one by more than `significant` σ and by more than the share `relevant`."""
     part = span_of(fitted.fit, name)
-    values, std, decides = fitted.fit.coordinates[part], fitted.fit.std[part], data.thresholds
+    values, std, thresholds = fitted.fit.coordinates[part], fitted.fit.std[part], data.thresholds
     if not len(values):
         return 0
     parameters = next(own for effect, _, own in fitted.fit.hypothesis.terms if effect.name == name)
     size = np.abs(values) / np.maximum(range_units(parameters, data.robot.body.cable_names, data.input_scale), 1e-12)
-    return int(((np.abs(values) > decides.significant * std) & (size > decides.relevant)).sum())
+    return int(((np.abs(values) > thresholds.significant * std) & (size > thresholds.relevant)).sum())
 
 
 def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:
-    """Return the dBIC of the offsets that moved: the others, as good as declared, cost nothing."""
+    """Return the dBIC of the input offsets; only those that differ significantly from zero count as parameters."""
     moved, count = moved_nuisance(data, fitted, OFFSETS), len(data.robot.body.cables)
     return evidence(without.fit, fitted.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
 
 
 def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effective: float) -> FittedModel | None:
-    """Return the model without the offsets if it misses them, else None."""
+    """Return the model without the input offsets if the data need these, by evidence, held-out error and displacement of the markers; else None."""
     if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Places: where on the body an effect explains most, from climbs over its seeds to fits."""
+"""Location search: the place on the body at which an effect fits best, by local search over its seeds, then by fits."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from femsense.model.robot import Robot
 def located(
     data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
 ) -> tuple[FittedModel, list[float]]:
-    """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
-    and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
+    """Return the best of the fits of a candidate, from its own seed (`made`) and from the end of each local search, with its seed improved; and the scatter of
+    its parameters: the larger of that of `closer` and that over the places that fit equally well."""
     evident = data.thresholds.evidence
     others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
     tries = [tried(data, fitted, other, noise) for other in others]
@@ -42,8 +42,8 @@ def located(
 
 
 def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> list[Candidate]:
-    """Return where the best seeds come to, the best first and none of them where it starts, when each goes from neighbour to
-    neighbour: a soft place here and a stiff one there look alike when the modulus is open."""
+    """Return the ends of the local searches from the best seeds, the best first and without the starting seed. A soft place here and a stiff one there
+    can have nearly the same field if the modulus is free, so that there are several optima."""
     asked, known = list[Entry](), list[Candidate]()
     answers: list[Answers] = [{} for _ in data.train]
 
@@ -55,7 +55,7 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
     ways = sorted(others, key=lambda c: (c.seed != start.seed, -c.gain))[: data.effort.starts]
-    for _ in range(data.effort.rounds):  # all of them at once, since a factor serves for all
+    for _ in range(data.effort.rounds):  # in lockstep, because one factorisation serves all seeds
         around = [start.effect.nearby(data.robot, here.seed) for here in ways]
         at([seed for seeds in around for seed in seeds])
         best = [max([here, *at(seeds)], key=lambda c: c.gain) for here, seeds in zip(ways, around)]
@@ -72,26 +72,25 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     return apart
 
 
-def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:
-    """Return whether two places do the same for the same: a soft one here and a stiff one there may look alike, but do not say the same."""
-    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= decides.alike
+def same_place(a: Candidate, b: Candidate, thresholds: Thresholds) -> bool:
+    """Return whether two places have nearly the same field with the same sign; with opposite signs (soft here, stiff there) they are different."""
+    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= thresholds.alike
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, decides: Thresholds) -> list[float]:
-    """Return by how much the steps of those that explain nearly as much as the best beside a fit scatter."""
-    steps = [c.step for c in seen if fit.chi2 + best.gain - c.gain <= beyond(fit, decides.evidence)]
+def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, thresholds: Thresholds) -> list[float]:
+    """Return the standard deviation of the steps over the seeds that fit nearly as well as the best one."""
+    steps = [c.step for c in seen if fit.chi2 + best.gain - c.gain <= beyond(fit, thresholds.evidence)]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
 def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, list[float]]:
-    """Return a fitted model whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
-    has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
-    its parameters scatters over the seeds that explain as much but for little."""
+    """Return a fitted model whose last effect has moved to better neighbouring seeds, and the scatter of its parameters over the seeds that fit nearly as
+    well. The seeds are compared in the fitted state: fields of the state before the effect rank the neighbours of a large effect wrongly."""
     while True:
         *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
         around = _seeds_instead(data, fitted, noise, effect.nearby(data.robot, seed))
         here = next((c for c in around if c.seed == seed), None)
-        if here is None:  # it does nothing to these markers
+        if here is None:  # the effect does not move these markers
             return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
         scatter = _scatter(around, best, fitted.fit, data.thresholds)
@@ -102,19 +101,19 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
 
 
 def _seeds_instead(data: Data, fitted: FittedModel, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
-    """Return the last effect of a fitted model at other seeds as candidates in its place, to first order where the body is."""
+    """Return the last effect of a fitted model at other seeds as candidates in its place, linearised in the fitted state."""
     *_, (effect, _, parameters) = fitted.fit.hypothesis.terms
     fields = effect_fields(fitted.fit, data.train, [(effect, s, parameters) for s in seeds])
     return screen(without_last(fitted.fit), problem_of(data, fitted.fit, noise), fields, 100.0)
 
 
 def without_last(fit: JointFit) -> JointFit:
-    """Return a fit as it would be without its last effect if all were linear about where it is."""
+    """Return a fit without its last effect, to first order."""
     return without_term(fit, len(fit.hypothesis.terms) - 1)
 
 
 def without_term(fit: JointFit, i: int) -> JointFit:
-    """Return a fit as it would be without one of its terms if all were linear about where it is."""
+    """Return a fit without one of its terms, to first order."""
     terms = fit.hypothesis.terms
     at, q = sum(len(p) for _, _, p in terms[:i]), len(terms[i][2])
     columns = fit.own + np.arange(at, at + q)
@@ -125,8 +124,8 @@ def without_term(fit: JointFit, i: int) -> JointFit:
 
 
 def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) -> bool:
-    """Return whether an effect of a fitted model, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
-    bent, as `closer` asks. Of one whose seed is no place nothing is known."""
+    """Return whether another seed of an accepted effect may fit better, to first order in the fitted state, with the parameters of its place excluded.
+    True for effects without neighbouring seeds, for which nothing can be predicted."""
     fit, terms = fitted.fit, fitted.fit.hypothesis.terms
     i = [effect.name for effect, _, _ in terms].index(name)
     effect, seed, moving = terms[i]
@@ -142,7 +141,7 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
 
 
 def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:
-    """Return a fitted model with the seed of its last effect swapped for that of a candidate beside it, fitted again; None where that does not fit."""
+    """Return a fitted model with the seed of its last effect replaced by that of a candidate, refitted; None if that fails."""
     fit, q = fitted.fit, len(candidate.parameters)
     *terms, _ = fit.hypothesis.terms
     hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
@@ -164,14 +163,14 @@ def _screen_seeds(
 
 
 def lies_on_body(
-    robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, decides: Thresholds
+    robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, thresholds: Thresholds
 ) -> bool:
-    """Return whether each place among parameters lies in the body at rest, or beside it by no more than a share of its reach. A force acts the same
-    all along its line, so that a fit may take it anywhere."""
+    """Return whether each place among parameters lies in the body at rest, or outside it by at most `resolved` of its reach. Without this bound a fit may
+    place a force anywhere along its line of action."""
     places: dict[str, list[float]] = {}
     for p, v in zip(parameters, coordinates):
         if p.unit == "m" and isinstance(p.part, int):
             places.setdefault(p.key, []).append(p.value(float(v)))
     points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
-    most = decides.resolved * robot.body.reach
+    most = thresholds.resolved * robot.body.reach
     return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= most).all())

@@ -1,4 +1,4 @@
-"""Refits: a candidate fitted together with all that the model has, in full nonlinearity."""
+"""Refits: a candidate fitted jointly with the whole model, with the full nonlinear equilibrium."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
-from femsense.loop.fit.joint_fit import FitHow, JointFit, Prior
+from femsense.loop.fit.joint_fit import FitOptions, JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
 from femsense.model.drive import has_history
@@ -21,19 +21,22 @@ from femsense.model.observation import Hypothesis
 
 
 def evidence(before: JointFit, after: JointFit) -> float:
-    """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
+    """Return the evidence for a larger model: Δχ², or (n − p) Δ log χ² if that is smaller, because the scale of the noise is an estimate.
+
+    n rows, p parameters of the larger model; both are −2 log likelihood ratios, for a known and for an estimated scale.
+    """
     freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
     return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
 
 
 def within(fit: JointFit, price: float) -> float:
-    """Return the χ² below which a model with something more is better than a fit by so much evidence."""
+    """Return the χ² below which a larger model has at least the evidence `price` against a fit."""
     freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
     return min(fit.chi2 - price, fit.chi2 * float(np.exp(-price / freedom)))
 
 
 def beyond(fit: JointFit, price: float) -> float:
-    """Return the χ² beyond which a model without something is worse than a fit by so much evidence."""
+    """Return the χ² above which a smaller model loses at least the evidence `price` against a fit."""
     freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
     return fit.chi2 * float(np.exp(price / freedom)) + price
 
@@ -46,17 +49,17 @@ def refit(
     *,
     wanted: float | None = None,
 ) -> FittedModel:
-    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
+    """Joint fit with one more effect, started from its linear step. Raises DataError if no start improves the fit.
 
-    Where the dBIC would stay below what is wanted (by default `Thresholds.evidence`), the fit is stopped early on its way.
+    A fit whose dBIC would stay below `wanted` (by default `Thresholds.evidence`) is stopped early.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(fitted.fit, candidate.effect, candidate.seed, candidate.parameters)
     directed = known_length(candidate.parameters) is not None
-    free = not candidate.effect.discrete and not directed  # for these the null is no start
-    answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
+    free = not candidate.effect.discrete and not directed  # a vector of known length has no direction at zero
+    answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # change of the parameters already fitted
     worth = within(fitted.fit, candidate.cost + (data.thresholds.evidence if wanted is None else wanted))
     if adds_history(fitted.fit, candidate, start):
         worth = np.inf
@@ -68,8 +71,8 @@ def refit(
         try:
             theta = _declared(data, fitted, hypothesis, noise) if share is None else fitted.fit.fit.theta + share * answer
             coordinates = np.concatenate([theta[fitted.fit.own :], null + part * (start - null)])
-            how = FitHow(own=theta[: fitted.fit.own], max_iterations=10, known=known, near=near, worth=worth)
-            return fit_model(data, hypothesis, prior, noise, coordinates, **how)
+            options = FitOptions(own=theta[: fitted.fit.own], max_iterations=10, known=known, near=near, worth=worth)
+            return fit_model(data, hypothesis, prior, noise, coordinates, **options)
         except DataError:
             return None
 
@@ -81,29 +84,29 @@ def refit(
 
 
 def adds_history(fit: JointFit, candidate: Candidate, values: FloatArray) -> bool:
-    """Return whether a candidate with such values, shape (q,), makes states depend on those before, as none of the fit does.
+    """Return whether a candidate with values of shape (q,) makes states depend on earlier ones, unlike the fitted model.
 
-    What it explains is then told by no derivative at its null, where every segment of a cable slides: on `arm-1` of
-    `benchmarks/distinct_states.py` friction has a predicted gain of 48 in χ² and brings 945.
+    Its gain cannot be predicted by a derivative at the null, where every cable segment slides: on `arm-1` of
+    `benchmarks/distinct_states.py` friction has a predicted Δχ² of 48 and an actual one of 945.
     """
     fitted, term = fit.hypothesis.robot_at(fit.coordinates), (candidate.effect, candidate.seed, candidate.parameters)
     return has_history(Hypothesis(fitted, (term,)).robot_at(values)) and not has_history(fitted)
 
 
 def _shares(candidate: Candidate, free: bool) -> tuple[float | None, ...]:
-    """Return the shares of the linear step from which a refit may start, in order: that step may go too far. None: from what is declared, where a
-    discrete alternative does not fit from where calibration has gone without it."""
+    """Return the shares of the linear step from which a refit may start, in order, because the full step may be too long. None: from the declared
+    values, if a discrete alternative has no equilibrium at the calibrated ones."""
     if candidate.effect.discrete:
         return (1.0, None) if candidate.gain < np.inf else (None, 1.0)
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 
 def _declared(data: Data, fitted: FittedModel, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
-    """Return where an effect starts if what is fitted stays as declared: with its own poses and initial inputs."""
+    """Return the parameters of a fit of the declared model with a discrete alternative: its own poses and initial inputs, the prior mean for the rest."""
     alone = replace(hypothesis, terms=())
     for trial in data.train:
         if hypothesis.robot.body.mesh is not fitted.fit.hypothesis.robot.body.mesh:
-            trial.starts_on(hypothesis.robot.body.mesh).clear()  # states that were carried there from elsewhere may have folded
+            trial.starts_on(hypothesis.robot.body.mesh).clear()  # states interpolated from another mesh may have folded
     nothing = Prior(np.zeros(0), np.zeros(0))
     placed = fit_model(data, alone, nothing, noise, np.zeros(0), own=own_of(fitted))
     return np.concatenate([own_of(placed), fitted.fit.prior.mean])
@@ -121,7 +124,7 @@ def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Para
 
 
 def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
-    """Return the linear step; of a vector of known length its direction with that length."""
+    """Return the linear step; for a vector of known length, its direction with that length."""
     start = null + candidate.step
     vector = known_length(candidate.parameters)
     if vector is not None:
@@ -130,7 +133,7 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
 
 
 def tried(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise, wanted: float | None = None) -> FittedModel | None:
-    """Return a refit, or None where there is none."""
+    """Return a refit, or None if it fails."""
     try:
         return refit(data, fitted, candidate, noise, wanted=wanted)
     except FemsenseError:

@@ -1,8 +1,8 @@
-"""Named effects with a value for each cable or chamber, once nothing else passes.
+"""Accepted effects with one value per cable or chamber, after the search has ended.
 
-A form with one value, or with the value of one cable, costs least and is named first. What tells the values of the others
-may be covered then by what is still missing. So the richer form of each named effect is fitted again in the whole model, and
-replaces the simple one where its further parameters have evidence and held-out data are predicted no worse.
+A form with one value, or with the value of one cable, has the smallest penalty and is accepted first; missing effects can hide
+the differences between cables until then. The richer form of each accepted effect is therefore refitted in the whole model, and replaces
+the simple one if its further parameters have evidence and the held-out error does not grow.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Term = tuple[Effect, Entry, tuple[Parameter, ...]]
 
 
 def with_all_parts(
-    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, progress: Progress
 ) -> tuple[FittedModel, list[RefitRecord]]:
-    """Return the model with the richer forms that have evidence, and what became of each that was fitted."""
+    """Return the model with the richer forms that have evidence, and the record of each form that was fitted."""
     records: list[RefitRecord] = []
     for i, term in enumerate(fitted.fit.hypothesis.terms):
         for richer in _richer_terms(data, term):
-            say(f"trying {term[0].name} with {len(richer[2])} parameters")
+            progress(f"trying {term[0].name} with {len(richer[2])} parameters")
             price = (len(richer[2]) - len(term[2])) * float(np.log(n_effective)) + data.thresholds.evidence
             record = RefitRecord(term[0].name, term[1])
             try:
@@ -44,11 +44,11 @@ def with_all_parts(
             worse = made.held_rms > fitted.held_rms
             better = gain > price and not worse
             verdict = (
-                "named with a value for each"
+                "accepted with one value each"
                 if better
                 else "the values of each are not distinguished"
                 if gain <= price
-                else "values of each predict the held-out data worse"
+                else "separate values predict the held-out data worse"
             )
             score = gain - price + data.thresholds.evidence
             records.append(replace(record, verdict=verdict, dchi2=gain, dbic=score, validation_rms_m=made.held_rms))
@@ -57,7 +57,7 @@ def with_all_parts(
 
 
 def _richer_terms(data: Data, term: Term) -> Iterator[Term]:
-    """Yield the forms of a term that have a value for each part where it has one for all, or for some of them."""
+    """Yield the forms of a term with one value per part if the term has one for all parts, or for some of them."""
     effect, seed, own = term
     parts = {p.part for p in own}
     for form in FORMS:
@@ -75,7 +75,7 @@ def _richer_terms(data: Data, term: Term) -> Iterator[Term]:
 
 
 def _fitted_with(data: Data, fitted: FittedModel, i: int, richer: Term, noise: Noise, price: float) -> FittedModel:
-    """Return the model with another form of its i-th term, started from the values that it has; a part without one starts from
+    """Return the model with another form of its i-th term, started from its current values; a part without a value starts from
     their mean. Raises DataError."""
     fit, terms = fitted.fit, fitted.fit.hypothesis.terms
     first = sum(len(parameters) for _, _, parameters in terms[:i])

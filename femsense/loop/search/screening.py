@@ -1,8 +1,8 @@
-"""Screening: how much of the residual each effect explains beyond what calibration can absorb.
+"""Screening: the decrease of χ² by each effect to first order, after calibration is projected out.
 
-With z the whitened nuisance columns (poses, initial inputs, modulus, input offsets, and the effects that are in the model already) and P the
-projector on their orthogonal complement, an effect's field s is judged by P s alone (Frisch–Waugh–Lovell): it is as if every nuisance were
-refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
+With Z the whitened columns of the nuisance parameters (poses, initial inputs, modulus, input offsets, and the effects already in the model)
+and P the projector on their orthogonal complement, an effect with field s is judged by P s, as if every nuisance parameter were refitted with
+it (Frisch–Waugh–Lovell theorem). ρ = |P s| / |s| is the retained share: what calibration does not absorb.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from femsense.model.observation import SceneJet
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """An effect with a seed, as a column block at the current model."""
+    """An effect with a seed, linearised at the current model."""
 
     effect: Effect
     seed: Entry
     parameters: tuple[Parameter, ...]
     raw: list[FloatArray]
-    """Columns in metres, one array (k, c, q) a trial."""
+    """Columns [m], one array (k, c, q) per trial."""
     placements: list[FloatArray]
-    """The same of the places that rest.csv measures [m], (r, 3, q) a trial."""
+    """Columns of the places measured by rest.csv [m], (r, 3, q) per trial."""
     columns: FloatArray
-    """Whitened, nuisance projected out, shape (N, q)."""
+    """Whitened columns after projection, shape (N, q)."""
     response: FloatArray
-    """How the fitted parameters answer to a unit of each column, shape (p, q)."""
+    """Change of the fitted parameters per unit of each column, shape (p, q)."""
     retained: float
-    """ρ."""
+    """ρ, the share of the field that calibration leaves."""
     step: FloatArray
-    """Best linear step from the null, shape (q,)."""
+    """Best linear step from the null within the bounds, shape (q,)."""
     gain: float
     """Decrease of χ² by that step."""
     score: float
     """dBIC: gain − cost."""
     cost: float
-    """What the evidence must bring for the candidate's freedom."""
+    """BIC penalty, see `penalty`."""
     smallest: FloatArray
-    """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
+    """Smallest detectable size of each parameter, in its coordinate, shape (q,)."""
 
 
 def joined(a: Candidate, b: Candidate) -> Candidate:
-    """Return two parts of an effect as one candidate, scored as if they did not know of each other."""
+    """Return two parts of an effect as one candidate; gains and costs add as if the parts were orthogonal."""
     return replace(
         a,
         parameters=(*a.parameters, *b.parameters),
@@ -74,10 +74,10 @@ def joined(a: Candidate, b: Candidate) -> Candidate:
 
 
 def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: float) -> float:
-    """Return what a candidate's freedom costs: (q + s) log n + 2 log (m a).
+    """Return the BIC penalty of a candidate, (q + s) log n + 2 log (m a).
 
-    q parameters are fitted; the s numbers of its seed (a place, a radius, a time) are chosen from many, so they count as parameters
-    too; m effects are looked at, and a is the number of cables or markers that it might be alone.
+    q fitted parameters; the s numbers of its seed (a place, a radius, a time) are selected among many and count as parameters
+    too; the selection among m effects, each for one of a cables or markers, adds 2 log (m a).
     """
     chosen = sum(int(np.size(v)) for v in seed.values() if not isinstance(v, bool) and np.asarray(v).dtype.kind in "iuf")
     return float((count + chosen) * np.log(n_effective) + 2.0 * np.log(max(effects * alone, 1)))
@@ -91,9 +91,9 @@ def screen(
     Arguments:
         base: the current fit.
         problem: its problem (trials and noise).
-        fields: of the effects to try, at this fit or very near to it.
+        fields: of the effects to try, at this fit or close to it.
         n_effective: number of independent observations, for BIC.
-        wanted: dBIC at which an effect would just have been seen.
+        wanted: dBIC at which an effect counts as detectable.
     """
     Q, inverse = basis_of(np.asarray(base.fit.jacobian))
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
@@ -117,13 +117,13 @@ def screen(
 
 
 def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], placements: list[FloatArray]) -> float:
-    """Return the decrease of χ² that is predicted of columns of markers and placements (see `Candidate`) beside a fit, without bounds."""
+    """Return the decrease of χ² that columns of markers and placements (see `Candidate`) predict in addition to a fit, without bounds."""
     more = basis_of(beside(np.asarray(base.fit.jacobian), whitened_columns(base, problem, raw, placements)))[0]
     return float(np.sum((more.T @ base.fit.residual) ** 2))
 
 
 def whitened_columns(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
-    """Return columns of markers and placements, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
+    """Return columns of markers and placements, whitened, with zeros in the remaining rows of the fit (declared poses and priors)."""
     q = own[0].shape[2]
     result = np.zeros((len(base.fit.residual), q))
     at = 0
@@ -136,7 +136,7 @@ def whitened_columns(base: JointFit, problem: JointProblem, own: list[FloatArray
 
 
 def best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
-    """Return the bounded step that explains most, and the decrease of χ²."""
+    """Return the bounded step with the largest decrease of χ², and that decrease."""
     null = np.array([p.null for p in parameters])
     low, high = np.array([p.low for p in parameters]) - null, np.array([p.high for p in parameters]) - null
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -147,19 +147,19 @@ def best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Pa
 
 
 def _smallest(columns: FloatArray, q: int, n_effective: float, wanted: float) -> FloatArray:
-    """Return the size of each parameter at which the expected dBIC reaches what is wanted."""
+    """Return the size of each parameter at which the expected dBIC reaches `wanted`."""
     needed = np.sqrt(wanted + q * np.log(n_effective))
     norm = np.linalg.norm(columns, axis=0)
     return np.asarray(np.where(norm > 0, needed / np.maximum(norm, 1e-300), np.inf))
 
 
 def _whole_step(columns: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
-    """Return the step to a discrete alternative, which is taken as a whole, and the decrease of χ²."""
+    """Return the full step to a discrete alternative, and its decrease of χ²."""
     return np.ones(1), float(residual @ residual) - float(np.sum((residual + columns[:, 0]) ** 2))
 
 
 def one_each(table: list[Candidate]) -> list[Candidate]:
-    """Return the best candidate of each name."""
+    """Return the best candidate of each effect."""
     seen: dict[str, Candidate] = {}
     for candidate in table:
         seen.setdefault(candidate.effect.name, candidate)
@@ -167,13 +167,13 @@ def one_each(table: list[Candidate]) -> list[Candidate]:
 
 
 def confounding(a: Candidate, b: Candidate) -> float:
-    """Return how much of a's field is collinear with b once nuisance is projected out (the largest canonical correlation)."""
+    """Return the cosine between the field of a and the span of b after projection: the share of a that b can reproduce."""
     field = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
     return float(np.linalg.norm(basis_of(b.columns)[0].T @ field) / max(float(np.linalg.norm(field)), 1e-300))
 
 
 def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
-    """Return the jets of a fitted model with the columns of a candidate behind the others."""
+    """Return the jets of a fitted model with the columns of a candidate appended."""
     return [
         replace(
             jet,
@@ -185,12 +185,12 @@ def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
 
 
 def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noise | None = None) -> tuple[Noise, float]:
-    """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations.
+    """Estimate the noise from the residual of the richest linear model; return it with the effective number of observations.
 
     Arguments:
-        data, fitted: whose residual tells it.
-        fields: of what the model may lack, which counts as explained. None: all that the fitted model leaves is noise to the fits, and markers sit no
-            farther from where they are declared than is known beforehand; `before` still says what a marker repeats to.
+        data, fitted: the residual that is used.
+        fields: of the effects that the model may lack; they are projected out. None: the whole residual of the fitted model counts as noise, markers are
+            limited to the prior of their places, and `before` gives the repeatability of a marker.
         before: an earlier estimate.
     """
     own, columns = fitted.fit.own, list[FloatArray]()
@@ -219,7 +219,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
 
 
 def _explained(data: Data, fitted: FittedModel, fields: Fields | None) -> list[FloatArray]:
-    """Return the columns of what a model may lack [m], (k, c, q) a trial, the likeliest first; none where nothing may be lacking."""
+    """Return the columns of effects that a model may lack [m], (k, c, q) per trial, the best first; empty without fields."""
     shapes = [jet.residual.shape for jet in fitted.fit.jets]
     if fields is None:
         return [np.zeros((*shape, 0)) for shape in shapes]
@@ -230,7 +230,7 @@ def _explained(data: Data, fitted: FittedModel, fields: Fields | None) -> list[F
 
 
 def _apart(table: list[Candidate], times: float) -> list[Candidate]:
-    """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
+    """Return the candidates that offset one marker by much more than the median offset: a misplaced marker does not show how well the others are placed."""
     alone = [c for c in table if c.effect.places_markers and len({_marker(p) for p in c.parameters}) == 1]
     size = np.array([np.linalg.norm(c.step) for c in alone])
     return [c for c, s in zip(alone, size) if s > times * np.median(size)]

@@ -1,4 +1,4 @@
-"""The search for effects: screen, refit, add the best, ask again of what was found before, and start again from the better model until nothing passes."""
+"""The search for effects: screen, refit, add the best, re-test the earlier ones, and repeat on the larger model until no candidate passes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
+from femsense.loop.fit.discretisation_error import as_shown, same_mesh_error, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.model_error import excess_of
@@ -25,125 +25,128 @@ from femsense.loop.search.swaps import instead_of_offsets, predicting_best, swap
 from femsense.model.recording import state_key
 
 
-def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], *, quadratic: bool) -> SearchProgress:
-    """Return a search on top of the last model of a history that has found nothing yet."""
+def new_search(ready: Ready, names: Sequence[str], refits: list[RefitRecord], *, quadratic: bool) -> SearchProgress:
+    """Return the initial state of a search that extends the last model of a history."""
     data, before, history = ready
     last = history[-1][1]
     return SearchProgress(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
 
 
-def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
-    """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
-    _seek(course, checkpoint, say)
-    if nothing_explains(course):
-        say("nothing explains what is left: asking again with weights that hold the error of the model")
-        weights = noise_of(course.data, course.fitted, None, course.noise)[0]
-        course.begin_again(with_turning_placements(course.data, course.base), weights)
-        _seek(course, checkpoint, say)
-    data, history, noise = course.data, course.history, course.noise
+def search_effects(state: SearchProgress, checkpoint: Checkpoint, progress: Progress) -> tuple[Data, Search]:
+    """Screen, refit and add effects until none passes; return the data prepared for the last model, and the search."""
+    _seek(state, checkpoint, progress)
+    if nothing_explains(state):
+        progress("no effect fits the residual: repeating the search with weights that include the model error")
+        weights = noise_of(state.data, state.fitted, None, state.noise)[0]
+        state.begin_again(with_turning_placements(state.data, state.base), weights)
+        _seek(state, checkpoint, progress)
+    data, history, noise = state.data, state.history, state.noise
     assert noise is not None
-    refits, before = course.refits, course.before
-    if course.holds_error:
-        history, refits = predicting_best(data, history, refits, course.table, noise, course.n_effective, say)
+    refits, before = state.refits, state.before
+    if state.holds_error:
+        history, refits = predicting_best(data, history, refits, state.table, noise, state.n_effective, progress)
     fitted = history[-1][1]
     most = _most_effects(data)
-    swap = instead_of_offsets(data, fitted, course.names, noise, course.n_effective, say) if most else None
+    swap = instead_of_offsets(data, fitted, state.names, noise, state.n_effective, progress) if most else None
     if swap is not None:
         refits = [*refits, *at_step(swap.records, len(history))]
         if swap.fitted is not None:
             fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
     if len(history) > 1 and "clouds" in data.measured:
         before = calibrated_pose(data, data.robot_as_declared, noise, before)  # before and after on the same rows
-    tables = course.first, course.table, refits
-    return data, Search(before, history, course.base, fitted, noise, course.n_effective, *tables, swap, course.outweighed)
+    tables = state.first, state.table, refits
+    return data, Search(before, history, state.base, fitted, noise, state.n_effective, *tables, swap, state.outweighed)
 
 
-def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None:
+def _seek(state: SearchProgress, checkpoint: Checkpoint, progress: Progress) -> None:
     """Add effects until none passes."""
-    while not course.over:
-        checkpoint.keep(course)
-        say(f"screening effects ({course.found} found so far)")
-        _take_step(course, say)
-    checkpoint.keep(course)
+    while not state.over:
+        checkpoint.keep(state)
+        progress(f"screening effects ({state.found} found so far)")
+        _take_step(state, progress)
+    checkpoint.keep(state)
 
 
-def nothing_explains(course: SearchProgress) -> bool:
-    """Return whether the last model has a large error of its own, or is much farther from the markers than the noise of the richest linear model
-    allows: that noise then weighs only how states differ, and lets a pose and input offsets go wherever these agree."""
-    data, fitted, noise = course.data, course.fitted, course.noise
-    if course.holds_error or noise is None or "clouds" in data.measured:
+def nothing_explains(state: SearchProgress) -> bool:
+    """Return whether the residual of the last model is dominated by model error.
+
+    It is if its mean square exceeds `lacks` times the noise, or if it exceeds noise and discretisation error together. The noise of the richest
+    linear model then underrates the residual: it weighs only differences between states, and pose and input offsets are free in their common part.
+    """
+    data, fitted, noise = state.data, state.fitted, state.noise
+    if state.holds_error or noise is None or "clouds" in data.measured:
         return False
     if mean_square(data.train, [jet.residual for jet in fitted.fit.jets], noise) > data.thresholds.lacks:
         return True
-    return excess_of(data, course.base, fitted, fitted, noise, repeatability(data, fitted, noise)).is_large
+    return excess_of(data, state.base, fitted, fitted, noise, repeatability(data, fitted, noise)).is_large
 
 
 def _most_effects(data: Data) -> int:
     return data.effort.effects if distinguishes_effects(data) else 0
 
 
-def _take_step(course: SearchProgress, say: Progress) -> None:
-    """Screen what a model may lack and add the effect that comes next; where none does, the search is over."""
-    names, found = course.names, course.found
-    data, fitted, noise, fields = course.data, course.fitted, course.noise, course.fields
+def _take_step(state: SearchProgress, progress: Progress) -> None:
+    """Screen the effects that the model may lack and add the best one; if none passes, end the search."""
+    names, found = state.names, state.found
+    data, fitted, noise, fields = state.data, state.fitted, state.noise, state.fields
     if found and "clouds" in data.measured:
         assert noise is not None
         fields = None
         data, fitted = matched(data, fitted, noise)
     try:
-        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names, holds_error=course.holds_error)
+        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names, holds_error=state.holds_error)
     except FemsenseError as error:
         if not found:
             raise
-        course.take_back(error)
+        state.take_back(error)
         return
-    history, refits = [*course.history[:-1], (course.history[-1][0], fitted)], course.refits
-    course.data, course.fitted, course.noise, course.n_effective = data, fitted, noise, n_effective
-    course.fields, course.table, course.history = fields, table, history
+    history, refits = [*state.history[:-1], (state.history[-1][0], fitted)], state.refits
+    state.data, state.fitted, state.noise, state.n_effective = data, fitted, noise, n_effective
+    state.fields, state.table, state.history = fields, table, history
     if not found:
-        course.base, course.first = fitted, table
+        state.base, state.first = fitted, table
     if found >= _most_effects(data):
-        course.over = True
+        state.over = True
         return
-    next_one, tried = select_next(data, fitted, table, noise, say)
+    next_one, tried = select_next(data, fitted, table, noise, progress)
     refits = [*refits, *at_step(tried, len(history))]
-    course.refits = refits
+    state.refits = refits
     if next_one is None:
-        _tell_parts_apart(course, say)
+        _tell_parts_apart(state, progress)
         return
-    course.earlier = data
+    state.earlier = data
     winner = next_one.fitted
-    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
+    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not same_mesh_error(fitted, winner)
     history = [*history, (next_one.candidate.effect.name, winner)]
-    history, refits = swapped(data, history, refits, noise, n_effective, say)
+    history, refits = swapped(data, history, refits, noise, n_effective, progress)
     last = history[-1][1]
-    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if anew else data, last)
-    course.data, course.history, course.refits, course.fitted = data, history, refits, last
+    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if recompute else data, last)
+    state.data, state.history, state.refits, state.fitted = data, history, refits, last
 
 
-def _tell_parts_apart(course: SearchProgress, say: Progress) -> None:
-    """Give named effects a value for each cable where these have evidence, and go on; where none has, the search is over."""
-    assert course.noise is not None
-    fitted, records = with_all_parts(course.data, course.fitted, course.noise, course.n_effective, say)
-    course.refits = [*course.refits, *at_step(records, len(course.history))]
-    course.over = fitted is course.fitted
-    course.fitted, course.history = fitted, [*course.history[:-1], (course.history[-1][0], fitted)]
+def _tell_parts_apart(state: SearchProgress, progress: Progress) -> None:
+    """Give accepted effects one value per cable where these have evidence, and continue; otherwise end the search."""
+    assert state.noise is not None
+    fitted, records = with_all_parts(state.data, state.fitted, state.noise, state.n_effective, progress)
+    state.refits = [*state.refits, *at_step(records, len(state.history))]
+    state.over = fitted is state.fitted
+    state.fitted, state.history = fitted, [*state.history[:-1], (state.history[-1][0], fitted)]
 
 
 def _screened(
     data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str], *, holds_error: bool
 ) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
-    """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
-    of what may come next: by the fields of the model before, as long as these predict no gain."""
+    """Return a model refitted with the noise of its own residual, that noise, the effective number of observations, and the fields and scores of the
+    candidates. The fields of the previous model are reused as long as they predict no gain."""
     fields = _fields(data, fitted, before, names)
-    told, n_effective = noise_of(data, fitted, fields, noise)
-    noise = noise if noise is not None and holds_error else told
+    estimated, n_effective = noise_of(data, fitted, fields, noise)
+    noise = noise if noise is not None and holds_error else estimated
     fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets)
     return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
-    """Return the fields of the model before where they tell what may come next, else those of the fitted model itself."""
+    """Return the fields of the previous model if they apply to the current one, else newly computed ones."""
     hints = None if before is None else before.beside(fitted.fit)
     return fields_of(data, fitted, names) if hints is None else hints
 
@@ -151,7 +154,7 @@ def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Seque
 def scored(
     data: Data, fitted: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
 ) -> tuple[Fields, list[Candidate]]:
-    """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
+    """Return fields and scores; if reused fields predict a gain, the fields of the fitted model itself."""
     table = screen_model(data, fitted.fit, noise, fields, n_effective)
     if fields.model is fitted.fit.hypothesis or not hinted(table, data.thresholds, data.effort):
         return fields, table
@@ -160,7 +163,7 @@ def scored(
 
 
 def distinguishes_effects(data: Data) -> bool:
-    """Return whether these data can distinguish effects: a state that is not fitted is held out, or enough different ones are fitted."""
+    """Return whether these data can distinguish effects: a held-out state is not fitted, or enough distinct states are fitted."""
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
     fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
     return fresh or len(fitted) >= data.thresholds.states

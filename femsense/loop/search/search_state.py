@@ -1,4 +1,4 @@
-"""How far a search for effects has come, and what it went through, as the conclusion needs it."""
+"""The state of a search for effects, and the record that the conclusion uses."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from femsense.loop.result.records import AllRecordings, RefitRecord
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.screening import Candidate
 
-OUTWEIGHED = "found by weights that much is left beside it: asked again with weights that hold the error of the model"
-"""The verdict on what was named, or passed, before."""
+OUTWEIGHED = "accepted with weights under which a large residual remained; repeated with weights that include the model error"
+"""The verdict on effects accepted, or passed, before the weights changed."""
 
 
 @dataclass(eq=False, slots=True)
 class SearchProgress:
-    """How far a search has come."""
+    """The state of a search."""
 
     data: Data
     earlier: Data
-    """The data as they were before the last effect was added."""
+    """The data before the last effect was added."""
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
     """As of `Search`."""
     given: int
-    """How many models of the history were there before the search."""
+    """Number of models in the history before the search began."""
     fitted: FittedModel
-    """The model that comes next is this one with one effect more."""
+    """The current model, which the next effect extends."""
     base: FittedModel
     """As of `Search`, from the first screening on."""
     names: list[str]
     """Effects that are tried."""
     quadratic: bool
-    """Whether it goes on quadratic elements though linear ones are declared."""
+    """Whether the search uses quadratic elements although linear ones are declared."""
     refits: list[RefitRecord]
-    """What became of candidates that were refitted, by the weights of now."""
+    """Results of the candidates refitted with the current weights."""
     outweighed: list[RefitRecord] = field(default_factory=list)
-    """What became of them by earlier weights: evidence that is compared with none of now."""
+    """Results with earlier weights; their evidence cannot be compared with current values."""
     noise: Noise | None = None
     n_effective: float = 0.0
     fields: Fields | None = None
@@ -50,15 +50,15 @@ class SearchProgress:
     """The last screening."""
     over: bool = False
     holds_error: bool = False
-    """Whether the noise holds what a model leaves, since nothing explained it, and stays as it is."""
+    """Whether the noise includes the model error, because no effect fitted it, and is no longer re-estimated."""
 
     @property
     def found(self) -> int:
-        """How many effects were found."""
+        """Number of effects found."""
         return len(self.history) - self.given
 
     def begin_again(self, data: Data, noise: Noise) -> None:
-        """Seek effects again on top of the first model, by weights that hold what the last one leaves."""
+        """Restart the search from the first model, with weights that include the residual of the last one."""
         kept = [*self.history[: self.given - 1], (self.history[self.given - 1][0], self.base)]
         self.outweighed = [replace(r, verdict=OUTWEIGHED) if r.is_named or r.passes else r for r in self.refits]
         self.refits = []
@@ -67,7 +67,7 @@ class SearchProgress:
         self.over, self.holds_error = False, True
 
     def take_back(self, error: FemsenseError) -> None:
-        """End without the last effect, whose states do not converge when they are solved again."""
+        """Remove the last effect, whose states do not converge when they are solved again, and end the search."""
         step, back = len(self.history) - 1, no_equilibrium(error)
         self.refits = [replace(r, verdict=back) if r.step == step and r.is_named else r for r in self.refits]
         self.data, self.history, self.over = self.earlier, self.history[:-1], True
@@ -76,14 +76,14 @@ class SearchProgress:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Search:
-    """What the search went through."""
+    """The completed search."""
 
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
-    """("", the model with what calibration may move on the declared mesh), then each effect with the model that added it."""
+    """("", the calibrated model on the declared mesh), then each effect with the model that added it."""
     base: FittedModel
-    """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
+    """The model of the first screening: calibrated, on quadratic elements if the search uses them."""
     final: FittedModel
     noise: Noise
     n_effective: float
@@ -94,24 +94,24 @@ class Search:
     refits: list[RefitRecord]
     """As of `SearchProgress`."""
     in_place: OffsetAlternative | None
-    """What might be in the place of the input offsets."""
+    """The best alternative to the input offsets."""
     outweighed: list[RefitRecord] = field(default_factory=list)
     """As of `SearchProgress`."""
     everywhere: AllRecordings | None = None
-    """What all recordings say of the last model, where it was sought in some of them."""
+    """Results of the last model in all recordings, if only some were searched."""
 
 
 Progress = Callable[[str], None]
-"""Told in words what is going on."""
+"""Called with a text that names the current step."""
 
 
 def no_equilibrium(error: FemsenseError) -> str:
-    """Return the verdict on a refit that fails."""
+    """Return the verdict on a refit without equilibrium."""
     return f"no equilibrium: {error}"
 
 
 def at_step(records: Iterable[RefitRecord], step: int) -> list[RefitRecord]:
-    """Return records of what was tried on the model of a step."""
+    """Return records with the number of the model that they extend."""
     return [replace(record, step=step) for record in records]
 
 
@@ -124,21 +124,21 @@ class Refit:
     score: float
     """dBIC of the nonlinear fit."""
     record: RefitRecord
-    """What the report says of it."""
+    """The record shown in the report."""
 
     def saying(self, verdict: str) -> Refit:
-        """Return it with another verdict in its record."""
+        """Return the refit with another verdict in its record."""
         return replace(self, record=replace(self.record, verdict=verdict))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OffsetAlternative:
-    """What became of the question."""
+    """The effect that best replaces the input offsets."""
 
     fitted: FittedModel | None
-    """A model with an effect in the place of the input offsets, where that is better."""
+    """The model with the effect instead of the input offsets, if it is better."""
     name: str
-    """The effect that is best in their place; empty: none passes."""
+    """The best effect; empty: none passes."""
     ahead: float
-    """dBIC of that effect less that of the input offsets."""
+    """dBIC of that effect minus dBIC of the input offsets."""
     records: list[RefitRecord]

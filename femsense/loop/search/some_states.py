@@ -1,8 +1,8 @@
-"""Recordings with many states that do not repeat: effects are sought in some of the states, and what is found must hold in all of them.
+"""Recordings with many distinct states: the search runs in representative states, and its result must hold in all of them.
 
-The whole search takes states that differ as much as they can. The models that it went through are then fitted to all states, each effect has to pass
-the acceptance test there, and the search goes on in all states from the last model that does. Nothing is named, and nothing is reported, that was not
-fitted to all of them.
+The representative states differ as much as possible. The models of the search are then fitted to all states, each effect must pass the
+acceptance test there, and the search continues in all states from the last model that passes. No effect is accepted or reported that
+was not fitted to all states.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from femsense.loop.search.search_state import Progress, Search, SearchProgress, 
 from femsense.model.drive import has_history
 
 SPARED = 0.5
-"""They are no more than this share of all, or effects are sought in all at once."""
+"""Largest share of representative states; beyond it the search runs in all states."""
 
 
 def some_states(data: Data) -> Data | None:
-    """Return the data with some states of each recording, fitted and held out, which differ as much as they can (`Effort.work`, but FEWEST states at
-    least); None where that spares little, where a state depends on those before, and where there are clouds, whose rows go by frames already."""
+    """Return the data in representative states of each recording, fitted and held out (`Effort.work`, at least FEWEST states). None if that saves
+    little, if states depend on earlier ones, and for clouds, whose rows are already thinned out by frames."""
     if "clouds" in data.measured or has_history(data.robot):
         return None
     most = data.effort.work // len(data.robot.body.mesh.tets)
@@ -41,39 +41,39 @@ def some_states(data: Data) -> Data | None:
     return data.with_trials(lambda t: t.part(spread_states(t, most)[0]))
 
 
-def in_all_states(every: Data, course: SearchProgress, search: Search, say: Progress) -> SearchProgress:
-    """Return how far the search in some states has come in all of them: its models fitted to all, with the effects that pass there.
+def in_all_states(every: Data, state: SearchProgress, search: Search, progress: Progress) -> SearchProgress:
+    """Return the state of the search in all states: its models refitted to all of them, with the effects that pass there.
 
     Arguments:
         every: the data with all states, none of which is solved yet.
-        course: the search in some states, at its end.
-        search: what it found.
-        say: told what is going on.
+        state: the completed search in representative states.
+        search: its record.
+        progress: called with the name of each step.
 
     Raises:
         DataError: the model without effects has no equilibrium in some state.
     """
-    say(f"fitting to all states (effects found: {len(search.history) - course.given})")
-    noise, given = search.noise, course.given
+    progress(f"fitting to all states (effects found: {len(search.history) - state.given})")
+    noise, given = search.noise, state.given
     fitted = [fitted_again(every, model, noise) for _, model in search.history[:given]]
     data = every
     while (fewer := _without_outliers(data, fitted[-1])) is not data:
         data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
     before = calibrated_pose(data, data.robot_as_declared, START)
-    data = with_turning_placements(as_shown(with_mesh_errors_of(data, course.data, fitted[-1]), fitted[-1]), fitted[-1])
+    data = with_turning_placements(as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
     refits = list(search.refits)
     for name, model in search.history[given:]:
-        say(f"fitting {name} to all states")
+        progress(f"fitting {name} to all states")
         if not _added(data, history, name, model, search, refits):
             break
     last, first = history[-1][1], list[Candidate]()
     n_effective = float(sum(t.groups.observations for t in data.train))
-    if len(history) > given:  # else it is screened anew
-        first = screen_model(data, base.fit, noise, fields_of(data, base, course.names), n_effective)
+    if len(history) > given:  # otherwise the search screens all states next
+        first = screen_model(data, base.fit, noise, fields_of(data, base, state.names), n_effective)
         data = with_turning_placements(data, last)
-    models = replace(course, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
+    models = replace(state, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
     return replace(models, noise=noise, n_effective=n_effective, fields=None, first=first, table=first, over=False)
 
 
@@ -89,10 +89,12 @@ def _added(
     search: Search,
     refits: list[RefitRecord],
 ) -> bool:
-    """Return whether an effect passes in all states: then its model, fitted to them, ends the history; its record says what became of it."""
+    """Return whether an effect passes in all states; if so, append its model, fitted to them, to the history. Its record gets the verdict."""
     at = next((i for i, r in reversed(list(enumerate(refits))) if r.name == name and r.is_named), None)
     candidate = _candidate(search, name, model)
-    if at is None or candidate is None:  # what replaces another one has no record of its own: all states are asked for it anew
+    if (
+        at is None or candidate is None
+    ):  # an effect that replaced another one has no record of its own: the search in all states tests it
         return False
     try:
         made = fitted_again(data, model, search.noise)
@@ -107,7 +109,7 @@ def _added(
 
 
 def _candidate(search: Search, name: str, model: FittedModel) -> Candidate | None:
-    """Return an effect of a model as the candidate that it was, with the parameters that it has by now; None where none is left of that name."""
+    """Return the candidate of an effect with its current parameters; None if the effect was not screened."""
     known = next((c for c in (*search.first, *search.last) if c.effect.name == name), None)
     if known is None:
         return None

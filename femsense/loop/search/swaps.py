@@ -1,6 +1,7 @@
-"""What is named is asked again: of each effect, when another one was found, whether it is still needed, and whether another one, or it itself elsewhere,
-is better in its place; at the end, of the input offsets what explains better what they took, and of effects that may stand for one another beside an error of
-the model which predicts better. What is named first, or fitted along with everything, may have won by what it took of what was still missing.
+"""Re-tests of accepted effects, because an effect that is accepted early can absorb part of one that is still missing.
+
+After each further effect: is an earlier one still needed, and does an alternative, or the same effect elsewhere, fit better in its place? At the end: does
+an effect fit better than the input offsets; and, with weights that include the model error, does an alternative predict held-out data better?
 """
 
 from __future__ import annotations
@@ -30,25 +31,25 @@ History = list[tuple[str, FittedModel]]
 
 
 def swapped(
-    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, say: Progress
+    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, progress: Progress
 ) -> tuple[History, list[RefitRecord]]:
-    """Return the history without effects, but for the last one, that are needless in the whole model, with alternatives in the places of those that
-    they beat there; and the refits with what became of those that were asked."""
+    """Return the history without earlier effects that the whole model no longer needs, and with alternatives that beat the others; and the refits,
+    including those of the alternatives."""
     for name in [name for name, _ in history[1:-1]]:
         fitted = history[-1][1]
-        less = _if_needless(data, fitted, name, noise, n_effective, say)
+        less = _if_needless(data, fitted, name, noise, n_effective, progress)
         if less is not None:
             history = [*history[:-1], (history[-1][0], less)]
             continue
         alternatives = _alternatives(data, fitted, refits, name)
         if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
-        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, say)
+        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, progress)
     return history, refits
 
 
-def stand_ins(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequence[Candidate]) -> list[RefitRecord]:
-    """Return the refits that pass on top of the same model as a named one's, and for which nothing is left beside what is named, by the last screening."""
+def alternatives_to(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequence[Candidate]) -> list[RefitRecord]:
+    """Return the refits that pass on top of the same model as an accepted one and that the last screening leaves without a gain."""
     left = {c.effect.name for c in table if c.score > 0.0}
     return [r for r in refits if r.passes and r.answers_as(own) and r.name not in left]
 
@@ -60,25 +61,25 @@ def predicting_best(
     table: Sequence[Candidate],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
 ) -> tuple[History, list[RefitRecord]]:
-    """Return a history and its refits with each effect replaced by one that may stand for it and surely predicts held-out data better.
+    """Return a history and its refits in which an alternative that predicts held-out data significantly better replaces each effect.
 
-    This is for weights that hold the error of the model: how far an effect is ahead then says how well it makes up for that error where fitted, too.
+    For weights that include the model error: the evidence of an effect then also measures how well it compensates for that error in the fitted data.
     """
     for name in [name for name, _ in history[1:]]:
         named = history[-1][1].fit.hypothesis.names
         own = next((r for r in reversed(refits) if r.name == name and r.is_named), None)
-        others = [] if own is None else sorted(stand_ins(own, refits, table), key=_held_rms)
+        others = [] if own is None else sorted(alternatives_to(own, refits, table), key=_held_rms)
         better = [r.name for r in others if r.name not in named and own is not None and _held_rms(r) < _held_rms(own)]
         if better:
             best = list(dict.fromkeys(better))[: data.effort.alternatives]
-            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, say, by_held_out=True)
+            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, progress, by_held_out=True)
     return history, refits
 
 
-def surely_closer(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
-    """Return whether another model is closer to the held-out states, each compared with itself, by more than the standard error of that."""
+def predicts_better(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
+    """Return whether the squared error of another model in held-out states, paired by state, is smaller by more than one standard error."""
     falls = dict[tuple[int, bytes], list[float]]()
     for i, (trial, own, new) in enumerate(zip(data.held, fitted.held_residuals, other.held_residuals)):
         for k, fall in zip(trial.scene.frame, (own**2 - new**2).sum(axis=1)):
@@ -88,7 +89,7 @@ def surely_closer(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
 
 
 def _held_rms(r: RefitRecord) -> float:
-    """Return the held-out error of a refit [m]; inf where it has none."""
+    """Return the held-out error of a refit [m]; inf if it has none."""
     return np.inf if r.validation_rms_m is None else r.validation_rms_m
 
 
@@ -100,16 +101,16 @@ def _exchanged(
     alternatives: list[str],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
     *,
     by_held_out: bool = False,
 ) -> tuple[History, list[RefitRecord]]:
-    """Return a history with the best alternative in the place of an effect where it is better, by evidence or on held-out data; and the refits."""
+    """Return a history in which the best alternative replaces an effect if it is better, by evidence or on held-out data; and the refits."""
     fitted = history[-1][1]
-    say(f"refitting {' or '.join(alternatives)} in the place of {name}")
+    progress(f"refitting {' or '.join(alternatives)} instead of {name}")
     try:
         without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, say, by_held_out)
+        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, progress, by_held_out)
         if best is not None:
             history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
     except FemsenseError:
@@ -121,15 +122,15 @@ def _exchanged(
 
 
 def _if_needless(
-    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, progress: Progress
 ) -> FittedModel | None:
-    """Return a model without an effect that those added later have made needless (dBIC for keeping it not above 0), the place of the last one, which was
-    found beside it, moved on; else None."""
+    """Return a model without an effect that later ones have made unnecessary (evidence for keeping it ≤ q log n), with the place of the last effect
+    improved; else None."""
     terms = fitted.fit.hypothesis.terms
     count = sum(len(p) for effect, _, p in terms if effect.name == name)
     if not count:
         return None
-    say(f"asking whether {name} is still needed")
+    progress(f"testing whether {name} is still needed")
     price = count * float(np.log(n_effective))
     others = [n for n in fitted.fit.hypothesis.names if n != name]
     try:
@@ -144,7 +145,7 @@ def _if_needless(
 
 
 def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
-    """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
+    """Return the effects whose evidence was within `evidence` of an accepted one's, the best first; and the effect itself if its seed was selected."""
     seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
     named = [r for r in refits if r.name == name and r.is_named]
     if name not in seeds or not named or np.isinf(data.thresholds.swap):
@@ -170,28 +171,30 @@ def _better(
     alternatives: list[str],
     noise: Noise,
     n_effective: float,
-    say: Progress,
+    progress: Progress,
     by_held_out: bool,
 ) -> tuple[Refit | None, list[RefitRecord]]:
-    """Return the best alternative if it is better than what is named, and what became of each."""
+    """Return the best alternative if it is better than the accepted effect, and the records of all."""
     table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *alternatives]), n_effective)
     own = _same(table, fitted, name)
     if own is None:
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
     listed = [c for c in table if c.effect.name in alternatives]
-    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, say)
+    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, progress)
     passing = [r for r in asked if r.record.passes]
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
     if by_held_out:
         best = min(passing, key=lambda r: r.fitted.held_rms, default=None)
-        return (best if best is not None and surely_closer(data, fitted, best.fitted) else None), records
+        return (best if best is not None and predicts_better(data, fitted, best.fitted) else None), records
     best = max(passing, key=lambda r: r.score, default=None)
     return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
 
 
-def _asked(data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, say: Progress) -> list[Refit]:
-    """Return what becomes of candidates in the place of what a model is fitted without, those that lead with their seeds improved."""
+def _asked(
+    data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, progress: Progress
+) -> list[Refit]:
+    """Return the acceptance tests of candidates on top of a model, with the seeds of the leading ones improved."""
     asked = list[Refit]()
     for candidate in listed:
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
@@ -200,19 +203,19 @@ def _asked(data: Data, without: FittedModel, listed: Sequence[Candidate], name: 
         except FemsenseError:
             continue
         asked.append(acceptance_test(data, without, candidate, made, record, noise))
-    leading = leaders(data, without, dict(enumerate(asked)), noise, say)
+    leading = leaders(data, without, dict(enumerate(asked)), noise, progress)
     return [leading.get(i, r) for i, r in enumerate(asked)]
 
 
 def _same(table: Sequence[Candidate], fitted: FittedModel, name: str) -> Candidate | None:
-    """Return the candidate of the form that is named: the one with most of what is fitted, which may be its place or time, too."""
+    """Return the candidate of the accepted form: of those whose parameters are all fitted (places and times may be too), the one with most."""
     moving = {(p.key, p.part) for effect, _, parameters in fitted.fit.hypothesis.terms if effect.name == name for p in parameters}
     forms = [c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= moving]
     return max(forms, key=lambda c: len(c.parameters), default=None)
 
 
 def _without(data: Data, history: History, without: FittedModel, name: str, noise: Noise) -> History:
-    """Return the history as if one effect had never been found."""
+    """Return the history as if one effect had never been accepted."""
     left = [n for n, _ in history[1:] if n != name]
     steps: History = [history[0]]
     for i, other in enumerate(left):
@@ -222,16 +225,16 @@ def _without(data: Data, history: History, without: FittedModel, name: str, nois
 
 
 def instead_of_offsets(
-    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, progress: Progress
 ) -> OffsetAlternative | None:
-    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing."""
+    """Return the effect that best replaces the input offsets of a model; None if the data do not need these."""
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None or np.isinf(data.thresholds.swap):
         return None
-    say("asking what else might be in the place of the input offsets")
+    progress("testing alternatives to the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
-    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, say)
+    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, progress)
     best = max((r for r in asked if r.record.passes), key=lambda r: r.score, default=None)
     if best is None:
         return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])
@@ -241,8 +244,8 @@ def instead_of_offsets(
 
 
 def _takes(data: Data, best: Refit, fitted: FittedModel, without: FittedModel, worth: float) -> tuple[bool, float]:
-    """Return whether an effect takes the place of the input offsets, which are worth so much dBIC, and by how much it is ahead: where evidence is close,
-    what predicts left-out sweeps better."""
+    """Return whether an effect replaces input offsets of evidence `worth` [dBIC], and by how much it is ahead; if their evidence is close, the
+    cross-validated prediction of left-out sweeps is added."""
     assert best.record.cv_gain is not None
     ahead, evident, least = best.score - worth, data.thresholds.evidence, data.thresholds.swap
     predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]

@@ -1,4 +1,4 @@
-"""How far `improve` is and how long it still takes: states that were solved, against what its stages usually take."""
+"""Progress of `improve`: the share of the work that is done and the remaining time, from the number of states solved."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from femsense.core.work import Work, counting
 
 CALIBRATION, SEARCH, ALL_STATES, VERDICT = "calibration", "search", "all states", "verdict"
 PASSES = {CALIBRATION: 10.0, SEARCH: 30.0, ALL_STATES: 6.0, VERDICT: 4.0}
-"""Equilibria that a stage usually takes for each fitted state (`benchmarks/distinct_states.py` prints them)."""
+"""Typical number of equilibria per fitted state in each stage (`benchmarks/distinct_states.py` prints them)."""
 COSTS = {"equilibria": 1.0, "responses": 1.5, "refined": 12.0}
-"""What each kind of work takes, in equilibria."""
+"""Cost of each kind of work, in equilibria."""
 QUADRATIC = 10.0
-"""What a state on quadratic elements takes, in that of one on linear ones."""
+"""Cost of a state on quadratic elements, relative to linear ones."""
 MORE = 0.25
-"""A stage that has taken as long as was planned is expected to take this share of that besides; less, the longer it has taken."""
+"""Remaining work of a stage that has reached its estimate, as a share of the estimate; it decreases as the stage continues."""
 EVERY = 5.0
-"""Seconds after which it is said again how far the work is."""
+"""Interval at which progress is repeated [s]."""
 
 
 class WorkPlan:
-    """Tells what is going on, with the share of the work that is done and about how long the rest takes."""
+    """Reports the current step with the share of the work that is done and the remaining time."""
 
     def __init__(self, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
-        """tell: is told in words; clock: seconds."""
+        """Arguments: `tell` receives the text; `clock` returns seconds."""
         self.tell, self.clock, self.begun = tell, clock, clock()
         self.rest: list[float] = []
-        """What is expected of the stage at hand and of each that follows, in equilibria on linear elements."""
+        """Estimated work of the current stage and of each later one, in equilibria on linear elements."""
         self.done, self.weight = 0.0, 1.0
-        """What the stages before took, and what an equilibrium of the stage at hand costs."""
+        """Work of the completed stages, and the cost of an equilibrium in the current one."""
         self.work = Work()
         self.seen = 0.0
         self.text, self.furthest, self.said = "", 0.0, -EVERY
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Count the work that is done meanwhile."""
+        """Count the work done inside the context."""
         with counting(self._go_on) as self.work:
             yield
 
     def plan(self, stages: Sequence[str], states: int, *, quadratic: bool) -> None:
-        """Expect these stages from now on, in so many fitted states; what is at hand has ended."""
+        """Plan these stages, each with this number of fitted states, and end the current one."""
         self._end()
         self.weight = QUADRATIC if quadratic else 1.0
         self.rest = [PASSES[stage] * states * self.weight for stage in stages]
@@ -53,20 +53,20 @@ class WorkPlan:
         self.rest = self.rest[1:]
 
     def __call__(self, text: str) -> None:
-        """Tell what is going on from now on."""
+        """Name the current step and report it."""
         self.text = text
         self._say()
 
     @property
     def share(self) -> float:
-        """Share of the work that is done; it never falls."""
+        """Share of the work that is done; it never decreases."""
         done, rest = self._done_and_rest()
         self.furthest = max(self.furthest, done / (done + rest) if done and self.rest else 0.0)
         return self.furthest
 
     @property
     def seconds_left(self) -> float:
-        """Seconds that the rest takes if it goes on as it did; inf as long as nothing is planned or done."""
+        """Remaining time at the average rate so far [s]; inf before anything is planned or done."""
         done, rest = self._done_and_rest()
         return (self.clock() - self.begun) * rest / done if done and self.rest else float("inf")
 
@@ -78,7 +78,7 @@ class WorkPlan:
         return self.done + own, now + sum(self.rest[1:])
 
     def _own(self) -> float:
-        """Return what the stage at hand has taken."""
+        """Return the work of the current stage."""
         return self.weight * (self._counted() - self.seen)
 
     def _counted(self) -> float:
@@ -99,5 +99,5 @@ class WorkPlan:
 
 
 def in_words(seconds: float) -> str:
-    """Return a time as people say it: seconds, from two minutes on minutes."""
+    """Return a duration in seconds, from two minutes on in minutes."""
     return f"{max(round(seconds), 1)} s" if seconds < 120.0 else f"{round(seconds / 60.0)} min"

@@ -1,1 +1,1 @@
-"""What the search shows: the verdict, what is handed back, what cannot be distinguished."""
+"""The result of a search: verdict, returned robot, confounded effects."""

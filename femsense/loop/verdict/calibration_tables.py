@@ -1,4 +1,4 @@
-"""What the report shows of calibration: how poses, initial inputs and nuisances move from model to model, and which frames are not used."""
+"""Tables of the report on calibration: poses, initial inputs and nuisance effects by model, and the frames that are not used."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from femsense.model.recording import Recording
 
 
 def calibration_shift(data: Data, models: Mapping[str, FittedModel]) -> CalibrationShift:
-    """Return poses, initial inputs, modulus and input offsets of each model; poses as they moved from the first of them."""
+    """Return poses, initial inputs and nuisance effects of each model; poses relative to the first model."""
     poses, inputs, at = list[PoseShift](), list[InputShift](), 0
     for i, trial in enumerate(data.train[j] for j in heads_of(data.train)):
         poses += [_pose_shift(models, i, v, at + 6 * v) for v in range(len(trial.poses))]
@@ -32,7 +32,7 @@ def calibration_shift(data: Data, models: Mapping[str, FittedModel]) -> Calibrat
 
 
 def _pose_shift(models: Mapping[str, FittedModel], recording: int, camera: int, at: int) -> PoseShift:
-    """Return how a pose moved, whose six numbers begin at a place of the parameters."""
+    """Return the change of the pose whose six parameters begin at index `at`."""
     first, *others = models
     part = slice(at, at + 6)
     zero = models[first].fit.fit.theta[part]
@@ -53,7 +53,7 @@ def _input_values(models: Mapping[str, FittedModel], at: int) -> dict[str, Vecto
 
 
 def _terms(models: Mapping[str, FittedModel]) -> list[TermShift]:
-    """Return the values that calibration moves, by model."""
+    """Return the nuisance values by model."""
     terms: dict[str, TermShift] = {}
     for name, fitted in models.items():
         for effect, _, parameters, span in terms_of(fitted.fit):
@@ -79,6 +79,6 @@ def excluded(recording: Recording, data: Data) -> dict[str, tuple[int, ...]]:
     for k in range(len(recording.time_s)):
         if k in used:
             continue
-        why = "touched, load not declared" if k not in usable else "no markers" if k not in marked else "thinned out"
+        why = "in contact, load not declared" if k not in usable else "no markers" if k not in marked else "thinned out"
         reasons.setdefault(why, []).append(int(recording.frame_numbers[k]))
     return {why: tuple(frames) for why, frames in reasons.items()}

@@ -1,4 +1,4 @@
-"""What the report shows of candidates: estimates, how often each comes first, what is collinear, and what would have been seen."""
+"""Tables of the report on candidates: estimates, ranks under the bootstrap, collinearity, and smallest detectable sizes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from femsense.loop.search.screening import Candidate, confounding, one_each
 from femsense.loop.thresholds import Thresholds
 
 DRAWS = 200
-"""Bootstrap draws of sweeps."""
+"""Number of bootstrap draws of sweeps."""
 MAP = 14
-"""Effects in the map of confounding."""
+"""Maximum number of effects in the map of confounding."""
 KINDS = {"linear": "change", "log": "factor", "reciprocal": "softer_than"}
-"""What the size of a parameter is, by how its coordinate gives its value."""
+"""Meaning of the size of a parameter, by the scale of its coordinate."""
 
 
 def ranking(data: Data, fit: JointFit, first: list[Candidate], rng: np.random.Generator) -> dict[str, Ranked]:
-    """Return for each effect the linear estimate of its parameters with their plausible range, and how often it comes first."""
+    """Return for each effect the linear estimate of its parameters with their plausible range, and the share of draws in which it is first."""
     ones = one_each(first)
     often = _first_share(data, fit, ones, rng)
     return {c.effect.name: Ranked(tuple(_estimates(c)), None if often is None else often[i]) for i, c in enumerate(ones)}
@@ -47,9 +47,9 @@ def _ends(a: float, b: float) -> tuple[float, float]:
 
 
 def _first_share(data: Data, fit: JointFit, ones: list[Candidate], rng: np.random.Generator) -> list[float] | None:
-    """Return how often each effect has the best linear score when whole sweeps are drawn with replacement; None for few sweeps.
+    """Return the share of bootstrap draws of sweeps in which each effect has the best linear score; None for few sweeps.
 
-    Nuisance is projected out anew in each draw. Rows that belong to no sweep (placements, declared poses, priors) stay.
+    The nuisance columns are projected out again in each draw. Rows without a sweep (placements, declared poses, priors) stay.
     """
     groups = sweep_rows(data.train, fit)
     if len(groups) < LEAST_SWEEPS or not ones:
@@ -82,7 +82,7 @@ def without_first(gram: FloatArray, p: int) -> FloatArray:
 
 
 def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> float:
-    """Return by how much columns a … b lower the sum of squares of the last one; a single parameter stays within its bounds."""
+    """Return the decrease of the sum of squares of the last column by columns a … b; a single parameter stays within its bounds."""
     if c.effect.discrete:
         return float(-2.0 * size[0] * G[a, -1] - size[0] ** 2 * G[a, a])
     if G[a:b, a:b].trace() <= 0:
@@ -94,14 +94,14 @@ def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> floa
     return float(-2.0 * step @ G[a:b, -1] - step @ G[a:b, a:b] @ step)
 
 
-def confounding_map(first: list[Candidate], decides: Thresholds) -> ConfoundingMap:
-    """Return how much of each effect's field (row) is collinear with that of another one (column), nuisance projected out."""
-    shown = [c for c in one_each(first) if c.retained >= decides.testable][:MAP]
+def confounding_map(first: list[Candidate], thresholds: Thresholds) -> ConfoundingMap:
+    """Return the share of each effect's field (row) that is collinear with that of another one (column), nuisance projected out."""
+    shown = [c for c in one_each(first) if c.retained >= thresholds.testable][:MAP]
     return ConfoundingMap(tuple(c.effect.name for c in shown), tuple(tuple(confounding(a, b) for b in shown) for a in shown))
 
 
 def power(last: list[Candidate]) -> dict[str, tuple[Size, ...]]:
-    """Return the smallest change of each parameter of each effect that would have been seen, in its own unit."""
+    """Return the smallest detectable change of each parameter of each effect, in its unit."""
     return {c.effect.name: tuple(_sizes(c)) for c in one_each(last)}
 
 
@@ -112,7 +112,7 @@ def _sizes(c: Candidate) -> list[Size]:
 
 
 def own_size(size: float, scale: str) -> float | None:
-    """Return a size in a coordinate as a change of the value, a factor on it, or the stiffness below which it is; None where it cannot be seen."""
+    """Return a size in a coordinate as a change of the value, a factor on it, or an upper limit of a stiffness; None if it is not detectable."""
     if not np.isfinite(size) or size <= 0:
         return None
     if scale == "log":

@@ -1,4 +1,4 @@
-"""What these data cannot distinguish: refits with as much evidence, fields that agree, and effects that are collinear with a named nuisance."""
+"""Limits of the data: alternatives with as much evidence, collinear fields, and effects that a nuisance effect absorbs."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.search.input_offset import OFFSETS
 from femsense.loop.search.screening import confounding, one_each
 from femsense.loop.search.search_state import Search
-from femsense.loop.search.swaps import stand_ins
+from femsense.loop.search.swaps import alternatives_to
 from femsense.loop.thresholds import Thresholds
 
 
-def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
-    """Return pairs that these data cannot distinguish: what is named, and what might be in its place."""
+def confounded(search: Search, names: Sequence[str], thresholds: Thresholds) -> list[ConfoundedPair]:
+    """Return the pairs that these data cannot distinguish: an accepted effect, and a possible alternative."""
     found: dict[frozenset[str], ConfoundedPair] = {}
     asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common, _alike
-    for pair in (pair for ask in asked for pair in ask(search, names, decides)):
+    for pair in (pair for ask in asked for pair in ask(search, names, thresholds)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
     return list(found.values())
 
 
 def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
-    """Return what two findings say of a pair: the smaller gap, and the larger shares."""
+    """Return two findings on a pair combined: the smaller gap, and the larger shares."""
 
     def chosen(of: Callable[[Iterable[float]], float], *values: float | None) -> float | None:
         known = [v for v in values if v is not None]
@@ -42,108 +42,108 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
     )
 
 
-def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], decides: Thresholds) -> str:
-    """Return sentences on what might be in the place of what is named, by refits or by what calibration absorbs; nothing where there is nothing."""
+def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], thresholds: Thresholds) -> str:
+    """Return sentences on the alternatives to the accepted effects, by refits or by absorption; empty if there are none."""
     instead: dict[str, list[str]] = {}
     stands_for: dict[str, list[str]] = {}
     for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
-        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= decides.evidence
+        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= thresholds.evidence
         for own, other in (pair.pair, pair.pair[::-1]):
             if own in names and other not in names:
                 (stands_for if far else instead).setdefault(own, []).append(other)
     said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
     told = [f"{own} may stand for {' or '.join(others)}" for own, others in stands_for.items()]
-    return (f" These data do not tell {', nor '.join(said)}." if said else "") + (
-        f" As the model still errs, {', and '.join(told)}." if told else ""
+    return (f" These data do not distinguish {', nor '.join(said)}." if said else "") + (
+        f" Because of the remaining model error, {', and '.join(told)}." if told else ""
     )
 
 
-def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose refits are within `evidence` of a named one's, or make a named nuisance needless with as much evidence."""
+def _as_evident(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects whose refits are within `evidence` of an accepted one's, or that replace an accepted nuisance effect with as much evidence."""
     ours = _named(search, names)
     for own in ours:
         for r in search.refits:
-            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - decides.evidence:
+            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - thresholds.evidence:
                 yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
     for name in (n for n in names if n in NUISANCE):
         for r in (r for r in search.refits if name in (r.takes_over or ()) and r.name not in names):
             ahead = max((own.evidence for own in ours if own.answers_as(r)), default=0.0)
-            if r.evidence > max(decides.evidence, ahead - decides.evidence):
+            if r.evidence > max(thresholds.evidence, ahead - thresholds.evidence):
                 yield ConfoundedPair((name, r.name), dbic_gap=max(ahead - r.evidence, 0.0))
     swap = search.in_place
-    if swap is not None and abs(swap.ahead) < decides.evidence and {OFFSETS, swap.name} & set(names):
+    if swap is not None and abs(swap.ahead) < thresholds.evidence and {OFFSETS, swap.name} & set(names):
         yield ConfoundedPair((OFFSETS, swap.name), dbic_gap=abs(swap.ahead))
 
 
-def _in_place_of_an_error(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects that pass alone and have nothing left beside what is named, where the weights hold the error of the model: by how much the named
-    one is ahead then says how well it makes up for that error, too."""
+def _in_place_of_an_error(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects that pass by themselves and are not needed in addition to the accepted ones, if the weights include the model error: evidence then also
+    measures how well an effect compensates for that error."""
     if search.noise.assumed is None:
         return
     for own in _named(search, names):
-        for r in stand_ins(own, search.refits, search.last):
+        for r in alternatives_to(own, search.refits, search.last):
             if r.name not in names:
                 yield ConfoundedPair((own.name, r.name), dbic_gap=max(own.evidence - r.evidence, 0.0))
 
 
 def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:
-    """Return the refits of what is named, but for a mesh without which nothing converges: that has no dBIC."""
+    """Return the refits of the accepted effects, without a mesh that has no dBIC because nothing else converges."""
     ours = [r for r in search.refits if r.name in names and r.dbic is not None]
     return [r for r in ours if r.is_named or r.in_place_of == r.name]
 
 
-def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects that this recording cannot test because most of each is collinear with one named nuisance, with the share that calibration absorbs."""
+def _absorbed(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects that are not testable because they are collinear with one accepted nuisance effect, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = J[:, : fit.own]
     present = search.final.fit.hypothesis.names
-    hidden = [c for c in one_each(search.first) if c.retained < decides.testable and c.effect.name not in present]
+    hidden = [c for c in one_each(search.first) if c.retained < thresholds.testable and c.effect.name not in present]
     for name in (n for n in names if n in NUISANCE):
         own = np.hstack([poses, J[:, fit.own :][:, span_of(fit, name)]])
         for c in hidden:
             whole = beside(poses, c.columns - J @ c.response)
-            if np.linalg.norm(beside(own, whole)) < (1.0 - decides.alike**2) ** 0.5 * np.linalg.norm(whole):
+            if np.linalg.norm(beside(own, whole)) < (1.0 - thresholds.alike**2) ** 0.5 * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
-def _in_common(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield a named nuisance and what looks like it where all its parameters move alike (a modulus, and a gain that all cables have in common), where
-    calibration absorbs that: one parameter alone, as the gain of one cable, it does not."""
+def _in_common(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield an accepted nuisance effect with an effect that equals it when all its parameters move together (the modulus, and a gain common to all cables), if
+    calibration absorbs that combination. A single parameter, such as the gain of one cable, is not absorbed."""
     for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
         for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
             if alias.common and alias.name in names:
-                yield from _common(search, alias.name, effect.name, decides)
+                yield from _common(search, alias.name, effect.name, thresholds)
 
 
-def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
+def _common(search: Search, own: str, other: str, thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield an accepted nuisance effect with an effect whose parameters move together, if calibration absorbs that combination."""
     forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
     fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
     left = widest.columns.sum(axis=1)
     J = np.asarray(fit.fit.jacobian)
     size = float(np.linalg.norm(beside(J[:, : fit.own], left - J @ widest.response.sum(axis=1))))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
-    if retained < decides.testable:
+    if retained < thresholds.testable:
         yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))
 
 
-def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose fields agree with that of a named one, once what calibration may move is projected out: those that explain more than they
-    cost, and that no refits distinguish."""
-    ones = [c for c in one_each(search.first) if c.retained >= decides.testable]
+def _alike(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects with a field collinear with that of an accepted one after calibration is projected out, if they have a positive score and refits do not
+    distinguish them."""
+    ones = [c for c in one_each(search.first) if c.retained >= thresholds.testable]
     for a in (c for c in ones if c.effect.name in names):
         for b in (c for c in ones if c is not a and c.score > 0.0):
             share = min(confounding(a, b), confounding(b, a))
-            if share > decides.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, decides):
+            if share > thresholds.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, thresholds):
                 yield ConfoundedPair((a.effect.name, b.effect.name), cosine=share)
 
 
-def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
-    """Return whether refits of another effect in the place of a named one brought less by `evidence`."""
+def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, thresholds: Thresholds) -> bool:
+    """Return whether refits of another effect in place of an accepted one have less evidence by at least `evidence`."""
     for named in (r for r in _named(search, names) if r.name == own and r.is_named):
         there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
-        tried = [dbic for dbic in there if np.isfinite(dbic)]  # one that was stopped early has none
-        if tried and max(tried) <= named.evidence - decides.evidence:
+        tried = [dbic for dbic in there if np.isfinite(dbic)]  # a fit that stopped early has none
+        if tried and max(tried) <= named.evidence - thresholds.evidence:
             return True
     return False

@@ -1,8 +1,8 @@
-"""What a model means for the forces that are sensed with it: at declared loads, or where nothing is declared by its compliance.
+"""Consequence of a model change for estimated forces: at declared loads, or if there are none, by the compliances.
 
-A smaller error of shape with a wrong effect can make forces worse; this is where it would show. All of it is linear about the state
-in which the declared load acts, with one factorisation a frame and model:  δf = argmin |r − C δf|²,  C the markers' answer to unit
-forces at the place of the load, r the residual with the declared load; sensed = declared + δf.
+A smaller residual obtained with a wrong effect can make forces worse; these tables show it. The analysis is linear about the state under the
+declared load, with one factorisation per frame and model:  δf = argmin |r − C δf|²,  C the response of the markers to unit forces at
+the load's place, r the residual with the declared load; estimated force = declared + δf.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from femsense.model.observation import SceneJet, placements
 from femsense.model.robot import Robot, spread_features
 
 POINTS = 8
-"""Places of the body at which compliances are compared, and frames with known loads at most."""
+"""Number of places at which compliances are compared, and maximum number of frames with known loads."""
 FIELD_POINTS = 48
-"""Points of the surface that carry the field of equivalent forces."""
+"""Number of surface points that carry the field of equivalent forces."""
 WEAKEST = 0.03
-"""Directions of force that the markers see less than this, relative to the best one, are left as declared."""
+"""Directions of force with a singular value of C below this share of the largest keep their declared value."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """One trial as a model has it."""
+    """One trial evaluated with a model."""
 
     robot: Robot
     trial: Trial
     jet: SceneJet
     poses: list[FloatArray]
     recording: int
-    """Number of the recording; those for validation come after the others."""
+    """Number of the recording; validation recordings come last."""
     held_out: bool
 
     def rows(self, frame: int) -> IntArray:
-        """Return the rows of the residual that belong to a frame."""
+        """Return the rows of the residual in a frame."""
         return np.flatnonzero(self.trial.scene.frame == frame)
 
     def number(self, frame: int) -> int:
-        """Return the number that frames.csv gives a frame."""
+        """Return the number of a frame in frames.csv."""
         return int(self.trial.scene.recording.frame_numbers[frame])
 
     def tangent(self, frame: int) -> Tangent:
@@ -59,7 +59,7 @@ class View:
         return tangent_at(self.robot.body, self.jet.states[frame])
 
     def answers(self, tangent: Tangent, frame: int, places: FloatArray) -> FloatArray:
-        """Return how the markers of a frame answer to unit forces along x, y, z at places of the body at rest [m/N], (3k, 3p)."""
+        """Return C, the response of the markers of a frame to unit forces along x, y, z at places of the body at rest [m/N], (3k, 3p)."""
         mesh, rows = self.robot.body.mesh, self.rows(frame)
         ties = embed_points(mesh, places)
         units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
@@ -71,18 +71,18 @@ class View:
 
     @property
     def vectors(self) -> FloatArray:
-        """Residuals as vectors of the robot frame [m], shape (k, 3): those of clouds along the normals."""
+        """Residuals as vectors in the robot frame [m], shape (k, 3); those of clouds along the normals."""
         return vectors_of(self.trial, self.jet.residual, self.poses)
 
     @property
     def measured(self) -> FloatArray:
-        """Measured points [m], shape (k, 3), robot frame; of clouds where the normals cross the measured surface."""
+        """Measured points [m], shape (k, 3), robot frame; for clouds, where the normals cross the measured surface."""
         scene = self.trial.scene
         return in_robot_frame(scene.points, scene.view, self.poses, self.robot.in_recording(scene.recording.label).observation)
 
 
 def views_of(data: Data, fitted: FittedModel) -> list[View]:
-    """Return one trial of each recording as a fitted model has it: the fitted ones, then those that are held out. Markers come before clouds."""
+    """Return one trial per recording evaluated with a fitted model: the fitted ones, then the held-out ones; markers before clouds."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     poses, numbers = poses_and_inputs(data, fitted.fit), numbers_of(data.train)
     known = [View(robot, data.train[i], fitted.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
@@ -95,7 +95,7 @@ def views_of(data: Data, fitted: FittedModel) -> list[View]:
 
 
 def force_consequence(before: list[View], after: list[View], noise: Noise) -> ForceImpact:
-    """Return what both models make of forces: at loads where these are declared, else by compliance; nothing where neither can be had."""
+    """Return the forces of both models: at declared loads, or if there are none, by compliance; empty if neither can be computed."""
     pairs = list(zip(before, after))
     loaded = [(a, b, k) for a, b in pairs if a.held_out for k in _loaded_frames(a)]
     loaded = loaded or [(a, b, k) for a, b in pairs for k in _loaded_frames(a)]
@@ -116,7 +116,7 @@ def _loaded_frames(view: View) -> list[int]:
 
 
 def _at_loads(before: View, after: View, frame: int, noise: Noise) -> LoadRow | None:
-    """Return the strongest declared load of a frame next to what either model senses there."""
+    """Return the largest declared load of a frame, and the force that each model estimates there."""
     recording = before.trial.scene.recording
     own = np.flatnonzero(recording.load_frame == frame)
     if any(len(view.rows(frame)) < len(own) for view in (before, after)):
@@ -134,7 +134,7 @@ def _at_loads(before: View, after: View, frame: int, noise: Noise) -> LoadRow | 
 
 
 def forces_from(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
-    """Return the forces that explain a residual best, and their covariance; directions that the markers hardly see stay at zero."""
+    """Return the least-squares forces of a residual and their covariance; poorly determined directions (WEAKEST) stay at zero."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     keep = s > WEAKEST * s[0]
     inverse = Vt[keep].T / s[keep]
@@ -142,10 +142,10 @@ def forces_from(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatA
 
 
 def _compliances(before: View, after: View) -> Compliance:
-    """Return how much a sensed force changes from model to model where no load is declared.
+    """Return the change of an estimated force between models where no load is declared.
 
-    A dent d along the normal is sensed as d / W, so that forces change by W_before / W_after. `phantom` is the force at the free end
-    that each model would have sensed from its residual, where nothing touches.
+    An indentation d along the normal is interpreted as the force d / W, so that forces change by W_before / W_after. `phantom` is the force at
+    the free end that the residual of each model would be interpreted as, in a contact-free frame.
     """
     frames = chosen_frames(before)
     declared = before.robot.body.mesh
@@ -171,7 +171,7 @@ def tuples_of(rows: FloatArray) -> tuple[tuple[float, ...], ...]:
 
 
 def chosen_frames(view: View) -> list[tuple[str, int]]:
-    """Return three frames of a trial, (title, index): the least driven, one half way and the most driven; by time where nothing drives."""
+    """Return three frames of a trial, (title, index): the least driven, one half way and the most driven; by time if the inputs are constant."""
     frames = view.trial.scene.frames
     drive = actuation_of(view.trial.scene.recording)[frames]
     if np.ptp(drive) == 0:
@@ -186,10 +186,10 @@ def chosen_frames(view: View) -> list[tuple[str, int]]:
 
 
 def equivalent_forces(views: list[View], noise: Noise) -> ForceField | None:
-    """Return forces on the surface that would explain the frame with the largest residual; a picture, no evidence.
+    """Return surface forces that would fit the frame with the largest residual; an illustration, not evidence.
 
-    Any residual is some field of forces. The field is the smallest one (Tikhonov) that leaves the noise: |C f − r|² = 3 k σ².
-    None where that frame holds no more than noise.
+    Every residual can be written as a field of forces. This is the smallest one (Tikhonov) that leaves the noise, |C f − r|² = 3 k σ².
+    None if that frame does not exceed the noise.
     """
     worst = max(((v, int(k)) for v in views for k in v.trial.scene.frames), key=lambda at: _mean_square(*at))
     view, frame = worst
@@ -221,7 +221,7 @@ def _mean_square(view: View, frame: int) -> float:
 
 
 def smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
-    """Return the smallest f with |C f − r|² ≤ goal, or where none comes so near the least regular one that still is stable."""
+    """Return the smallest f with |C f − r|² ≤ goal; if there is none, the least regularised one that is stable."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     b = U.T @ r
     outside = float(r @ r - b @ b)

@@ -1,4 +1,4 @@
-"""The F test of lack of fit against pure error, from states that are reached again."""
+"""The F test of lack of fit against pure error, from repeated states."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from femsense.model.repeats import LEAST_REPEATS
 
 
 def tested(trials: list[Trial], residuals: list[FloatArray], fit: JointFit, structure: Structure) -> Tested:
-    """Return the tests of residuals [m], (k, c) a trial, that a fit leaves."""
+    """Return the tests of the residuals [m], (k, c) per trial, of a fit."""
     return Tested(structure, lack_of_fit(trials, residuals, len(fit.fit.theta)), fit.rms)
 
 
 def lack_of_fit(trials: list[Trial], residuals: list[FloatArray], parameters: int) -> LackOfFit | None:
-    """Return the F test of lack of fit against pure error; None where too little is repeated.
+    """Return the F test of lack of fit against pure error; None if too few states repeat.
 
-    A repeat is a state that is reached again from the same state before it; frames of one stay in a state are averaged first, since
-    they share their error. F = [Σ n c̄² / (cells − parameters)] / [Σ (c − c̄)² / (stays − cells)] over the cells (state, marker).
+    A repeat is a state reached again from the same previous state. Frames of one stay share their error and are averaged first.
+    F = [Σ n c̄² / (cells − parameters)] / [Σ (c − c̄)² / (stays − cells)] over the cells (state, marker); under the null hypothesis
+    that the model is complete, F has the F distribution with these degrees of freedom.
     """
     from scipy.stats import f as fisher
 

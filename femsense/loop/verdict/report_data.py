@@ -1,4 +1,4 @@
-"""What the report shows besides the verdict: figures in numbers, so that loop.json alone is enough to draw them."""
+"""Data for the figures of the report, so that loop.json alone suffices to draw them."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from femsense.loop.verdict.lack_of_fit import tested
 from femsense.loop.verdict.residual_diagnostics import frame_rms, structure_tests
 
 MOST_NODES = 4000
-"""A skin with more corners than this is drawn at rest only."""
+"""Largest number of corners of a surface that is drawn deformed."""
 
 
 def gather(
     data: Data, search: Search, back: FittedModel, shown: FittedModel, after_tests: Structure, rng: np.random.Generator
 ) -> Evidence:
-    """Return what the figures and tables of the report need.
+    """Return the data for the figures and tables of the report.
 
     Arguments:
         data: the recordings, split.
-        search: what was found in them.
-        back: what is handed back; `shown`: that or the last model of the search, whose residual is what is left.
-        after_tests: tests of structure at the end.
+        search: its record.
+        back: the returned model; `shown`: that or the last model of the search, whose residual is reported.
+        after_tests: tests of structure of the reported residual.
         rng: of the bootstrap and the permutations.
     """
     before, noise = search.before, search.noise
@@ -80,7 +80,7 @@ def _label(view: View) -> list[str]:
 
 
 def _frame_table(old: list[View], new: list[View], score: list[tuple[FloatArray, FloatArray]]) -> FrameTable:
-    """Return one row for each frame of all trials, fitted ones first."""
+    """Return one row per frame of all trials, fitted ones first."""
     parts = [_frame_columns(a, b, *scores) for a, b, scores in zip(old, new, score)]
     return FrameTable(**{f.name: tuple(v for part in parts for v in getattr(part, f.name)) for f in fields(FrameTable)})
 
@@ -105,10 +105,10 @@ def _frame_columns(before: View, after: View, first: FloatArray, second: FloatAr
 
 
 def _pattern(data: Data, old: list[View], new: list[View]) -> tuple[list[tuple[FloatArray, FloatArray]], Pattern]:
-    """Return how strongly each frame shows the leading pattern of the residual before, (before, after) a trial [m], and what it goes with.
+    """Return the amplitude of the leading pattern of the residual before, by frame, (before, after) per trial [m], and its correlations.
 
-    The pattern is the first right singular vector of frames × markers, the mean of each marker over the frames of a trial taken off; a
-    score is the residual's component along it over √markers, so that it compares with a root mean square.
+    The pattern is the first right singular vector of frames × markers, after the mean of each marker over the frames of a trial is subtracted; an
+    amplitude is the residual's component along it over √markers, comparable with a root mean square.
     """
     count = len(data.robot.marker_names)
     names = sorted({int(m) for v in old for m in v.trial.scene.marker})
@@ -130,7 +130,7 @@ def _pattern(data: Data, old: list[View], new: list[View]) -> tuple[list[tuple[F
 
 
 def _grid(view: View, count: int) -> FloatArray:
-    """Return the residual as frames × (markers · 3) with the mean of each marker taken off; 0 where a marker is hidden."""
+    """Return the residual as frames × (markers · 3) with the mean of each marker subtracted; 0 if a marker is hidden."""
     scene = view.trial.scene
     grid = np.full((len(scene.frames), count, 3), np.nan)
     grid[np.searchsorted(scene.frames, scene.frame), scene.marker] = view.vectors
@@ -140,10 +140,10 @@ def _grid(view: View, count: int) -> FloatArray:
 
 
 def _tip(data: Data, old: list[View], new: list[View]) -> Tip | None:
-    """Return the way of the marker farthest from the clamp along its main direction of motion: measured, before and after.
+    """Return the path of the marker farthest from the clamp along its main direction of motion: measured, before and after.
 
-    Measured points are where the handed-back calibration puts them; a model stands at measured − residual. Clouds do not tell where a
-    point of the surface went: None.
+    Measured points are placed by the returned calibration; a model's points are measured − residual. None for clouds, which do not identify
+    material points.
     """
     if any(v.trial.scene.crossings is not None for v in old):
         return None
@@ -170,7 +170,7 @@ def _tip(data: Data, old: list[View], new: list[View]) -> Tip | None:
 
 
 def _pictures(data: Data, old: list[View], new: list[View]) -> Pictures:
-    """Return the skin of the declared body in three frames with the residuals there, and which way the cameras look."""
+    """Return the surface of the declared body in three frames with the residuals there, and the viewing directions of the cameras."""
     view, other = old[0], new[0]
     triangles = surface_triangles(to_linear(view.robot.body.mesh))
     corners, triangles = np.unique(triangles, return_inverse=True)

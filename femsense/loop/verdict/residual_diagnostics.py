@@ -1,4 +1,4 @@
-"""What a residual still holds: tests of structure, and what it goes with."""
+"""Diagnostics of a residual: tests of structure, and correlations."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from femsense.model.robot import Robot
 PERMUTATIONS = 499
 WORST_FRAMES = 5
 GOES_WITH = 8
-"""So many frames and covariates are listed."""
+"""Maximum number of listed frames, and of covariates."""
 
 
 def _structure(lag_one: float, p: dict[str, float], level: float) -> Structure:
-    """Return tests with the verdict on all of them together."""
+    """Return the tests with their joint verdict: the smallest p-value times their number, compared with the level."""
     least = min(p.values(), default=1.0)
     return Structure(lag_one, least, p, least * len(p) <= level)
 
@@ -27,14 +27,16 @@ def _structure(lag_one: float, p: dict[str, float], level: float) -> Structure:
 def structure_tests(
     trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator, level: float = DEFAULTS.structure
 ) -> Structure:
-    """Return tests for structure in residuals [m], (k, c) a trial; `level`: probability, over all tests together (Holm 1979), of calling mere noise structure.
+    """Return permutation tests for structure in residuals [m], (k, c) per trial; `level` is the probability of a false alarm of all tests together (Holm 1979).
 
-    * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
-      shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
-    * `pattern`: the largest singular value of states × markers, against shuffles of each marker's states among themselves (Horn 1965).
-    * `sweep`: the sweep with the largest mean square, against the same shuffles.
+    Marker means and state means are removed first. The statistics and their null distributions are
 
-    Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
+    * `neighbours`: T = Σ r_k·r_{k+1} / Σ |r_k|² over consecutive states of a sweep, under permutations of the states within sweeps. It is
+      independent of the scale, so that a wrong noise level cannot cause an alarm.
+    * `pattern`: the largest singular value of states × markers, relative to all, under permutations of the states of each marker (Horn 1965).
+    * `sweep`: the largest mean square of a sweep, relative to all, under the same permutations.
+
+    Errors of a cloud are correlated between neighbouring points, so that its states are permuted as a whole, and `pattern` is not tested.
     """
     if any(t.scene.crossings is not None for t in trials):
         return _cloud_tests(trials, residuals, rng, level)
@@ -51,7 +53,7 @@ def structure_tests(
 
 
 def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator, level: float) -> Structure:
-    """Return the tests of clouds, with those of the markers beside them where there are some."""
+    """Return the tests of clouds, together with those of the markers if there are some."""
     pairs = list(zip(trials, residuals))
     marked = [(t, r) for t, r in pairs if t.scene.crossings is None]
     markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng, level=level) if marked else None
@@ -67,7 +69,7 @@ def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.rando
 
 
 def _shuffled(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator) -> list[tuple[FloatArray, IntArray]]:
-    """Return fields with their states in another order, each whole."""
+    """Return fields with their states permuted as a whole."""
     return [(values[rng.permutation(len(values))], sweep) for values, sweep in fields]
 
 
@@ -76,7 +78,7 @@ def _share(null: FloatArray, observed: float) -> float:
 
 
 def _largest(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> tuple[float, float]:
-    """Return the largest singular value, and the largest mean square of a sweep, relative to all; with `rng` after shuffling."""
+    """Return the largest squared singular value and the largest mean square of a sweep, relative to all; with `rng` after a permutation."""
     singular, apart = 0.0, 0.0
     for values, sweep in fields:
         flat = values.reshape(len(values), -1)
@@ -112,7 +114,7 @@ def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
 
 
 def _mean_seen(values: FloatArray) -> FloatArray:
-    """Return the mean over the first axis of what is not NaN; NaN where all is."""
+    """Return the mean over the first axis without NaN; NaN if all are."""
     seen = np.isfinite(values)
     count = seen.sum(axis=0)
     total = np.where(seen, values, 0.0).sum(axis=0)
@@ -144,10 +146,9 @@ def describe_left(
     structure: Structure,
     explained_share: float,
 ) -> Left:
-    """Return what the remaining residual looks like: how large, where on the body, in which frames, which way, and what it goes with.
+    """Return the description of the remaining residual: size, place on the body, frames, direction, and correlations.
 
-    The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
-    The others are as of `Left`.
+    The direction is the first principal direction of the residuals of the worst marker, with the sign of their mean. The others are as of `Left`.
     """
     heads = heads_of(trials)
     trials, residuals = [trials[i] for i in heads], [residuals[i] for i in heads]
@@ -182,7 +183,7 @@ def describe_left(
 
 
 def frame_errors(trials: list[Trial], residuals: list[FloatArray]) -> list[FrameError]:
-    """Return what is left in each frame of each recording, in order: of its markers, where there are any, else of its clouds."""
+    """Return the residual of each frame of each recording, in order: of its markers, or if there are none, of its clouds."""
     return [
         FrameError(i, int(number), float(rms))
         for i, (t, r) in enumerate((trials[at], residuals[at]) for at in heads_of(trials))
@@ -198,13 +199,13 @@ def frame_rms(trial: Trial, residual: FloatArray) -> FloatArray:
 
 
 def _direction(vectors: FloatArray) -> tuple[FloatArray, float]:
-    """Return the unit vector that holds most of the mean square of vectors (k, 3), and the share it holds."""
+    """Return the first principal direction of vectors (k, 3) as a unit vector, and its share of their mean square."""
     _, s, Vt = np.linalg.svd(vectors, full_matrices=False)
     sign = -1.0 if float(vectors.mean(axis=0) @ Vt[0]) < 0 else 1.0
     return sign * Vt[0], float(s[0] ** 2 / max(float((s**2).sum()), 1e-300))
 
 
 def _share_of_half(rms_falling: FloatArray) -> float:
-    """Return the share of the frames, the worst first, that hold half of the mean square."""
+    """Return the share of the frames, the worst first, that contribute half of the mean square."""
     held = np.cumsum(rms_falling**2)
     return float((np.searchsorted(held, 0.5 * held[-1]) + 1) / len(held))

@@ -1,4 +1,4 @@
-"""The robot that is handed back: which of the effects that were found, and with which sizes."""
+"""The returned robot: which of the effects that were found it has, and their values."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from femsense.model.effects import OF_BODY, Effect, Entry, Parameter
 from femsense.model.robot import Robot
 
 (MODULUS,) = OF_BODY
-"""What calibration may move of the body."""
+"""The nuisance effect of the body: its modulus."""
 
 
 COMPARED = 3
-"""Frames of each held-out recording in which the robot that is handed back is asked for what the fitted model says."""
+"""Number of frames of each held-out recording in which the returned robot is compared with the fitted model."""
 
 
 def promoted_nuisances(data: Data, search: Search) -> list[str]:
-    """Return the nuisances that the data moved significantly away from what is declared; of the input offsets, those that are missed."""
+    """Return the nuisance effects with a significant deviation from the declared values; input offsets only if the data need them."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
     return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def is_sure(fitted: FittedModel, name: str, std: FloatArray, decides: Thresholds) -> bool:
-    """Return whether a value of a nuisance differs from what is declared by more than `significant` of the standard deviations that are reported."""
-    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > decides.significant * std).any())
+def is_significant(fitted: FittedModel, name: str, std: FloatArray, thresholds: Thresholds) -> bool:
+    """Return whether a value of a nuisance effect deviates from the declared one by more than `significant` reported standard deviations."""
+    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > thresholds.significant * std).any())
 
 
-def sure_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
-    """Return the effects with a value of their own that is away from what is declared by more than `significant` of the standard deviations that are
-    reported, and those that have none (a law, a mesh). Places and times are no such values, nor is a weight that no robot can be without."""
+def significant_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
+    """Return the effects with a value that deviates from its null by more than `significant` reported standard deviations, and those without such a value
+    (a law, a mesh). Places and times do not count, nor does a weight, which every robot has."""
     terms = {effect.name: (effect, parameters) for effect, _, parameters in fitted.fit.hypothesis.terms}
     return [name for name in names if name not in terms or _is_away(data, fitted, *terms[name], std[name])]
 
@@ -66,13 +66,13 @@ def _is_away(data: Data, fitted: FittedModel, effect: Effect, parameters: Sequen
     return bool((off > data.thresholds.significant * std)[sized].any())
 
 
-def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
-    """Return the names that are handed back with their model: with all that was fitted along or, where held-out data speak against that, fitted again
-    without the nuisances that are not named. Nuisances that are as declared there are not named, and from the last one on neither is what would make
-    the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+def returnable_effects(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
+    """Return the names of the returned effects and their model: with all nuisance effects or, if held-out data reject that, refitted without those that are
+    not accepted. A nuisance effect that equals its declared value in that model is removed; then, from the last one on, effects that enlarge the
+    held-out error or reach a bound of their plausible range."""
     while names:
         models = [_inside(data, search, kept) for kept in ([*NUISANCE, *names], names)]
-        back = next((m for m in models if m is not None and _may_be_handed_back(data, search, m)), None)
+        back = next((m for m in models if m is not None and _is_returnable(data, search, m)), None)
         idle = [] if back is None else [n for n in promoted if n in names and not moved_nuisance(data, back, n)]
         if back is not None and not idle:
             return names, back
@@ -80,36 +80,36 @@ def worth_handing_back(data: Data, search: Search, promoted: list[str], names: l
     return [], search.before
 
 
-def surely_handed_back(
-    data: Data, search: Search, promoted: list[str], sure: list[str], seed_std: dict[str, FloatArray]
+def returned_effects(
+    data: Data, search: Search, promoted: list[str], significant: list[str], seed_std: dict[str, FloatArray]
 ) -> tuple[list[str], FittedModel, list[str]]:
-    """Return the names that are handed back with their model, and the names that are sure beside what is not handed back, but not without it.
+    """Return the names of the returned effects, their model, and the effects that are significant only together with removed ones.
 
-    Where something that was found is gone, the others are fitted again, and asked again whether they are sure.
+    After an effect is removed, the others are refitted and tested for significance again.
     """
-    unsure = list[str]()
+    insignificant = list[str]()
     while True:
-        names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
+        names, back = returnable_effects(data, search, promoted, [*promoted, *significant])
         if not names or back is search.final:
-            return names, back, unsure
+            return names, back, insignificant
         std = parameter_std(data, back, search.noise, seed_std)
-        kept = [n for n in names if n in promoted and is_sure(back, n, std[n], data.thresholds)]
-        kept += sure_effects(data, back, [n for n in names if n not in promoted], std)
+        kept = [n for n in names if n in promoted and is_significant(back, n, std[n], data.thresholds)]
+        kept += significant_effects(data, back, [n for n in names if n not in promoted], std)
         if len(kept) == len(names):
-            return names, back, unsure
-        unsure += [n for n in names if n not in kept]
-        promoted, sure = [n for n in promoted if n in kept], [n for n in sure if n in kept]
+            return names, back, insignificant
+        insignificant += [n for n in names if n not in kept]
+        promoted, significant = [n for n in promoted if n in kept], [n for n in significant if n in kept]
 
 
 def _inside(data: Data, search: Search, names: Sequence[str]) -> FittedModel | None:
-    """Return the model of some names, with places and times still where one of them would go to the edge of its range; None where it has no equilibrium."""
-    back = _handed_back(data, search.final, names, search.noise)
+    """Return the model of some effects; if one reaches a bound, with places and times fixed. None without equilibrium."""
+    back = _returned_model(data, search.final, names, search.noise)
     if back is None or not at_edge(back.fit):
         return back
-    return _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
+    return _returned_model(data, with_seeds_still(data, search.final), names, search.noise)
 
 
-def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
+def _is_returnable(data: Data, search: Search, back: FittedModel) -> bool:
     return not at_edge(back.fit) and not set(OF_BODY) & set(at_edge(back.fit, nuisance=True)) and holds_out(data, search, back)
 
 
@@ -119,38 +119,41 @@ def has_effects(names: Iterable[str]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutComparison:
-    """A model beside the declared one, on held-out data."""
+    """A model compared with the declared one, on held-out data."""
 
     error: float
-    """Its error, in that of the declared model."""
+    """Ratio of the errors."""
     gain: float
-    """By how much χ² falls."""
+    """Decrease of χ²."""
     beyond_mesh: float
-    """Its error less the likeliest share of the discretisation error, in that of the declared model."""
+    """Ratio of the errors after the most likely discretisation error is subtracted."""
     error_to_base: float
-    """Its error, in that of the model with all that calibration may move."""
+    """Ratio of its error to that of the model with all nuisance effects."""
     only_calibrated: bool
-    """Whether it has no effect but what calibration may move."""
+    """Whether it contains nuisance effects only."""
     with_offsets: bool = False
-    """Whether input offsets are among that."""
+    """Whether these include input offsets."""
 
-    def holds(self, decides: Thresholds) -> bool:
-        """Return whether the model is no worse in millimetres; or else better by the noise that these data have, where it is calibrated only and
-        within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than the model
-        with all that calibration may move, and not be input offsets alone."""
-        if self.error <= decides.not_worse:
+    def holds(self, thresholds: Thresholds) -> bool:
+        """Return whether the held-out data accept the model.
+
+        They do if its error does not exceed the declared model's by more than `not_worse`. Otherwise χ² must fall (by `evidence` for calibration alone), and
+        either it is calibration alone and the ratio is below `noisy`, or only the discretisation error makes it larger: the errors without it, and relative
+        to the fully calibrated model, are within `not_worse`, and it is not a calibration with input offsets.
+        """
+        if self.error <= thresholds.not_worse:
             return True
-        if self.gain <= (decides.evidence if self.only_calibrated else 0.0):  # effects have been judged by held-out data before
+        if self.gain <= (thresholds.evidence if self.only_calibrated else 0.0):  # effects have already passed a held-out test
             return False
-        if self.only_calibrated and self.error <= decides.noisy:
+        if self.only_calibrated and self.error <= thresholds.noisy:
             return True
-        only_offsets = self.only_calibrated and self.with_offsets  # much else looks like them
-        shown = not only_offsets and self.error_to_base <= decides.not_worse
-        return shown and self.beyond_mesh <= decides.not_worse
+        only_offsets = self.only_calibrated and self.with_offsets  # many missing effects resemble input offsets
+        shown = not only_offsets and self.error_to_base <= thresholds.not_worse
+        return shown and self.beyond_mesh <= thresholds.not_worse
 
 
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
-    """Return whether a model holds on held-out data beside the declared one."""
+    """Return whether a model is accepted by held-out data, compared with the declared one."""
     names = back.fit.hypothesis.names
     before, after = held_beyond_mesh(data, search, back)
     compared = HeldOutComparison(
@@ -165,13 +168,13 @@ def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
 
 
 def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:
-    """Return the held-out errors before and after [m] less the likeliest share of the discretisation error."""
+    """Return the held-out errors before and after [m], with the most likely discretisation error subtracted."""
     before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
     return before, after
 
 
-def _handed_back(data: Data, final: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel | None:
-    """Return the model of some names alone, fitted again where others are gone; None where it has no equilibrium."""
+def _returned_model(data: Data, final: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel | None:
+    """Return the model of some effects, refitted if others are removed; None without equilibrium."""
     if {effect.name for effect, _, _ in final.fit.hypothesis.terms} <= set(names):
         return final
     try:
@@ -181,8 +184,8 @@ def _handed_back(data: Data, final: FittedModel, names: Sequence[str], noise: No
 
 
 def entries_of(fitted: FittedModel, names: list[str]) -> list[Entry]:
-    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found, then what was
-    fitted along and is not named."""
+    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found, then nuisance effects
+    that are not listed as effects."""
     settled = [{"name": effect.name, **seed} for effect, seed in fitted.fit.hypothesis.settled]
     tables = {e["name"]: e for e in fitted.fit.hypothesis.entries(fitted.fit.coordinates)}
     order = [*(name for name in names if name in tables), *(name for name in tables if name not in names)]
@@ -190,13 +193,13 @@ def entries_of(fitted: FittedModel, names: list[str]) -> list[Entry]:
 
 
 def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> float:
-    """Return how far markers are between a robot and the fitted model that it should be [m], root mean square, in some of the held-out states.
+    """Return the rms distance of markers between a robot and the fitted model that it represents [m], in some of the held-out states.
 
     Arguments:
-        data: what was held out; clouds are not asked.
-        robot: the declared robot with the effects that are handed back, as whoever loads its file has it.
+        data: held-out data; clouds are skipped.
+        robot: the declared robot with the returned effects, as loaded from its file.
         back: the fitted model.
-        noise: with which poses of other recordings are fitted.
+        noise: weights for the poses of held-out recordings.
 
     Raises:
         DataError: the robot has no equilibrium there.

@@ -18,9 +18,9 @@ from femsense.loop.thresholds import DEFAULTS, Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
 MOST_LISTED = 3
-"""Effects that are listed."""
+"""Maximum number of effects that are listed."""
 ROUNDED = 1e-6
-"""What is so small beside the largest component of a vector, or beside its standard deviation, is said as 0."""
+"""Components below this share of the largest one of a vector, or of their standard deviation, are written as 0."""
 
 
 def verdict_in_words(
@@ -30,58 +30,58 @@ def verdict_in_words(
     before: FittedModel,
     after: FittedModel,
     budget: ModelError,
-    decides: Thresholds = DEFAULTS,
+    thresholds: Thresholds = DEFAULTS,
 ) -> str:
-    """Return the sentence on top: the verdict, the held-out error, and how much of that is an error of the model."""
+    """Return the verdict as a sentence, with the held-out error and the share of model error in it."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= decides.noisy * np.hypot(known, mesh):
+    if verdict == NONE and before.held_rms <= thresholds.noisy * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        own = finer if mesh and before.held_rms > decides.noisy * known else ""
-        return f"The model explains the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
-    of_it = f"of it {1e3 * budget.held_out_m:.2f} mm is an error of the model, {_noise_in_words(budget)} noise"
+        own = finer if mesh and before.held_rms > thresholds.noisy * known else ""
+        return f"The model fits the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
+    of_it = f"of which {1e3 * budget.held_out_m:.2f} mm is model error and {_noise_in_words(budget)} noise"
     if verdict == NONE:
         costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
-        return f"Nothing that was tried explains more of the data: {error}, {of_it}{costs}." + _mesh_in_words(budget)
+        return f"No effect that was tried improves the fit: {error}, {of_it}{costs}." + _mesh_in_words(budget)
     where = "" if after.held_residuals and after.held_residuals[0].shape[1] == 3 else " along the normals of the surface"
     if verdict == UNEXPLAINED and not effects:
-        explains = "nothing that may be handed back" if found else "no effect of the list"
-        return f"A residual is left that {explains} explains: {error}{where}, {of_it}." + _mesh_in_words(budget)
+        explains = "no effect that passes the tests fits" if found else "no known effect fits"
+        return f"A residual remains that {explains}: {error}{where}, {of_it}." + _mesh_in_words(budget)
     of_it += "".join(
         f", {1e3 * size:.2f} mm {name}"
         for name, size in ((MESH.name, mesh), ("places of markers", budget.placement_m))
         if size > 5e-6
     )
     what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
-    tail = "" if verdict == FOUND else " A residual is left that no effect explains."
+    tail = "" if verdict == FOUND else " A residual remains that no effect fits."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
 
 
 def _noise_in_words(budget: ModelError) -> str:
-    """Return the size of the noise, and whether it is measured."""
+    """Return the size of the noise, with a note if it is assumed."""
     size = f"{1e3 * budget.noise_m:.2f} mm"
-    return size if budget.noise_is_measured else f"perhaps {size} (no state repeats)"
+    return size if budget.noise_is_measured else f"about {size} (assumed: no state repeats)"
 
 
 def _mesh_in_words(budget: ModelError) -> str:
-    """Return a sentence on why the discretisation error is not known; nothing where it is."""
-    return f" The discretisation error is not known: {budget.discretisation_note}." if budget.discretisation_note else ""
+    """Return a sentence on why the discretisation error is unknown; empty if it is known."""
+    return f" The discretisation error is unknown: {budget.discretisation_note}." if budget.discretisation_note else ""
 
 
 def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
-    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
+    """Return a sentence with the held-out errors without discretisation error, if the held-out error has grown; else empty."""
     if back.held_rms <= data.thresholds.not_worse * search.before.held_rms or not mesh_errors(data):
         return ""
     before, after = held_beyond_mesh(data, search, back)
-    return f" Less the likeliest share of the discretisation error, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
+    return f" Without the most likely discretisation error it is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
 def on_linear(data: Data, back: FittedModel, names: Sequence[str], noise_m: float) -> str:
-    """Return a sentence on what is named on a linear mesh and may stand for its error; nothing elsewhere, or where that is an effect itself.
+    """Return a sentence on effects that may compensate for the discretisation error of a linear mesh; empty for quadratic elements or without such effects.
 
-    A modulus alone counts where the discretisation error is beyond the noise: it is the first to stand for it.
+    A modulus alone counts if the discretisation error exceeds the noise: it compensates most easily.
     """
     mesh = mesh_error_rms(data)
     if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic:
@@ -89,49 +89,49 @@ def on_linear(data: Data, back: FittedModel, names: Sequence[str], noise_m: floa
     if not has_effects(back.fit.hypothesis.names) and (not names or mesh <= noise_m):
         return ""
     return (
-        f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which what is named may stand for:"
-        f' declare mesh.element = "tet10" and ask again, or try {MESH.name} too.'
+        f" The effects may compensate for the discretisation error of the linear elements ({1e3 * mesh:.2f} mm):"
+        f' declare mesh.element = "tet10" and repeat, or also try {MESH.name}.'
     )
 
 
-def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:
-    """Return a sentence on effects that were found and are not handed back; of `unsure` ones no value is away from none. Nothing where there are none."""
+def evidence_for(data: Data, found: list[str], insignificant: list[str]) -> str:
+    """Return a sentence on effects that were found and are not returned; values of `insignificant` ones do not differ significantly from their null."""
     said = ""
-    others = [n for n in found if n not in unsure]
-    if unsure:
-        said = f" {', '.join(unsure)} would explain more, but with values no surer than three deviations."
+    others = [n for n in found if n not in insignificant]
+    if insignificant:
+        said = f" {', '.join(insignificant)} would improve the fit, but no value is significant (three standard deviations)."
     if not others:
         return said
     mesh = mesh_error_rms(data)
-    finer = f"; the discretisation error is {1e3 * mesh:.2f} mm, and a finer mesh may tell" if mesh else ""
+    finer = f"; the discretisation error is {1e3 * mesh:.2f} mm, and a finer mesh may decide" if mesh else ""
     return (
         said
-        + f" There is evidence for {', '.join(others)}, but the held-out error would grow with it or a value be implausible{finer}."
+        + f" There is evidence for {', '.join(others)}, but with it the held-out error grows or a value is implausible{finer}."
     )
 
 
 def by_noise(data: Data, measured: Repeatability) -> str:
-    """Return in words that what a state repeats to is beyond what cameras have; nothing where it is not."""
-    reach, decides = data.robot.body.reach, data.thresholds
-    if measured.total < decides.significant * decides.resolved * reach:
+    """Return a sentence if the noise exceeds that of any camera; else empty."""
+    reach, thresholds = data.robot.body.reach, data.thresholds
+    if measured.total < thresholds.significant * thresholds.resolved * reach:
         return ""
     return (
-        f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
-        " Look whether inputs belong to their frames and names to their markers and cables."
+        f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is larger than that of any camera: repeated frames differ."
+        " Check that inputs belong to their frames, and names to their markers and cables."
     )
 
 
-def everywhere_in_words(seen: AllRecordings | None, decides: Thresholds) -> str:
-    """Return what all recordings say of a model that was sought in some; nothing where it was sought in all."""
+def everywhere_in_words(seen: AllRecordings | None, thresholds: Thresholds) -> str:
+    """Return the results in all recordings of a model that was searched for in some; empty if all were searched."""
     if seen is None:
         return ""
     before, after = 1e3 * seen.before_validation_rms_m, 1e3 * seen.after_validation_rms_m
     said = (
-        f" Effects were sought in {seen.searched} of {seen.recordings} recordings and fitted to all: held-out error in all {before:.2f} mm "
+        f" {seen.searched} of {seen.recordings} recordings were searched, and the model was fitted to all: held-out error in all {before:.2f} mm "
         f"before, {after:.2f} mm after."
     )
-    more = [name for name, score in sorted(seen.dbic.items(), key=lambda item: -item[1]) if score > decides.evidence]
-    return said + (f" In all of them there is linear evidence for more: {', '.join(more[:MOST_LISTED])}." if more else "")
+    more = [name for name, score in sorted(seen.dbic.items(), key=lambda item: -item[1]) if score > thresholds.evidence]
+    return said + (f" In all recordings there is linear evidence for more: {', '.join(more[:MOST_LISTED])}." if more else "")
 
 
 def values_in_words(parameters: Mapping[str, Value]) -> str:

@@ -1,4 +1,4 @@
-"""What a closed loop says of effects, errors and data, as records."""
+"""Effects, errors and data of a closed loop, as records."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from femsense.loop.verdict.sentences import ROUNDED
 from femsense.model.effects.base import absent_elsewhere, placed
 
 DRAWS = 2000
-"""Draws of the bootstrap of the interval of the held-out error: of sweeps or, of fewer than LEAST_SWEEPS, of frames."""
+"""Number of bootstrap draws for the interval of the held-out error, over sweeps, or over frames if there are fewer than LEAST_SWEEPS sweeps."""
 
 # Effects
 
@@ -49,7 +49,7 @@ def chain_of_effects(
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
     models = dict(search.history)
     errors = []
-    for i in range(len(promoted) - (names == promoted)):  # the last one's is that of what is handed back
+    for i in range(len(promoted) - (names == promoted)):  # the last error is that of the returned model
         errors.append(_rough_error(data, models[""], promoted[: i + 1], search.noise))
     errors += [models[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     steps = zip(names, [search.before.held_rms, *errors], errors)
@@ -57,7 +57,7 @@ def chain_of_effects(
 
 
 def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise) -> float:
-    """Return the held-out error [m] of a fitted model with some of its terms only, fitted to some states; its own where they have no equilibrium."""
+    """Return the held-out error [m] of a fitted model with some of its terms, fitted to some states; without equilibrium its own error."""
     if set(fitted.fit.hypothesis.names) <= set(names):
         return fitted.held_rms
     try:
@@ -69,10 +69,10 @@ def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise
 
 
 def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> dict[str, Value]:
-    """Return the values of one effect; vectors and tables keep their shape. What was not fitted has std None.
+    """Return the values of one effect; vectors and tables keep their shape. Values that were not fitted have std None.
 
-    Values are those that are handed back, none where a fit moved them by next to nothing; standard deviations are not smaller than those of the full
-    fit, in which nothing was held still.
+    Values are those of the returned model, at their null if the fit moved them by less than ROUNDED standard deviations. Standard deviations are at
+    least those of the full fit, in which no number is held fixed.
     """
     result = dict[str, Value]()
     for effect, seed in back.fit.hypothesis.settled:
@@ -109,7 +109,7 @@ def _unit(key: str) -> str:
 
 
 def errors_of(data: Data, fitted: FittedModel, rng: np.random.Generator) -> Errors:
-    """Return the errors of a model: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
+    """Return the errors of a model: of the markers, and along the normals of the clouds; without markers both are those of the clouds."""
     kind = max(r.shape[1] for r in fitted.held_residuals)
     interval, by = _interval(data, fitted, kind, rng)
     errors = Errors(fitted.fit.rms, fitted.held_rms, interval, by)
@@ -121,7 +121,7 @@ def errors_of(data: Data, fitted: FittedModel, rng: np.random.Generator) -> Erro
 
 
 def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generator) -> tuple[tuple[float, float], str]:
-    """Return the 95 % interval of the held-out error of markers (kind 3) or clouds (1) [m], and what was drawn again."""
+    """Return the 95 % interval of the held-out error of markers (kind 3) or clouds (1) [m], and the unit of the bootstrap."""
     pairs = [((r**2).sum(axis=1), t.groups) for r, t in zip(fitted.held_residuals, data.held) if r.shape[1] == kind]
     by_sweep = sum(np.unique(g.sweep).size for _, g in pairs) >= LEAST_SWEEPS
     blocks = [s[labels == g] for s, own in pairs for labels in [own.sweep if by_sweep else own.frame] for g in np.unique(labels)]
@@ -134,29 +134,29 @@ def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generat
 # Candidates
 
 
-def untestable(first: Sequence[Candidate], names: Collection[str], decides: Thresholds) -> list[Untestable]:
-    """Return the effects that these data cannot show, but for those that are named."""
+def untestable(first: Sequence[Candidate], names: Collection[str], thresholds: Thresholds) -> list[Untestable]:
+    """Return the effects that calibration absorbs in these data, without the accepted ones."""
     return [
         Untestable(c.effect.name, float(np.sqrt(max(0.0, 1.0 - c.retained**2))), c.retained)
         for c in one_each(list(first))
-        if c.retained < decides.testable and c.effect.name not in names
+        if c.retained < thresholds.testable and c.effect.name not in names
     ]
 
 
 def tried_effects(
-    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], decides: Thresholds
+    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], thresholds: Thresholds
 ) -> list[TriedEffect]:
     """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
     last = {c.effect.name: c for c in one_each(table)}
     screened = {c.effect.name for c in first}
-    unscreened = {r.name: r for r in reversed(refits) if r.name not in screened}  # the mesh is asked about without screening it
+    unscreened = {r.name: r for r in reversed(refits) if r.name not in screened}  # the mesh is tested without screening
     rows = [
         TriedEffect(r.name, r.seed, r.dchi2, r.dbic, None, None, own := _refits_of(r.name, refits), _verdict_of(own))
         for r in unscreened.values()
     ]
     for c in one_each(first):
         joint, end = _refits_of(c.effect.name, refits), last.get(c.effect.name)
-        verdict = _verdict_of(joint) if joint else _why_not(c, end, decides)
+        verdict = _verdict_of(joint) if joint else _why_not(c, end, thresholds)
         rows.append(TriedEffect(c.effect.name, c.seed, c.gain, c.score, c.retained, end.score if end else None, joint, verdict))
     return rows
 
@@ -166,24 +166,24 @@ def _refits_of(name: str, refits: Sequence[RefitRecord]) -> tuple[RefitRecord, .
 
 
 def _verdict_of(joint: Sequence[RefitRecord]) -> str:
-    """Return what became of an effect in all its joint refits: the best that was said of any."""
+    """Return the best verdict of an effect's joint refits, else the last one."""
     said = [r.verdict for r in joint]
     return next((v for v in (NAMED, PASSES) if v in said), said[-1])
 
 
-def _why_not(c: Candidate, end: Candidate | None, decides: Thresholds) -> str:
-    if c.retained < decides.testable:
+def _why_not(c: Candidate, end: Candidate | None, thresholds: Thresholds) -> str:
+    if c.retained < thresholds.testable:
         share = 100.0 * np.sqrt(max(0.0, 1.0 - c.retained**2))
         return f"not testable: {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it is absorbed by calibration"
-    if c.score > decides.evidence and end is not None and end.score <= decides.evidence:
-        return f"nothing is left for it once what is named is in the model (dBIC {c.score:.0f}, then {end.score:.1f})"
-    if c.score > decides.evidence:
-        return f"not refitted: far behind the best (dBIC {c.score:.0f})"
+    if c.score > thresholds.evidence and end is not None and end.score <= thresholds.evidence:
+        return f"the accepted effects fit its share of the residual (dBIC {c.score:.0f}, then {end.score:.1f})"
+    if c.score > thresholds.evidence:
+        return f"not refitted: its score is far below the best (dBIC {c.score:.0f})"
     return f"too little evidence (dBIC {c.score:.1f})"
 
 
 def detectable(table: list[Candidate], found: Collection[str]) -> dict[str, Detectable]:
-    """Return for each effect that was not found the smallest size that would have been seen, in the unit of its parameter."""
+    """Return the smallest detectable size of each effect that was not found, in the unit of its parameter."""
     return {c.effect.name: _smallest_seen(c) for c in one_each(table) if c.effect.name not in found}
 
 
@@ -202,7 +202,7 @@ def _smallest_seen(c: Candidate) -> Detectable:
 def data_card(
     data: Data, final: FittedModel, full_std: dict[str, FloatArray], noise: Noise, noise_source: str, n_effective: float
 ) -> DataCard:
-    """Return what the data are, how they were split, and what calibration moves beside all effects."""
+    """Return the data, their split, and the nuisance values of the final model."""
     moved = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
     heads = [data.train[i] for i in heads_of(data.train)]
     return DataCard(
@@ -227,7 +227,7 @@ def _frame_numbers(trials: list[Trial]) -> tuple[tuple[int, ...], ...]:
 
 
 def _cloud_card(data: Data, noise: Noise) -> CloudCard | None:
-    """Return what was used of clouds; None where they were not."""
+    """Return the cloud data that were fitted; None without clouds."""
     own = [t for t in data.train if t.scene.crossings is not None]
     if not own:
         return None
@@ -242,7 +242,7 @@ def _cloud_card(data: Data, noise: Noise) -> CloudCard | None:
 
 
 def residual_table(data: Data, before: FittedModel, after: FittedModel) -> Residuals:
-    """Return the held-out residuals of two models, as vectors of the robot frame [m]."""
+    """Return the held-out residuals of two models as vectors in the robot frame [m]."""
     recordings, frames, markers = list[int](), list[int](), list[str]()
     fields: tuple[list[tuple[float, ...]], ...] = ([], [])
     for i, at in enumerate(heads_of(data.held)):

@@ -1,4 +1,4 @@
-"""The conclusion: which effects are named, what is left, what these data cannot say, and the robot that is handed back."""
+"""The conclusion: accepted effects, remaining residual, limits of the data, and the returned robot."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from femsense.loop.verdict.residual_diagnostics import describe_left, frame_erro
 from femsense.loop.verdict.returned_model import (
     MODULUS,
     entries_of,
-    is_sure,
+    is_significant,
     prediction_gap,
     promoted_nuisances,
-    sure_effects,
-    surely_handed_back,
+    returned_effects,
+    significant_effects,
 )
 from femsense.loop.verdict.sentences import by_mesh, by_noise, everywhere_in_words, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
@@ -49,35 +49,37 @@ from femsense.model.effects import Entry, apply_effects
 from femsense.model.robot import Robot
 
 SAME = 0.01, 1e-5
-"""The robot that is handed back may differ from the fitted model by this share of what that leaves, or by this [m]."""
+"""Largest difference between the predictions of the returned robot and the fitted model: this share of the held-out error, or this [m]."""
 
 
 def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: bool = False) -> LoopResult:
-    """Return the verdict with all that the report shows; with an empirical correction of what is left if `correct`."""
+    """Return the result of a search, with the data of the report, and with an empirical correction if `correct`."""
     before, final, noise = search.before, search.final, search.noise
     std = parameter_std(data, final, noise, _seed_std(search))
     measured = repeatability(data, final, noise)
-    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n], data.thresholds)]
+    promoted = [n for n in promoted_nuisances(data, search) if is_significant(final, n, std[n], data.thresholds)]
     added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
-    sure = sure_effects(data, final, added, std)
-    names, back, unsure = surely_handed_back(data, search, promoted, sure, _seed_std(search))
-    drifted = MODULUS in promoted and MODULUS not in names  # what a modulus beyond all bounds takes away is not explained
+    significant = significant_effects(data, final, added, std)
+    names, back, insignificant = returned_effects(data, search, promoted, significant, _seed_std(search))
+    drifted = (
+        MODULUS in promoted and MODULUS not in names
+    )  # a reduction of the residual by an implausible modulus explains nothing
     promoted = [n for n in names if n in NUISANCE]
     entries = entries_of(back, names) if names else []
     effects = chain_of_effects(data, search, promoted, names, back, std)
     lacks = lacks_much(data, back, final, noise)
-    shown = back if lacks else final  # what nuisances take away unnamed is left, too
+    shown = back if lacks else final  # the residual includes what unaccepted nuisance effects would remove
     surprise = _surprise(data, back, noise)
     plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
     excess = excess_of(data, before, final, back, noise, measured)
-    found = _not_handed_back(search, names)
+    found = _not_returned(search, names)
     open_to_doubt = (tests.significant or surprise) and (drifted or excess.explained < data.thresholds.explained)
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names, data.thresholds)
     correction, learned = judged_correction(data, back) if correct else (None, None)
-    robot = _handed_back(data, entries)
+    robot = _returned_robot(data, entries)
     robot = robot if robot.correction is learned else replace(robot, correction=learned)
     robot = replace(robot, name=improved_name(robot.name)) if entries or learned is not None else robot
     only_held = bool(surprise) and not tests.significant and not lacks
@@ -90,7 +92,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)
-        + evidence_for(data, found, [n for n in added if n not in sure or n in unsure])
+        + evidence_for(data, found, [n for n in added if n not in significant or n in insignificant])
         + surprise
         + _by_prediction(data, robot, back, noise)
         + everywhere_in_words(search.everywhere, data.thresholds),
@@ -118,7 +120,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
 
 
 def improved_name(name: str) -> str:
-    """Return the name of the robot that is returned, so that its runs are told from those of the declared one: finger becomes
+    """Return the name of the returned robot, so that its runs differ from those of the declared one: finger becomes
     finger-improved, and that finger-improved-2."""
     begin, found, count = name.partition("-improved")
     if not found or not (count == "" or re.fullmatch(r"-\d+", count)):
@@ -126,7 +128,7 @@ def improved_name(name: str) -> str:
     return f"{begin}-improved-{int(count[1:] or 1) + 1}"
 
 
-def _handed_back(data: Data, entries: Sequence[Entry]) -> Robot:
+def _returned_robot(data: Data, entries: Sequence[Entry]) -> Robot:
     """Return the declared robot with effects, in its document too."""
     if not entries:
         return data.declared
@@ -138,15 +140,15 @@ def _handed_back(data: Data, entries: Sequence[Entry]) -> Robot:
 
 
 def _by_prediction(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> str:
-    """Return a sentence on by how much the robot that is handed back differs from the fitted model; nothing where it does not."""
+    """Return a sentence on the difference between the predictions of the returned robot and of the fitted model; empty if they agree."""
     share, least = SAME
     try:
         gap = prediction_gap(data, robot, back, noise)
     except FemsenseError as error:
-        return f" The robot that is handed back does not predict what the fitted model does: {error}."
+        return f" The returned robot cannot reproduce the predictions of the fitted model: {error}."
     if gap <= max(share * back.held_rms, least):
         return ""
-    return f" The robot that is handed back predicts markers {1e3 * gap:.2f} mm from where the fitted model has them."
+    return f" The returned robot predicts markers {1e3 * gap:.2f} mm away from those of the fitted model."
 
 
 def _seed_std(search: Search) -> dict[str, FloatArray]:
@@ -154,14 +156,14 @@ def _seed_std(search: Search) -> dict[str, FloatArray]:
 
 
 def lacks_much(data: Data, back: FittedModel, final: FittedModel, noise: Noise) -> bool:
-    """Return whether what is handed back leaves much that the final model takes away with nuisances that are not named."""
+    """Return whether the final model, with nuisance effects that are not accepted, has less than 1/`lacks` of the mean square of the returned one."""
     train = [mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
     held = [mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
     return any(own > data.thresholds.lacks * max(full, 1.0) for own, full in (train, held))
 
 
 def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
-    """Return a sentence on what held-out data show of what is handed back and fitted data do not; nothing where these are as well explained."""
+    """Return a sentence if the whitened mean square of held-out data exceeds that of fitted data by more than `lacks`; else empty."""
     fitted = mean_square(data.train, [j.residual for j in back.fit.jets], noise)
     held = mean_square(data.held, back.held_residuals, noise)
     if held <= data.thresholds.lacks * max(fitted, 1.0):
@@ -169,13 +171,13 @@ def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     frames = frame_errors(data.held, _beyond_mesh(data.held, back.held_residuals, noise))
     worst = max(frames, key=lambda frame: frame.rms_m)
     return (
-        f" Held-out data show what the fitted ones do not, most in frame {worst.frame} ({1e3 * worst.rms_m:.2f} mm):"
+        f" Held-out data have a larger residual than fitted data, most in frame {worst.frame} ({1e3 * worst.rms_m:.2f} mm):"
         " record more sweeps like that one."
     )
 
 
 def _left(data: Data, fitted: FittedModel, noise: Noise, tests: Structure, excess: Excess, *, held: bool) -> Left:
-    """Return what the residual of the fitted data looks like, or of the held-out data where these alone show it."""
+    """Return the description of the remaining residual, of the fitted data or, if only these show it, of the held-out data."""
     trials, residuals = (data.held, fitted.held_residuals) if held else (data.train, [jet.residual for jet in fitted.fit.jets])
     beyond = _beyond_mesh(trials, residuals, noise)
     return describe_left(data.robot, trials, beyond, held_out=held, structure=tests, explained_share=excess.explained)
@@ -185,6 +187,6 @@ def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise)
     return [without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)]
 
 
-def _not_handed_back(search: Search, names: list[str]) -> list[str]:
-    """Return the effects that were found, but are not among the names that are handed back."""
+def _not_returned(search: Search, names: list[str]) -> list[str]:
+    """Return the effects that were found but are not returned."""
     return [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]

@@ -2,7 +2,7 @@
 
     F = β Σ |y − f(x)|² + α Σ w²,   γ = P − α tr (β JᵀJ + α I)⁻¹,   α = γ / (2 Σ w²),   β = (N − γ) / (2 Σ |y − f(x)|²)
 
-minimised by Levenberg–Marquardt, with α and β estimated anew after each step: γ is the number of weights that the data fix.
+minimised by Levenberg–Marquardt, with α and β re-estimated after each step: γ is the number of weights that the data determine.
 Foresee and Hagan 1997, Gauss–Newton approximation to Bayesian learning; MacKay 1992. JᵀJ is built by blocks, without J.
 """
 

@@ -1,13 +1,13 @@
-"""What may have become of a model on another day, as corrections of its network, from simple to less simple:
+"""Corrections of a model for another day, from simple to complex:
 
-    channel:   y' = f(x − o eᵢ)       one sensor reads something else (o and i are found)
-    base:      y' = R y + t           the same robot, seen from elsewhere
-    zeros:     y' = f(x − o)          sensors with other zeros (their prior: a tenth of the channel's spread)
-    line:      y' = f(x) + C z + d    what else a linear map of the readings can say
+    channel:   y' = f(x − o eᵢ)       one channel i has an offset o (both are estimated)
+    base:      y' = R y + t           the base has moved relative to the camera
+    zeros:     y' = f(x − o)          all channels have offsets (prior: a tenth of the channel's spread)
+    line:      y' = f(x) + C z + d    an additional linear map of the readings
     afresh:    y' = C z + d           a linear map of the labelled frames alone
 
-Each is fitted to some blocks of labelled frames and judged on the others. A less simple one is taken only where it predicts those
-better, beyond what chance does in 95 of 100 cases.
+Each is fitted to some blocks of labelled frames and tested on the others. A more complex one is chosen only if its improvement on
+the test blocks is significant at the 5 % level.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from femsense.xr.proprioception.selection import marker_rms
 from femsense.xr.proprioception.spread import HeldOut, errors_of
 
 BLOCKS = 8
-"""Of labelled frames that are held out in turn. With four, what a correction needs is missing in one of them: on a day of a real arm, 40 frames
-then chose a correction that left twice as much as learning afresh."""
+"""Number of blocks of labelled frames that are held out in turn. With four, one of them lacked information that a correction needs: on a day of a real arm,
+40 frames then selected a correction with twice the error of learning afresh."""
 BETTER = 0.9
-"""Times the error without it that a correction must reach on frames it was not fitted to."""
+"""Largest ratio of the error of an accepted correction to that without it, on held-out frames."""
 RESAMPLES = 1000
 RESAMPLED = 12
-"""Parts in time of the frames that are drawn again and again: neighbours are alike."""
+"""Number of blocks in time for the bootstrap, because neighbouring frames are correlated."""
 ZERO_STD = 0.1
 """Of a sensor's zero, in spreads of its channel."""
 ZERO_STEPS = 3
@@ -59,7 +59,7 @@ class Shift:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frames:
-    """Labelled frames beside the network that is to predict them."""
+    """Labelled frames with the network's inputs."""
 
     network: Network
     inputs: FloatArray
@@ -82,7 +82,7 @@ class Frames:
         return errors
 
     def held_out(self, name: str) -> HeldOut:
-        """Return the same errors with what the corrected networks say of their own variance."""
+        """Return the same errors with the predictive variance of the corrected networks."""
         found = []
         for k, held in enumerate(_blocks(len(self.targets))):
             known, other = self.select(~held), self.select(held)
@@ -95,7 +95,7 @@ def explain(frames: Frames) -> tuple[str, dict[str, float]]:
     errors = {name: frames.errors(name) for name in CORRECTIONS}
     chosen = CORRECTIONS[0]
     for name in CORRECTIONS[1:]:
-        like = name.startswith(AFRESH) and chosen.startswith(AFRESH)  # of maps that are learnt afresh what predicts best
+        like = name.startswith(AFRESH) and chosen.startswith(AFRESH)  # among maps learnt afresh, the smallest error decides
         if marker_rms(errors[name]) < marker_rms(errors[chosen]) if like else is_better(errors[name], errors[chosen]):
             chosen = name
     return chosen, {name: marker_rms(found) for name, found in errors.items()}
@@ -132,11 +132,11 @@ def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
 
 
 def shifts_of(frames: Frames, *, moved: bool = False) -> tuple[Shift, ...]:
-    """Return the shift of one channel that explains frames best, then those of other channels that explain them as well.
+    """Return the offset of one channel that fits the frames best, then those of other channels that fit equally well.
 
-    Each channel's shift is scanned over its range; the best three are refined.
+    The offset of each channel is scanned over its range; the best three are refined.
 
-    moved: whether the base may have moved as well; a rigid motion is then taken off for each shift that is tried.
+    moved: whether the base may have moved too; a rigid motion is then fitted for each offset that is tried.
     """
     from scipy.optimize import minimize_scalar
 
@@ -160,7 +160,7 @@ def shifts_of(frames: Frames, *, moved: bool = False) -> tuple[Shift, ...]:
 
 
 def rigid_motion(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return the rigid motion that takes the markers of all rows to where they are, shape (4, 4)."""
+    """Return the rigid motion from the predicted to the measured markers of all rows, shape (4, 4)."""
     a, b = after.reshape(-1, 3), before.reshape(-1, 3)
     try:
         return fit_rigid(a, b)
@@ -193,7 +193,7 @@ def _with_shift(network: Network, shift: Shift, channels: int) -> Network:
 
 
 def _errors_without(frames: Frames, shift: Shift, moved: bool) -> FloatArray:
-    """Return the errors where one channel has another zero, and the base has moved [m], shape (n, 3 m)."""
+    """Return the errors with an offset of one channel and a motion of the base [m], shape (n, 3 m)."""
     predicted = _with_shift(frames.network, shift, len(frames.reach))(frames.inputs)
     T = rigid_motion(predicted, frames.targets) if moved else np.eye(4)
     return np.asarray(transform_points(T, predicted.reshape(-1, 3)).reshape(predicted.shape) - frames.targets)

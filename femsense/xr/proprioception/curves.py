@@ -1,9 +1,9 @@
-"""Channels that depend on the others by a curve: a smooth map that blocks in time have judged which it was not trained on.
+"""Nonlinear dependence of channels on each other: smooth maps, tested on blocks of time that were held out.
 
-What the other channels make of channel i is f_i(z) of the normalised readings, with z_i left out. It is a function of all of them, or of the one
-that tells most of it, where that errs less: beside channels that have nothing to do with it, many readings are needed to learn one of all.
-A reading is off the curve where |z_i − f_i(z)| > h_i, h_i from the largest error that was left on held-out blocks. Where the channels go
-together by a straight line, the inverse covariance knows that better, and there is no curve.
+Channel i is predicted from the other normalised readings by f_i(z), with z_i left out. f_i depends on all of them, or on the most
+informative one if that has a smaller error: with many unrelated channels, a function of all needs many readings.
+A reading is outside if |z_i − f_i(z)| > h_i, with h_i from the largest error on held-out blocks. If channels depend on each other
+linearly, the inverse covariance is more accurate, and there is no curve.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ PENALTY, LENGTH, NOISE = 1e-4, 1.0, 1e-2
 HELD_MARGIN = 1.5
 """Times the largest error on held-out blocks that is allowed, as of the straight line."""
 NARROWER = 0.7
-"""A curve is kept where it allows at most so much of what the straight line allows. Then no row more of an arm's own motion is called
+"""A curve is kept if its interval is at most this share of the linear one. Then no additional row of an arm's own motion is reported
 outside; with 1.0 up to six more in ten thousand are (`benchmarks/xr_domain.py --narrower 0.7 1.0`)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Curve:
-    """What all other channels, or one of them, make of one channel, in normalised readings."""
+    """Prediction of one channel from all others, or from one of them, in normalised readings."""
 
     channel: int
     network: Network
@@ -68,7 +68,7 @@ def learn_curves(z: FloatArray, lines: FloatArray) -> tuple[Curve, ...]:
 
 
 def depends(x: FloatArray, y: FloatArray) -> float:
-    """Return how far y is a function of x, both of shape (n,): 1 where it is one, about 0 where it has nothing to do with it (Chatterjee 2021)."""
+    """Return Chatterjee's coefficient of y on x, both of shape (n,): 1 if y is a function of x, about 0 if they are independent (2021)."""
     ranks = np.argsort(np.argsort(y[np.argsort(x, kind="stable")], kind="stable"), kind="stable")
     n = len(x)
     return float(1.0 - 3.0 * np.abs(np.diff(ranks)).sum() / (n**2 - 1.0))

@@ -1,11 +1,11 @@
-"""Whether a reading lies inside what was learnt: the range of each channel, and how channels go together.
+"""The domain of a model: the range of each channel, and the dependence between channels.
 
-A channel is judged against the range in which it was seen, and against what the other channels make of it: by a straight line,
+A channel is compared with its training range, and with its prediction from the other channels: by linear regression,
 
     z_i = (P x)_i / √P_ii,   P the inverse covariance of the normalised readings,
 
-the deviation of channel i from its regression on all others, in standard deviations of that regression; and by a curve, where one
-tells more (`curves`).
+the deviation of channel i from its regression on all others, in standard deviations of that regression; and by a curve if that
+is more accurate (`curves`).
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from femsense.xr.proprioception.bayes import inverse_spread
 from femsense.xr.proprioception.curves import Curve, learn_curves
 
 MARGIN = 0.05
-"""Share of its range by which a channel may leave it before that is said. With both limits, of rows that repeat what was learnt
-1 in 2000 is called outside (a pneumatic arm, `benchmarks/xr.py`), and of rows with a chamber that was not trained all are."""
+"""Share of its range by which a channel may leave it before it is reported. With both limits, 1 in 2000 rows that repeat the training motion is reported
+outside (a pneumatic arm, `benchmarks/xr.py`), and all rows with a chamber that was not trained."""
 FLOOR = 0.01
-"""Standard deviation of a regression, as a share of the channel's own, below which it is not believed."""
+"""Smallest standard deviation of a regression, relative to the channel's own."""
 JOINT_MARGIN = 1.5
-"""Times the largest joint deviation seen; new rows of the same motion reach 1.06 times it."""
+"""Limit of the joint deviation, relative to the largest one in training; new rows of the same motion reach 1.06 times that."""
 SAME = 1e-12
 """A channel that moves by less, relative to its reading, does not move."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """A channel that reads what was never learnt."""
+    """A channel outside of the training domain."""
 
     channel: str
     kind: str
@@ -40,13 +40,13 @@ class Outside:
     value: float
     low: float
     high: float
-    """Between these it was seen; for "joint", between these the other channels would have it."""
+    """Its training range; for "joint", the interval predicted from the other channels."""
     far: float
-    """How far outside, in widths of that interval; infinite where it has none."""
+    """Distance from the interval in units of its width; infinite without a finite reading."""
 
     @property
     def text(self) -> str:
-        """One line for people."""
+        """The message to the user, one line."""
         if self.kind == "missing":
             return f"{self.channel}: no number"
         if self.kind == "gap":
@@ -62,7 +62,7 @@ class Outside:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Domain:
-    """What readings were learnt from."""
+    """The training domain of a model."""
 
     low: FloatArray
     high: FloatArray
@@ -73,14 +73,14 @@ class Domain:
     precision: FloatArray
     """Inverse covariance of the normalised readings, shape (c, c)."""
     limit: FloatArray
-    """Largest joint deviation of each channel that was seen, shape (c,)."""
+    """Largest joint deviation of each channel in training, shape (c,)."""
     curves: tuple[Curve, ...] = ()
     """Of the normalised readings, for channels that depend on the others by a curve."""
 
     def check(self, row: FloatArray, channels: tuple[str, ...], needed: BoolArray | None = None) -> tuple[Outside, ...]:
         """Return the channels of a row, shape (c,), that are outside, the farthest first.
 
-        Of channels that are not `needed`, shape (c,), and have no finite number nothing is said; the others are judged without them.
+        Channels that are not `needed`, shape (c,), and have no finite reading are ignored, and the others are judged without them.
         """
         lost = ~np.isfinite(row) & (True if needed is None else needed)
         missing = [Outside(channels[i], "missing", float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost)]
@@ -90,7 +90,7 @@ class Domain:
         return tuple(sorted(found, key=lambda item: -item.far))
 
     def filled(self, row: FloatArray) -> FloatArray:
-        """Return a row, shape (c,), with what the other channels expect by a straight line where it has no finite number.
+        """Return a row, shape (c,), with the linear prediction from the other channels in place of values that are not finite.
 
         z_m = −P_mm⁻¹ P_mk z_k: with it the deviations of the others are those of a regression without the missing ones.
         """

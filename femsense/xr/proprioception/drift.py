@@ -1,6 +1,5 @@
-"""Another day: does a model still hold, has the base moved, has one channel shifted, or has the map changed?
-
-And a correction from a few labelled frames. What explains them is chosen in `corrections`.
+"""Validity of a model on another day: it holds, the base has moved, one channel has an offset, or the map has changed; and a
+correction from a few labelled frames (`corrections`).
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ FEWEST = 8
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drift:
-    """What became of a model on other data."""
+    """Comparison of a model with other data."""
 
     verdict: str
-    """"holds", or what explains the frames: "one channel shifted", "base moved", "map changed", joined by "and"."""
+    """"holds", or the cause: "one channel shifted", "base moved", "map changed", joined by "and"."""
     stated_mm: float
     """The error of the model on the data that it is from."""
     error_mm: float
@@ -52,17 +51,17 @@ class Drift:
     """How far the middle of the markers moves by it."""
     turn_deg: float
     shifts: dict[str, float]
-    """The channel that alone shifted, and how much it reads too much, in its unit; then others that explain it as well."""
+    """The channel with an offset and the offset in its unit; then others that fit equally well."""
     left_mm: float
     """With all that explains the frames, on frames that it was not fitted to."""
     outside: float
-    """Share of the rows with a channel outside what was learnt."""
+    """Share of the rows with a channel outside of the training domain."""
     channels: dict[str, float]
     """Of those channels, the share of rows in which each is outside."""
 
     @property
     def text(self) -> str:
-        """Lines for people."""
+        """The message to the user, in lines."""
         lines = [f"{self.verdict}: {self.error_mm:.2f} mm here, {self.stated_mm:.2f} mm when it was learnt"]
         if self.verdict != "holds":
             lines.append(f"a rigid motion of {self.shift_mm:.2f} mm and {self.turn_deg:.2f}° leaves {self.rigid_mm:.2f} mm")
@@ -76,7 +75,7 @@ class Drift:
 
 
 def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
-    """Say whether a model still holds on other data, channels and markers as it knows them, and what explains it where not.
+    """Test whether a model holds on other data with the same channels and markers, and find the cause if it does not.
 
     Raises:
         DataError: fewer than 8 rows.
@@ -107,8 +106,8 @@ def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
 def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
     """Return the model corrected by a few labelled frames of another day.
 
-    Of the corrections in `corrections.CORRECTIONS` the one is taken that explains the frames; the report says which, and its
-    error on frames that it was not fitted to.
+    The correction is selected from `corrections.CORRECTIONS`; the report names it with its
+    error on held-out frames.
 
     Raises:
         DataError: fewer than 8 rows.
@@ -155,7 +154,7 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
 
 
 def _other_names(kind: str, here: tuple[str, ...], known: tuple[str, ...]) -> str:
-    """Return in words how names differ from those that a model knows."""
+    """Return in words how names differ from those of the model."""
     missing, new = [n for n in known if n not in here], [n for n in here if n not in known]
     if not missing and not new:
         return f"the {kind} stand in another order than when the model was learnt: {', '.join(here)}, not {', '.join(known)}"
@@ -168,9 +167,9 @@ def _frames(model: ProprioceptiveModel, data: Labelled) -> Frames:
 
 
 def _verdict(frames: Frames, chosen: str, stated: float) -> str:
-    """Return what the chosen correction means; where more is left than the model has by itself, the map has changed too.
+    """Return the meaning of the chosen correction; if the remaining error significantly exceeds the model's own, the map has changed too.
 
-    More is what lies above with its whole 95 % interval: a few rows outside of what was learnt are no change.
+    Significant means that its whole 95 % interval lies above: a few rows outside of the training domain are no change.
     """
     errors = frames.errors("none")
     motion = marker_rms(frames.targets - frames.targets.mean(axis=0))

@@ -1,9 +1,9 @@
 """SENSORS.csv and MARKERS.csv.
 
-SENSORS.csv: `time_s`, optionally `frame`, and one column a channel, with any name and in any unit.
-MARKERS.csv: `frame,marker[,camera],x_m,y_m,z_m[,qw,qx,qy,qz]`, as in a recording; a hidden marker has no row. Frames are those of
-SENSORS.csv, there the rows from 0 where it has no such column. With a quaternion a marker is a rigid body: points before and behind it
-along the body become markers, too, so that bones take its direction.
+SENSORS.csv: `time_s`, optionally `frame`, and one column per channel, with any name and in any unit.
+MARKERS.csv: `frame,marker[,camera],x_m,y_m,z_m[,qw,qx,qy,qz]`, as in a recording; a hidden marker has no row. Frames refer to
+SENSORS.csv; without a column `frame` there, to its rows from 0. With a quaternion a marker is a rigid body: points in front of and behind it
+along the body become markers too, so that bones follow its orientation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NOT_CHANNELS = ("frame", "time_s")
 AXES = ("x_m", "y_m", "z_m")
 TURN = ("qw", "qx", "qy", "qz")
 UNIT = 0.01
-"""By how much the length of a quaternion may differ from 1."""
+"""Tolerance of the length of a quaternion."""
 DIRECTED = 0.25
 """Distance of the points that a rigid body adds, in mean distances of rigid bodies."""
 
@@ -39,12 +39,12 @@ def read_labelled(
 
     Arguments:
         sensors, markers: SENSORS.csv and MARKERS.csv.
-        calibration: through its camera poses the markers come into the robot's frame. By default through those that a
-            recording.toml beside them declares; where none does they stay in the frame in which they were measured.
-        in_robot_frame: the markers are in the robot's frame already.
+        calibration: its camera poses transform the markers into the robot frame. By default those declared in a
+            recording.toml next to the files; without a pose the markers stay in their frame.
+        in_robot_frame: whether the markers are in the robot frame already.
 
     Raises:
-        InputError: what cannot be read, no channel, times that decrease, frames that are in one file only, a camera without a pose.
+        InputError: unreadable files, no channel, decreasing times, frames in one file only, a camera without a pose.
     """
     if in_robot_frame and calibration is not None:
         raise InputError("markers in the robot's frame need no calibration", where="in_robot_frame", found=calibration)
@@ -58,9 +58,9 @@ def read_labelled(
 
 
 def camera_poses(markers: Path, calibration: str | Path | None) -> dict[str, FloatArray]:
-    """Return T_robot_camera, shape (4, 4), by the name of the camera: of a calibration, else of a recording.toml beside the markers.
+    """Return T_robot_camera, shape (4, 4), by camera name: of a calibration, else of a recording.toml next to the markers.
 
-    Empty where neither says one. Raises InputError.
+    Empty if neither declares one. Raises InputError.
     """
     if calibration is not None:
         found = read_calibration(calibration)
@@ -90,22 +90,22 @@ def read_sensors(path: str | Path) -> tuple[IntArray, FloatArray, tuple[str, ...
     frames = table.integers("frame") if "frame" in columns else np.arange(len(table))
     again = np.flatnonzero(np.bincount(frames) > 1)
     if len(again):
-        raise InputError("a frame stands twice", where=f"{file}, column frame", found=int(again[0]))
+        raise InputError("a frame appears twice", where=f"{file}, column frame", found=int(again[0]))
     return frames, table.numbers(("time_s",))[:, 0], channels, table.numbers(channels, empty_is_nan=True)
 
 
 def with_directions(
     names: tuple[str, ...], places: FloatArray, turns: FloatArray, where: Path
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Return rigid bodies with points `DIRECTED` of their mean distance before and behind each along the body, as further markers.
+    """Return rigid bodies with additional markers at `DIRECTED` of their mean distance before and behind each, along the body.
 
-    The direction of the body is that of the line through the rigid bodies at rest (the first frame with all of them), and turns with each.
+    The direction of the body is that of the line through the rigid bodies at rest (the first complete frame), and rotates with each.
 
     Arguments:
         names: of the m rigid bodies, from base to tip.
         places: [m], shape (n, m, 3).
         turns: their rotations, shape (n, m, 3, 3), nan where one is hidden.
-        where: what messages name.
+        where: for messages.
 
     Returns:
         names, and places of shape (n, 3 m − 2, 3).
@@ -136,10 +136,10 @@ def _read_markers(
     path: Path, frames: IntArray, poses: dict[str, FloatArray]
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
     """Return names in the order in which they first come, places (n, m, 3), nan where a marker is hidden, and rotations
-    (n, m, 3, 3) of rigid bodies; None where there are only points.
+    (n, m, 3, 3) of rigid bodies; None for points only.
 
-    Places are taken through the poses of their cameras, where there are any; of several cameras their mean is taken, and the rotation
-    that the last one saw.
+    Positions are transformed by the poses of their cameras, if known; with several cameras the mean position is used, and the rotation of
+    the last one.
     """
     table = read_csv(path, required=("frame", "marker", *AXES), optional=("camera", *TURN))
     labels, numbers = table.text("marker"), table.integers("frame")

@@ -1,4 +1,4 @@
-"""Readings of sensors with the markers that were seen at the same moments."""
+"""Sensor readings with the marker positions measured at the same times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORDS = {ROBOT: "the robot's frame", AS_MEASURED: "the frame in which markers we
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Course:
-    """All readings of one recording, in order of time, also those beside which no markers were seen: filters run over them."""
+    """All readings of one recording, in order of time, with or without markers: filters run over them."""
 
     time_s: FloatArray
     """shape (n,)."""
@@ -60,7 +60,7 @@ class Labelled:
 
     @property
     def spacing_s(self) -> float:
-        """Median time between readings, with markers or without [s]; 0 where there are none."""
+        """Median time between readings, with or without markers [s]; 0 if there are none."""
         gaps = np.concatenate([np.diff(course.time_s) for course in self.courses])
         return float(np.median(gaps)) if len(gaps) else 0.0
 
@@ -75,7 +75,7 @@ class Labelled:
         return replace(self, part=part, row=row, markers=freeze(self.markers[rows]))
 
     def inputs(self, taus: tuple[float, ...]) -> FloatArray:
-        """Return readings with their filters, shape (n, (1 + k) c); filters start anew with each recording."""
+        """Return readings with their filters, shape (n, (1 + k) c); filters restart with each recording."""
         return self._of([with_memory(course.time_s, course.readings, taus) for course in self.courses])
 
     def _of(self, values: Sequence[FloatArray]) -> FloatArray:
@@ -93,17 +93,17 @@ def labelled(
     marker_names: Sequence[str] | None = None,
     frame: str = AS_MEASURED,
 ) -> Labelled:
-    """Return readings with markers from arrays. Rows without a finite reading are left out, those without a finite marker tell only what came before others.
+    """Return readings with markers from arrays. Rows without a finite reading are left out; those without a finite marker only enter filters.
 
     Arguments:
         time_s: when each row was read [s], not decreasing, shape (n,).
         readings: shape (n, c).
         markers: [m], shape (n, m, 3).
         channels, marker_names: names; numbers by default.
-        frame: of the markers: "robot", or "markers" for any other that stays fixed to the base.
+        frame: of the markers: "robot", or "markers" for any other frame fixed to the base.
 
     Raises:
-        InputError: shapes that do not belong together, times that decrease, or an unknown frame.
+        InputError: shapes that do not match, decreasing times, or an unknown frame.
     """
     t, x, y = (np.asarray(array, dtype=np.float64) for array in (time_s, readings, markers))
     if t.ndim != 1 or x.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or not len(t) == len(x) == len(y):
@@ -167,12 +167,12 @@ def joined(parts: Sequence[Labelled]) -> Labelled:
 
 
 def check_frame(known: str, found: str) -> None:
-    """Raise InputError unless markers are in the frame of reference that is known: a motion of the base would be told for it."""
+    """Raise InputError unless markers are in the expected frame of reference; otherwise a motion of the base would be inferred."""
     if known != found:
         raise InputError(
             "markers in another frame of reference",
             where="markers",
             found=WORDS[found],
             expected=WORDS[known],
-            hint="-c CALIBRATION takes a camera's markers into the robot's frame, --robot-frame says that they are in it",
+            hint="-c CALIBRATION transforms a camera's markers into the robot frame, --robot-frame declares that they are in it",
         )

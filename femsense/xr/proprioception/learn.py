@@ -1,4 +1,4 @@
-"""`learn`: from readings with markers beside them to a model, with its error on what it did not see."""
+"""`learn`: from readings with markers to a model, with its error on held-out data."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ RESAMPLES = 1000
 ERROR_BLOCKS = 12
 """Blocks in time that are drawn again and again for the interval of an error."""
 CLIPPED = 0.05
-"""Share of rows at one end of a channel's range from which on it is said to be saturated."""
+"""Share of rows at one end of a channel's range beyond which the channel is reported as saturated."""
 DISTINCT = 20
-"""A channel with fewer values is a switch: its ends mean nothing."""
+"""A channel with fewer distinct values is a switch, whose ends are not saturation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LearnOptions:
-    """What the data cannot say."""
+    """Problems of the data."""
 
     kinds: tuple[str, ...] = KINDS
     """Maps that are tried, simple ones first."""
     memories: tuple[tuple[float, ...], ...] = MEMORIES
-    """Time constants [s] of filters that are tried beside the readings; ((),): none."""
+    """Candidate time constants [s] of filters in addition to the readings; ((),): none."""
     end_to_end: bool = False
-    """Whether a second network gives the bones straight from the readings, as in the paper."""
+    """Whether a second network predicts the bones directly from the readings, as in the paper."""
     bones: ArmatureOptions = field(default_factory=ArmatureOptions)
     rest_row: int = 0
     """Row in which the robot is at rest: its bones are the skin's."""
@@ -70,17 +70,17 @@ def learn(
 ) -> ProprioceptiveModel:
     """Return a model of readings.
 
-    The kind of map, its memory and its channels are those with the smallest error on blocks in time that were held out. The
-    error that the report states is on three blocks of twenty that neither training nor choice saw.
+    The kind of map, its memory and its channels are those with the smallest error on held-out blocks of time. The reported error
+    is that on three blocks of twenty that were used neither for training nor for selection.
 
     Arguments:
         data: readings with markers, of one recording or several (`joined`).
-        test: another recording: the report states the error there as well, in `test`.
-        options: which maps are tried, and the bones.
-        progress: called with what is done and how much there is.
+        test: another recording, whose error is reported in `test`.
+        options: candidate maps, and the bones.
+        progress: called with (steps done, all steps).
 
     Raises:
-        InputError: a kind of map that there is not, a test in another frame of reference. DataError: too few rows, or readings that never change.
+        InputError: an unknown kind of map, a test in another frame of reference. DataError: too few rows, or constant readings.
     """
     options = options or LearnOptions()
     _check(data, options)
@@ -168,7 +168,7 @@ def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> d
 def error_interval(errors: FloatArray, *, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the root mean square distance [m] of errors, shape (n, 3 m).
 
-    Blocks in time are drawn again and again, since neighbours are alike (Künsch 1989).
+    Blocks in time are resampled, because neighbouring rows are correlated (Künsch 1989).
     """
     square = (errors.reshape(len(errors), -1, 3) ** 2).sum(axis=2).mean(axis=1)
     parts = np.array_split(square, min(ERROR_BLOCKS, len(square)))
@@ -182,9 +182,9 @@ def error_interval(errors: FloatArray, *, seed: int = 0) -> tuple[float, float]:
 def importance(
     network: Any, inputs: FloatArray, targets: FloatArray, channels: tuple[str, ...], filters: int
 ) -> dict[str, float]:
-    """Return by how much the error grows when a channel is taken from another time [mm], by channel.
+    """Return the increase of the error when a channel is replaced by itself at other times [mm], by channel.
 
-    The channel and its filters are shifted by half the rows, so that it keeps its own course (permutation importance,
+    The channel and its filters are shifted by half the rows, which keeps their autocorrelation (permutation importance,
     Breiman 2001).
     """
     base, half, width = marker_rms(network(inputs) - targets), len(inputs) // 2, len(channels)
@@ -203,7 +203,7 @@ def dead_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[str]:
 
 
 def saturated_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[str]:
-    """Return the channels that stand at an end of their range too often to be by chance."""
+    """Return the channels that are at an end of their range in more than the allowed share of rows."""
     found = []
     for name, x in zip(channels, readings.T):
         at_end = max((x == x.max()).mean(), (x == x.min()).mean())

@@ -1,7 +1,7 @@
-"""The baselines: ridge regression, and a Gaussian process in the form of radial units beside a linear map.
+"""The baselines: ridge regression, and a Gaussian process in the form of radial units with a linear map.
 
 ridge:   C = argmin Σ |y − C z − d|² + λ n |C|²
-radial:  what ridge leaves, by k(z, z') = exp(−½ |z − z'|² / ℓ²) on at most `CENTRES` rows (subset of regressors;
+radial:  the residual of ridge, by k(z, z') = exp(−½ |z − z'|² / ℓ²) on at most `CENTRES` rows (subset of regressors;
          Rasmussen and Williams 2006, section 8.3): A = Rᵀ Φ (ΦᵀΦ + ν K)⁻¹
 """
 
@@ -32,7 +32,7 @@ def train_radial(x: FloatArray, y: FloatArray, *, penalty: float, length: float,
         x, y: inputs (n, d) and outputs (n, o).
         penalty: of the linear map, as in `train_ridge`.
         length: ℓ, in spreads of the inputs times √d.
-        noise: variance ν of what the kernel does not explain, relative to what it explains.
+        noise: variance ν of the unexplained part, relative to the explained one.
     """
     line = train_ridge(x, y, penalty=penalty)
     used = max(int((line.scale > 0).sum()), 1)

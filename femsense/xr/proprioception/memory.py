@@ -1,9 +1,9 @@
-"""What a sensor read a while ago: its readings through low-pass filters of first order, as inputs beside the readings.
+"""Memory of a model: readings through first-order low-pass filters, as additional inputs.
 
     m ← m + a (x⁻ − m) + (1 − a τ / Δt) (x − x⁻),   a = 1 − exp(−Δt / τ)
 
-with x⁻ the row before: readings are taken as lines between rows, so that filters depend little on how often sensors are read.
-A body that creeps, or a tube that fills, follows its inputs late. Filters need no constant rate, and little is kept for a stream.
+with x⁻ the previous row: readings are interpolated linearly, so that filters depend little on the sampling rate.
+A creeping body, or a filling tube, follows its inputs with a delay. The filters need no constant rate, and little state in a stream.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 
 SPARSE = 2.0
-"""Rows farther apart than so many of the shortest time constant tell its filter too little: errors of an arm were 1.2 times as large at two,
+"""Largest spacing of rows, relative to the shortest time constant: errors of an arm were 1.2 times as large at two,
 1.9 times at four (a trial)."""
 
 

@@ -20,7 +20,7 @@ from femsense.xr.proprioception.spread import Spread
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProprioceptiveModel:
-    """From readings to markers (`markers`) and bones (`armature`), with a check of what comes in (`check`)."""
+    """A model from readings to markers (`markers`) and bones (`armature`), with a check of its inputs (`check`)."""
 
     channels: tuple[str, ...]
     """Names of the readings, in the order of a row."""
@@ -30,13 +30,13 @@ class ProprioceptiveModel:
     memory_s: tuple[float, ...]
     """Time constants of the filters [s]; none: the readings of one moment are enough."""
     domain: Domain
-    """Of what was learnt."""
+    """The training domain."""
     chain: Armature | None
-    """Bones on the curve through the markers; None where there is a single marker."""
+    """Bones on the curve through the markers; None with a single marker."""
     bones: Network | None = None
     """The end-to-end network, from readings to 9 numbers a bone (place, x axis, z axis); None: bones from the markers."""
     report: dict[str, Any] = field(default_factory=dict)
-    """How it was learnt, and its errors on what was held out."""
+    """Training report, with errors on held-out data."""
     frame: str = AS_MEASURED
     """Of reference of markers and bones: "robot", or "markers", that in which they were measured."""
     spread: Spread | None = None
@@ -53,12 +53,12 @@ class ProprioceptiveModel:
         """Return the markers [m], shape (m, 3) for one row of readings, shape (c,), or (n, m, 3) for several, shape (n, c).
 
         Arguments:
-            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before. Where one that is needed
-                is no finite number, the markers are nan.
-            time_s: when several rows were read [s], shape (n,); needed where the model has a memory.
+            rows: readings. One row is taken as steady; for a stream, `live` keeps the memory. If a required reading
+                is not finite, the markers are nan.
+            time_s: times of several rows [s], shape (n,); required if the model has a memory.
 
         Raises:
-            InputError: no numbers, another number of channels, or no times for a model with memory.
+            InputError: not numbers, a wrong number of channels, or missing times for a model with memory.
         """
         x, single = self._rows(rows)
         y = self.network(self._inputs(x, single, time_s)).reshape(len(x), -1, 3)
@@ -67,11 +67,11 @@ class ProprioceptiveModel:
     def interval(self, rows: npt.ArrayLike, time_s: npt.ArrayLike | None = None) -> FloatArray:
         """Return the radius of the 95 % interval of each marker [m], shape (m,) for one row, or (n, m).
 
-        It holds the predictive variance of the map and what the sessions that were learnt from drift, but not what another day may
-        change. Arguments and errors as of `markers`.
+        It contains the predictive variance of the map and the drift within the training sessions, but not changes between days. Arguments and
+        errors as of `markers`.
 
         Raises:
-            InputError: also where the model is of an older version, without intervals.
+            InputError: also for models of an older version, without intervals.
         """
         if self.spread is None:
             raise InputError("a model of an older version has no intervals", where="model", hint="learn it again: femsense learn")
@@ -82,7 +82,7 @@ class ProprioceptiveModel:
     def armature(self, row: npt.ArrayLike) -> BonePoses:
         """Return the bones of one steady row of readings, shape (c,).
 
-        Raises InputError as `markers`, where a reading is no finite number, and where there is no chain.
+        Raises InputError as `markers`, if a reading is not finite, and if the model has no chain.
         """
         x, _ = self._rows(row)
         if not np.isfinite(x[0, self.needed]).all():
@@ -99,8 +99,8 @@ class ProprioceptiveModel:
         return self._chain()(self.network(inputs).reshape(-1, 3))
 
     def check(self, row: npt.ArrayLike) -> tuple[Outside, ...]:
-        """Return the channels of a row, shape (c,), that read what was never learnt, the farthest first;
-        empty where all is well."""
+        """Return the channels of a row, shape (c,), outside of the training domain, the farthest first;
+        empty if there are none."""
         return self.domain.check(self._rows(row)[0][0], self.channels, self.needed)
 
     @property
@@ -149,20 +149,20 @@ class ProprioceptiveModel:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LivePose:
-    """What one row of a stream says."""
+    """Prediction from one row of a stream."""
 
     markers: FloatArray
     """[m], shape (m, 3)."""
     bones: BonePoses | None
-    """None where the model has no chain."""
+    """None if the model has no chain."""
     outside: tuple[Outside, ...]
-    """Channels that read what was never learnt."""
+    """Channels outside of the training domain."""
     interval: FloatArray | None = None
-    """Radius of the 95 % interval of each marker [m], shape (m,); None where the model has none, or no pose."""
+    """Radius of the 95 % interval of each marker [m], shape (m,); None if the model has none, or without a pose."""
 
 
 class LiveModel:
-    """Follows a stream of readings, row by row; keeps what the model's memory needs."""
+    """Processes a stream of readings row by row, with the model's memory."""
 
     def __init__(self, model: ProprioceptiveModel) -> None:
         self.model = model
@@ -174,7 +174,7 @@ class LiveModel:
     def step(self, row: npt.ArrayLike, time_s: float) -> LivePose:
         """Return markers and bones of a row, shape (c,), read at `time_s` [s].
 
-        Where a reading that is needed is no finite number, the pose is nan and `outside` says which: keep showing the last good one.
+        If a required reading is not finite, the pose is nan and `outside` lists the channel: keep showing the last valid one.
         """
         model = self.model
         x = model._rows(row)[0][0]
@@ -199,7 +199,7 @@ class LiveModel:
 
 
 def bone_numbers(poses: BonePoses) -> FloatArray:
-    """Return what an end-to-end network learns of bones: place [m], x axis and z axis of each, shape (9 b,)."""
+    """Return the training targets of an end-to-end network: position [m], x axis and z axis of each bone, shape (9 b,)."""
     T = poses.T_robot_bone
     return np.concatenate([T[:, :3, 3], T[:, :3, 0], T[:, :3, 2]], axis=1).ravel()
 

@@ -1,7 +1,7 @@
-"""A model as one ONNX file: its networks as a graph that any runtime computes, and what else it knows as metadata.
+"""A model as one ONNX file: its networks as a graph for any runtime, and the rest as metadata.
 
-Inputs of the graph: `readings` (rows, c) and, where the model has a memory, `filtered` (rows, k c). Outputs: `markers` (rows,
-3 m) and, of an end-to-end network, `bones` (rows, 9 b). Metadata: the key `femsense` holds JSON.
+Inputs of the graph: `readings` (rows, c) and, if the model has a memory, `filtered` (rows, k c). Outputs: `markers` (rows,
+3 m) and, for an end-to-end network, `bones` (rows, 9 b). Metadata: the key `femsense` contains JSON.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from femsense.xr.proprioception.spread import Spread
 FORMAT = "femsense-proprioception-1"
 KEY = "femsense"
 FILTERS = "lines between rows"
-"""What `filtered` is of: see `memory`."""
+"""Description of the input `filtered`: see `memory`."""
 NUMBERS = ("centre", "scale", "B", "b", "A", "C", "d")
 TURNED = ("B", "A", "C")
 """Stored so that rows of inputs are multiplied from the left."""
@@ -39,7 +39,7 @@ CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
-    """Write a model as an ONNX file and return its path. Raises InputError where another file stands there."""
+    """Write a model as an ONNX file and return its path. Raises InputError if a foreign file exists there."""
     check_target(path, folder=False, kind=MODEL)
     width = len(model.channels)
     inputs = {"readings": width}

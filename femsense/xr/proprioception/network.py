@@ -1,4 +1,4 @@
-"""One layer of hidden units with a linear path beside it: the form of every map that is learnt here.
+"""One layer of hidden units with a parallel linear path: the form of all maps that are learnt here.
 
 y = A φ(z) + C z + d,   z = scale · (x − centre)
 φ_j = 1 / (1 + exp(−(B z + b)_j))   "sigmoid"      φ_j = exp(−½ |z − B_j|²)   "radial"      no φ   "linear"
@@ -26,7 +26,7 @@ class Network:
     scale: FloatArray
     """shape (d,), one over those units."""
     B: FloatArray
-    """Weights of the hidden units, or their centres, shape (h, d); h = 0 where there are none."""
+    """Weights of the hidden units, or their centres, shape (h, d); h = 0 if there are none."""
     b: FloatArray
     """shape (h,)."""
     A: FloatArray
@@ -54,7 +54,7 @@ class Network:
 
     @property
     def uses(self) -> BoolArray:
-        """Which inputs what comes out depends on, shape (d,): those that never changed have no scale, those left out no weight."""
+        """Which inputs the output depends on, shape (d,): constant inputs have no scale, excluded ones no weight."""
         hidden = np.ones(len(self.scale), dtype=bool) if self.kind == "radial" else (self.B != 0).any(axis=0)
         return np.asarray((self.scale != 0) & ((self.C != 0).any(axis=0) | (hidden & bool(self.A.any()))))
 

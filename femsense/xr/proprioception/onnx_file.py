@@ -1,4 +1,4 @@
-"""A small part of ONNX, written and read without a library: a graph of a few operators, its numbers, and text beside it.
+"""A small subset of ONNX, written and read without a library: a graph of a few operators, its constants, and metadata.
 
 The fields are those of onnx/onnx.proto, in the wire format of Protocol Buffers (a key of field · 8 + type,
 then a varint or bytes).
@@ -38,7 +38,7 @@ class Node:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Graph:
-    """Operators in order, with what goes in and out; every array is (rows, width)."""
+    """Operators in order, with their inputs and outputs; every array is (rows, width)."""
 
     nodes: tuple[Node, ...]
     inputs: Mapping[str, int]
@@ -49,7 +49,7 @@ class Graph:
 
 
 def write_onnx(path: str | Path, graph: Graph, text: Mapping[str, str]) -> None:
-    """Write a graph, and text as metadata of the model; never leaves a half-written file."""
+    """Write a graph with metadata, under a temporary name that is renamed at the end."""
     parts = [_bytes(GRAPH_NODE, _node(node)) for node in graph.nodes]
     parts.append(_text(GRAPH_NAME, "femsense"))
     parts += [_bytes(GRAPH_INITIALIZER, _tensor(name, array)) for name, array in graph.numbers.items()]
@@ -63,7 +63,7 @@ def write_onnx(path: str | Path, graph: Graph, text: Mapping[str, str]) -> None:
 
 
 def read_onnx(path: str | Path) -> tuple[dict[str, npt.NDArray[np.float32]], dict[str, str]]:
-    """Return the constants and the metadata of an ONNX file. Raises InputError where it is none."""
+    """Return the constants and the metadata of an ONNX file. Raises InputError if it is not one."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -130,7 +130,7 @@ def _value(name: str, width: int) -> bytes:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield (field number, varint or bytes) of a message. Raises ValueError where it ends too early or is of another kind."""
+    """Yield (field number, varint or bytes) of a message. Raises ValueError if it is truncated or of another kind."""
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)

@@ -1,8 +1,8 @@
-"""Which map is learnt: chosen on blocks of time that it was not trained on.
+"""Model selection on held-out blocks of time.
 
-Rows that follow each other are nearly the same, so a row held out at random says nothing of the next excursion.
-Six blocks in time are held out in turn; of the rest of the recording,
-blocks spread over it are kept for the error that is stated (70 / 15 / 15 %).
+Consecutive rows are nearly equal, so a row held out at random does not test the next excursion.
+Six blocks in time are held out in turn; blocks spread over the rest of the recording
+are reserved for the reported error (70 / 15 / 15 %).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MLP_DECAY = 1.0
 """Weight decay, as scikit-learn counts it."""
 CHEAP = {"ridge", "radial"}
 Progress = Callable[[int, int], None]
-"""Called with what is done, and how much there is."""
+"""Called with (steps done, all steps)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,10 +149,10 @@ def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Net
 
 
 def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
-    """Return the mean of a committee of small networks on what ridge leaves, as one network.
+    """Return the mean of a committee of small networks on the residual of ridge, as one network.
 
-    Each has `MLP_UNITS` rectified units, as many as the paper's, and starts from other weights; scikit-learn trains it (L-BFGS). One
-    alone depends on its start by half its error.
+    Each has `MLP_UNITS` rectified units, as many as the paper's, and other initial weights; scikit-learn trains it (L-BFGS). The error of a single
+    one varies by half with its initial weights.
     """
     from sklearn.neural_network import MLPRegressor
 

@@ -1,14 +1,14 @@
-"""How far a predicted marker may be off: an interval for each pose.
+"""Uncertainty of a predicted marker: an interval for each pose.
 
 The map is linear in its last layer, with features f(x) = (φ(z), z, 1), so its predictive variance is that of Bayesian linear
 regression (Bishop 2006, section 3.3.2; for networks the Laplace approximation of the last layer):
 
     s²(x) = 1 + κ fᵀ (FᵀF / n + λ I)⁻¹ f / p
 
-F are the p features of the n rows that it was trained on. The leverage beside κ is 1 on average over those rows; it does not fall with n,
-since rows that follow each other, and motions that are repeated, tell the same. κ is the likeliest for errors on blocks in time that
-were held out. The interval of a marker has the radius q s(x), where q is the 95 % quantile of |error| / s(x) on such blocks. Blocks at the
-end, predicted from what came before them, hold what a session drifts.
+F are the p features of the n training rows. The leverage term multiplied by κ averages 1 over those rows; it does not decrease with n,
+because consecutive rows and repeated motions carry the same information. κ maximises the likelihood of errors on held-out blocks of time.
+The interval of a marker has the radius q s(x), where q is the 95 % quantile of |error| / s(x) on such blocks. Blocks at the
+end, predicted from earlier ones, contain the drift of a session.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FIRST_END = 3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Spread:
-    """What the radius of an interval is computed from."""
+    """Parameters of the radius of an interval."""
 
     root: FloatArray
     """L⁻¹ of p (FᵀF / n + λ I) = L Lᵀ, shape (p, p)."""
@@ -54,7 +54,7 @@ class Spread:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldOut:
-    """Errors of maps on rows that they were not trained on, with what these say of their own variance."""
+    """Errors of maps on rows that they were not trained on, with their own predictive variance."""
 
     distance: FloatArray
     """Of each marker [m], shape (n, m)."""
@@ -75,11 +75,11 @@ class HeldOut:
 
 
 def splits(part: IntArray) -> Iterator[tuple[BoolArray, BoolArray, int]]:
-    """Yield (trained on, predicted, group): each recording from the others where there are several, else blocks in time, and those
-    at the end from what came before them.
+    """Yield (trained on, predicted, group): each recording from the others if there are several, else blocks in time, and those
+    at the end from earlier ones.
 
     Arguments:
-        part: which recording each row is of, in order of time, shape (n,).
+        part: number of the recording of each row, in order of time, shape (n,).
     """
     recordings = np.unique(part)
     if len(recordings) > 1:
@@ -96,7 +96,7 @@ def splits(part: IntArray) -> Iterator[tuple[BoolArray, BoolArray, int]]:
 def held_out(
     train: Callable[[FloatArray, FloatArray], Network], inputs: FloatArray, targets: FloatArray, part: IntArray
 ) -> HeldOut:
-    """Return the errors of a way of training on what it was not trained on; see `splits`.
+    """Return the cross-validation errors of a training function; see `splits`.
 
     Arguments:
         train: returns the map of inputs (k, d) to coordinates (k, 3 m).
@@ -138,7 +138,7 @@ def likeliest_kappa(held: HeldOut) -> float:
 
 
 def growth(held: HeldOut) -> float:
-    """Return the error on blocks at the end over that on blocks between others; 1 where there are not both."""
+    """Return the ratio of the error on blocks at the end to that on blocks between others; 1 without both."""
     later = held.group != BETWEEN
     if later.all() or not later.any():
         return 1.0

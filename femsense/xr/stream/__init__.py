@@ -1,1 +1,1 @@
-"""Live streams: what is sent, to whom, and what comes back."""
+"""Live streams: messages, recipients, and replies."""

@@ -1,4 +1,4 @@
-"""Who may watch: this machine alone, or whoever knows the password."""
+"""Access to a stream: this machine only, or with a password."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COOKIE = "femsense"
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Where a server listens and whom it answers."""
+    """Address of a server, and its access rules."""
 
     host: str = "127.0.0.1"
     password: str | None = field(default=None, repr=False)
@@ -28,9 +28,9 @@ class Access:
     """PEM file; with it all traffic is encrypted."""
     key: Path | None = None
     names: tuple[str, ...] = ()
-    """Further names under which other machines know this one: of a proxy, a tunnel, a router."""
+    """Further host names of this machine: of a proxy, a tunnel, a router."""
     ticket: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    """What the page's cookie holds once the password was given; made anew for each server."""
+    """Value of the page's cookie after the password was accepted; random for each server."""
 
     def __post_init__(self) -> None:
         if not is_loopback(self.host) and not self.password:
@@ -46,11 +46,11 @@ class Access:
 
     @property
     def scheme(self) -> str:
-        """What the page's address begins with."""
+        """URL scheme of the page."""
         return "https" if self.certificate is not None else "http"
 
     def tls(self) -> ssl.SSLContext | None:
-        """Return what encrypts, or None. Raises InputError."""
+        """Return the TLS context, or None. Raises InputError."""
         if self.certificate is None:
             return None
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -1,4 +1,4 @@
-"""Brings a stream from elsewhere into a hub of this machine: from a WebSocket of femsense, or from a broker."""
+"""Forwards a remote stream, from a WebSocket of femsense or from a broker, into a hub of this machine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from femsense.xr.stream.web_source import WebSource
 from femsense.xr.stream.websocket import pack, unpack
 
 LARGEST_MESH = 64 << 20
-"""Bytes of a mesh that is taken from elsewhere."""
+"""Largest mesh that is accepted [bytes]."""
 
 
 class Bridge:
-    """Keeps a hub supplied from a URL, for as long as it takes; what viewers send goes the other way."""
+    """Forwards messages from a URL to a hub until closed; messages of viewers go in the opposite direction."""
 
     def __init__(self, hub: Hub, url: str, *, password: str | None = None, authority: Path | None = None) -> None:
         """Connect in the background.
@@ -66,11 +66,11 @@ class Bridge:
 
     @property
     def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
+        """Why there is no connection; empty with one."""
         return self._trouble()
 
     def close(self) -> None:
-        """Leave."""
+        """Disconnect."""
         self._stop.set()
         self._close()
 
@@ -86,7 +86,7 @@ class Bridge:
             self.hub.publish([message])
 
     def lost(self, robots: Collection[str], where: str) -> None:
-        """Say of robots that there is no connection any more; those that have ended said so before."""
+        """Report the lost connection for all robots except those that have ended."""
         newest = {robot: self.hub.newest().get(topic(robot, STATUS)) for robot in robots}
         states = {robot: read_document(told.payload) or {} for robot, told in newest.items() if told is not None}
         gone = [robot for robot in robots if states.get(robot, {}).get("state") != "ended"]

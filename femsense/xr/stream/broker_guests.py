@@ -1,4 +1,4 @@
-"""The embedded broker, who may use it, and what it hears from them: a plugin of amqtt, which loads this module by its name."""
+"""Access control and messages of the embedded broker: a plugin of amqtt, which loads this module by its name."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from femsense.xr.stream.hub import Message
 
 
 class EachOnce(Broker):  # type: ignore[misc]
-    """amqtt's broker, which gives a client what is kept for its own subscriptions only.
+    """amqtt's broker, with retained messages sent to a client for its own subscriptions only.
 
-    amqtt 0.12 gives a client at its connection what is kept for the filters of all others too: it comes again once the client
-    has subscribed, and even what it never asked for.
+    On connection, amqtt 0.12 also sends a client the messages retained for the filters of all others: duplicates of what its own
+    subscriptions bring, and topics without a subscription.
     """
 
     async def _publish_retained_messages_for_subscription(self, subscription: tuple[str, int], session: Session) -> None:
@@ -26,7 +26,7 @@ class EachOnce(Broker):  # type: ignore[misc]
 
 
 class Guests(BaseAuthPlugin):  # type: ignore[misc]
-    """Lets in who knows the password, any user name; hands on what guests publish."""
+    """Accepts clients with the password, any user name; forwards messages that guests publish."""
 
     async def authenticate(self, *, session: Session) -> bool:
         """Return whether a client may connect."""
@@ -35,7 +35,7 @@ class Guests(BaseAuthPlugin):  # type: ignore[misc]
         return not wanted or hmac.compare_digest(given.encode(), wanted.encode())
 
     async def on_broker_client_connected(self, *, client_id: str, client_session: Session) -> None:
-        """Tell that a client is there."""
+        """Report a new client."""
         self.config.arrived(client_id)
 
     async def on_broker_message_received(self, *, client_id: str, message: ApplicationMessage) -> None:
@@ -44,7 +44,7 @@ class Guests(BaseAuthPlugin):  # type: ignore[misc]
 
     @dataclass
     class Config:
-        """What the broker knows of its guests."""
+        """Access settings and callbacks of the plugin."""
 
         receive: Any
         """Called with a message and the client's name."""

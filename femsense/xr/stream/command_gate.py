@@ -1,4 +1,4 @@
-"""What stands between a wish and a robot: armed or not, held or not, how fast, how far."""
+"""The safety gate between targets and robot commands: arming, hold-to-run, rate and range limits."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ class GateOptions:
     """How commands may go out."""
 
     allowed: bool = False
-    """Whether any command goes out at all."""
+    """Whether commands are sent at all."""
     hold_s: float = 0.25
     """Commands end when no wish has come for so long: who drags must hold on."""
     range_per_s: float = 0.25
     """An input moves by this share of its range a second at most."""
     command_hz: float = 50.0
-    """How often commands go out. A command that comes later moves no farther: what a thread has missed is not made up for at once."""
+    """Interval of the commands [s]. A late command moves no farther: missed intervals are not made up for."""
 
 
 class CommandGate:
-    """Lets inputs move towards what is wanted, slowly, within their ranges, and only while someone armed holds on."""
+    """Moves inputs towards their targets, slowly, within their ranges, and only while an armed client holds on."""
 
     def __init__(self, inputs: Sequence[Input], options: GateOptions | None = None) -> None:
         self.inputs, self.options = tuple(inputs), options or GateOptions()
         self.commanded: dict[str, float] = {}
-        """What was commanded last; empty while nothing is."""
+        """The last command; empty while nothing is commanded."""
         self.last: dict[str, float] = {}
-        """What was commanded last, also while nothing is: a robot that stops stays there. Empty before the first command."""
+        """The last command, also after motion has stopped: a stopped robot stays there. Empty before the first command."""
         self.turn = 0
-        """How often it was let go: what was found for an earlier turn is not wanted in this one."""
+        """Number of releases: a target computed before a release is not valid after it."""
         self._wanted: dict[str, float] = {}
         self._held_at = self._moved_at = float("-inf")
 
@@ -44,12 +44,12 @@ class CommandGate:
             self.release()
 
     def want(self, inputs: Mapping[str, float], *, turn: int | None = None) -> None:
-        """Set where the inputs are to go, unless that was found for an earlier turn."""
+        """Set the target of the inputs, unless it was computed before the last release."""
         if turn in (None, self.turn):
             self._wanted = dict(inputs)
 
     def release(self) -> None:
-        """Stop at once: nothing moves any more."""
+        """Stop all motion immediately."""
         self._held_at = float("-inf")
         self._wanted = {}
         self.turn += 1
@@ -61,7 +61,7 @@ class CommandGate:
 
     @property
     def arrived(self) -> bool:
-        """Whether the inputs that go out are those that are wanted: limited rates have caught up."""
+        """Whether the commanded inputs have reached their targets."""
         near = 1e-3
         return self.moving and all(
             abs(self.commanded[one.name] - _within(one, self._wanted.get(one.name, self.commanded[one.name])))
@@ -70,12 +70,12 @@ class CommandGate:
         )
 
     def step(self, now: float, current: Mapping[str, float]) -> dict[str, float] | None:
-        """Return the inputs to command at a time [s], or None where none may be.
+        """Return the inputs to command at a time [s], or None if no command is allowed.
 
         Arguments:
             now: the time [s].
-            current: where the robot itself says that the inputs are; commands begin from there, so that nothing jumps. What it
-                does not say is where commands left it last, however long ago.
+            current: inputs reported by the robot; commands begin there, so that there is no jump. Inputs that it does not report
+                begin at their last command, however old.
         """
         held = now - self._held_at <= self.options.hold_s
         if not held:

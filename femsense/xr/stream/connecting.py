@@ -1,4 +1,4 @@
-"""Why there is no connection to a stream or a broker, in words, and what to do about it."""
+"""Connection errors of streams and brokers in words, with advice."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def why_not(error: BaseException, *, tls: bool, password: bool) -> str:
     """Return why an attempt to connect failed.
 
     Arguments:
-        error: what was raised.
+        error: the exception.
         tls: whether the attempt was encrypted.
         password: whether a password was given.
     """
@@ -27,13 +27,13 @@ def why_not(error: BaseException, *, tls: bool, password: bool) -> str:
         return _refused_by_server(int(status), password=password)
     if isinstance(error, OSError):
         return _not_reached(error, tls=tls)
-    if type(error).__name__ == "InvalidMessage":  # of websockets: what answers speaks no HTTP
+    if type(error).__name__ == "InvalidMessage":  # of websockets: the peer does not speak HTTP
         return NO_TLS if tls else NO_STREAM
     return str(error) or NO_ANSWER
 
 
 def not_let_in(*, password: bool) -> str:
-    """Return what is wrong where a password is."""
+    """Return the error in words if the password is the cause."""
     return f"the password is wrong: {PASSWORD_WAYS}" if password else f"a password is needed: {PASSWORD_WAYS}"
 
 

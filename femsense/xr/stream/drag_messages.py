@@ -1,4 +1,4 @@
-"""What clients say of a drag, and what they are told, in words."""
+"""Messages of clients about a drag, and the replies in words."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from femsense.xr.stream.payloads import read_document
 LONGEST = 4096
 """Bytes of a wish."""
 LONGEST_NAME = 64
-"""Characters of the name that a client gives itself."""
+"""Maximum number of characters of a client's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """Where someone wants a point."""
+    """The requested position of a point."""
 
     claim: Claim
     handle: str
@@ -28,7 +28,7 @@ class Wish:
 
 
 def read_wish(payload: bytes, way: str) -> Wish | None:
-    """Return the wish in a message that came some way, or None where there is none."""
+    """Return the request in a message from any channel, or None if there is none."""
     told = read_document(payload, most=LONGEST)
     if told is None:
         return None
@@ -40,7 +40,7 @@ def read_wish(payload: bytes, way: str) -> Wish | None:
 
 
 def in_plain_words(motion: Motion) -> str:
-    """Return what became of a wish, for somebody who drags and knows nothing of solvers."""
+    """Return the result of a request in words for a user without knowledge of the solver."""
     away = f"{1e3 * motion.error_m:.3g} mm"
     held_back = f": {'; '.join(motion.limits)}" if motion.limits else ""
     if motion.status == REACHED:

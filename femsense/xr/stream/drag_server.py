@@ -1,7 +1,7 @@
-"""Answers a dragged point: inputs by a `Follower`, the shape that the robot can take, and commands while armed and held.
+"""Replies to a dragged point: inputs by a `Follower`, the shape that the robot can reach, and commands while armed and held.
 
-One client steers at a time (`lease`), and anybody can stop everything. Each wish is answered with where the way to it stands;
-while a wish stays, answers go on until nothing comes nearer.
+One client controls the robot at a time (`lease`), and every client can stop it. Each request is answered with the state of the search;
+while the request is unchanged, replies continue until the search ends.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ class DragOptions:
     tolerance_m: float = 1e-4
     """A target is reached that is missed by less [m]: finer than a hand drags."""
     answer_s: float = 0.02
-    """No further equilibrium is begun for an answer after so long [s]; the next answer goes on from there."""
+    """Time after which no further equilibrium is started for a reply [s]; the next reply continues there."""
     rest_s: float = 0.3
-    """A hand that has not moved for so long rests: its target is sought from rest too where it is not reached [s]."""
+    """Time after which an unchanged target counts as resting [s]; it is then also searched from rest if it is not reached."""
     feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
-    """How what is measured corrects the inputs."""
+    """Correction of the inputs by measurements."""
 
 
 def drive_inputs(robot: Robot) -> tuple[Input, ...]:
-    """Return what drives a robot with its limits: tensions [N] of cables, pressures [Pa] of chambers."""
+    """Return the inputs of a robot with their limits: tensions [N] of cables, pressures [Pa] of chambers."""
     body = robot.body
     cables = [Input(c.name, "N", c.min_tension, _top(c.max_tension, "N")) for c in body.cables]
     return (*cables, *(Input(c.name, "Pa", 0.0, _top(c.max_pressure, "Pa")) for c in body.chambers))
@@ -94,15 +94,15 @@ class DragServer:
         calibration: Calibration | None = None,
         options: DragOptions | None = None,
     ) -> None:
-        """Start to answer.
+        """Start to reply.
 
         Arguments:
-            hub: wishes come from there, answers go there.
+            hub: source of requests and destination of replies.
             robot: its limits hold.
-            skin: whose bones show the shape that is reachable; vertices at rest are points of the robot.
+            skin: its bones show the reachable shape; its vertices at rest are points of the robot.
             name: of the robot in topics.
-            calibration: its initial inputs are taken off the commands.
-            options: of answers and commands.
+            calibration: its initial inputs are subtracted from the commands.
+            options: of replies and commands.
         """
         self.hub, self.robot, self.options = hub, robot, options or DragOptions()
         self.name = name or robot.name
@@ -158,7 +158,7 @@ class DragServer:
             self.stop()
 
     def _measure(self, payload: bytes) -> None:
-        """Take note of where the dragged marker was measured, and of what the robot says of its inputs."""
+        """Store the measured position of the dragged marker, and the inputs that the robot reports."""
         told, now = read_document(payload) or {}, time.monotonic()
         places = {str(row.get("name")): place_of(row.get("position_m")) for row in rows_of(told, "markers")}
         inputs = self._values(told)
@@ -173,7 +173,7 @@ class DragServer:
                 self._told, self._told_at = inputs, now
 
     def stop(self) -> None:
-        """End all motion at once, whoever steers; who wants to go on has to disarm first."""
+        """Stop all motion immediately, for every client; motion requires disarming first."""
         with self._lock:
             self.lease.stop()
             self._let_go()
@@ -182,7 +182,7 @@ class DragServer:
         self._say_who_steers()
 
     def _let_go(self) -> None:
-        """Forget what was wanted: it is not wanted now."""
+        """Discard the current request."""
         self.gate.release()
         self.feedback.forget()
         self._wish, self._handle, self._grabbed = None, "", False
@@ -242,9 +242,9 @@ class DragServer:
                 self.answer(wish.handle, wish.target_m)
 
     def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
-        """Come nearer to one wish, publish what was found, and set it as what the gate moves to.
+        """Advance the search for a request, publish the result, and set it as the target of the gate.
 
-        What is measured of the point while the robot stands still moves the model's target (see `tip_feedback`).
+        Measurements of the point while the robot is at rest correct the model's target (see `tip_feedback`).
         """
         begun = time.perf_counter()
         with self._lock:
@@ -270,7 +270,7 @@ class DragServer:
                 self.gate.want(motion.inputs, turn=turn)
         self._bones = self._fit(self._skin.positions(motion.positions), start=self._bones)
         off = float(np.linalg.norm(self.feedback.expected(motion.reached_m[handle]) - np.array(target_m)))
-        asked = replace(motion, error_m=off)  # the search knows only of the target that was moved
+        asked = replace(motion, error_m=off)  # the search used the corrected target
         self._tell((self._bones, self._document(handle, asked, 1e3 * (time.perf_counter() - begun))))
         return motion
 
@@ -296,7 +296,7 @@ class DragServer:
         return self._settled_since
 
     def _why_not_measured(self, handle: str, now: float) -> str:
-        """Return in words why nothing corrects a point at a time [s]; empty where it is measured, or nobody ever measured."""
+        """Return in words why a point is not corrected at a time [s]; empty if it is measured, or was never measured."""
         fresh, ago = self.options.feedback.fresh_s, now - self._measured_at.get(handle, float("-inf"))
         if ago <= fresh or not (self._measured_at or self._unmeasured):
             return ""
@@ -324,7 +324,7 @@ class DragServer:
     # ---- commands
 
     def _command_all(self) -> None:
-        """Send commands for as long as the gate lets them out; when it closes, say so once."""
+        """Send commands while the gate allows them; report once when it closes."""
         was_moving = False
         while not self._stop.wait(1.0 / self.options.gate.command_hz):
             with self._lock:
@@ -345,7 +345,7 @@ class DragServer:
             self._stopped()
 
     def _stopped(self) -> None:
-        """Say that no more commands come: the inputs stay. The newest answer, which who comes late gets, says so too."""
+        """Report the end of the commands: the inputs stay. The last reply, retained for new clients, is updated too."""
         self._command(self.gate.last, armed=False)
         self._tell()
 
@@ -361,20 +361,20 @@ class DragServer:
         self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
 
     def _current(self, now: float) -> dict[str, float]:
-        """Return the inputs that the robot has at a time [s], as far as it says so itself, on `measured`.
+        """Return the robot's inputs at a time [s], as far as it reports them on `measured`.
 
-        Before the first command the topic `inputs` says it; later it does not count: of a run that plays it says what was once.
+        Before the first command the topic `inputs` is used too; after it this is not valid: a replayed run would report its recorded inputs.
         """
         told = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
         return told if self.gate.last else {**self._shown(), **told}
 
     def _is_known(self, now: float) -> bool:
-        """Return whether it is known where commands begin at a time [s]: the robot says it, or is where commands left it."""
+        """Return whether the starting point of commands is known at a time [s]: reported by the robot, or its last command."""
         fresh = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
         return bool(self.gate.last) or len(fresh) == len(self.gate.inputs) or not self.options.gate.allowed
 
     def _shown(self) -> dict[str, float]:
-        """Return the inputs of what viewers see."""
+        """Return the inputs of the displayed state."""
         message = self.hub.newest().get(topic(self.name, INPUTS))
         return self._values((message and read_document(message.payload)) or {})
 

@@ -14,7 +14,7 @@ from typing import TextIO
 from femsense.core.errors import InputError
 
 POLL_S = 0.002
-"""How often a file is asked whether it has grown."""
+"""Interval at which a file is checked for new rows [s]."""
 CHUNK = 1 << 20
 
 
@@ -22,14 +22,14 @@ class GrowingFile:
     """Rows of a CSV file as they are written."""
 
     def __init__(self, file: Path, channels: Sequence[str]) -> None:
-        """Open the file if it is there. Raises InputError where it is and lacks a channel, or where it cannot come."""
+        """Open the file if it exists. Raises InputError if it lacks a channel, or if it cannot appear later."""
         self._file, self._channels = file, channels
         self._stream: TextIO | None = None
         self._columns: list[str] = []
         self.away = ""
         """Why there are no rows, as far as the file itself is the reason."""
         self.age_s = 0.0
-        """How long ago the row that is heard now was written at least [s]: of what stood there already the file's own time says it."""
+        """Minimum age of the current row [s]; for rows that existed before, from the modification time of the file."""
         if file.is_dir() or not file.absolute().parent.is_dir():
             raise InputError(
                 "no such source",
@@ -57,15 +57,15 @@ class GrowingFile:
             for line in lines:
                 hear(dict(zip(self._columns, next(csv.reader([line]), []))))
             if not lines:
-                self.age_s = 0.0  # what comes from now on is written while we watch
+                self.age_s = 0.0  # later rows are written while the file is watched
                 stop.wait(POLL_S)
-                if self._began_anew():
+                if self._was_replaced():
                     self._close()
                     rest = ""
         self._close()
 
     def _open(self) -> bool:
-        """Open the file, and return whether it is there with all channels; `away` says what is missing."""
+        """Open the file, and return whether it exists with all channels; `away` contains the reason if not."""
         try:
             stream = self._file.open(newline="", encoding="utf-8", errors="replace")
         except OSError as error:
@@ -86,13 +86,13 @@ class GrowingFile:
         return [name for name in self._channels if self._columns and name not in self._columns]
 
     def _end(self) -> str:
-        """Return the last whole line and what follows: what is old is not shown."""
+        """Return the last complete line and the rest: older lines are skipped."""
         text = ""
         while self._stream is not None and (chunk := self._stream.read(CHUNK)):
             text = "\n".join((text + chunk).split("\n")[-2:])
         return text
 
-    def _began_anew(self) -> bool:
+    def _was_replaced(self) -> bool:
         """Whether the file was cut off or replaced; False while it is away."""
         with suppress(FileNotFoundError):
             now = self._file.stat()

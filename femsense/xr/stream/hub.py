@@ -1,4 +1,4 @@
-"""Where messages meet who wants them: the newest of each topic is kept, and handed to sinks as it comes."""
+"""The message hub: the newest message of each topic is kept, and passed to sinks on arrival."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Sink(Protocol):
 
 
 class Hub:
-    """The newest message of each topic, and the sinks that want each; safe for threads."""
+    """The newest message of each topic, and the sinks of each; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -41,7 +41,7 @@ class Hub:
         self._listeners: list[Callable[[Message, str], None]] = []
 
     def attach(self, sink: Sink) -> None:
-        """Add a sink; it is told at once what is known."""
+        """Add a sink; it receives the kept messages immediately."""
         with self._lock:
             self._sinks.append(sink)
             known = tuple(self._newest.values())
@@ -63,12 +63,12 @@ class Hub:
             return dict(self._newest)
 
     def listen(self, listener: Callable[[Message, str], None]) -> None:
-        """Call listener(message, who) for what viewers send; in their thread, so it must not wait."""
+        """Call listener(message, who) for messages of viewers, in their thread, so it must not block."""
         with self._lock:
             self._listeners.append(listener)
 
     def received(self, message: Message, who: str) -> None:
-        """Pass on what a viewer sent."""
+        """Pass on a message of a viewer."""
         with self._lock:
             listeners = tuple(self._listeners)
         for listener in listeners:

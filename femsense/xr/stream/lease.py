@@ -1,11 +1,11 @@
-"""Who steers: one client at a time holds a lease with a number and a time, whatever way its messages come.
+"""Control of the robot: one client at a time holds a numbered lease with a time limit, independent of the channel of its messages.
 
-A client asks by a message without a number. The lease that is granted has a new number, larger than any before, and ends after `hold_s`
-without a message that quotes it. Messages of one client carry a number that grows. So a message that was recorded, that a broker
-delivers again, or that was held up longer than a lease lasts moves nothing.
+A client requests a lease by a message without a number. A granted lease has a number larger than any before, and ends after `hold_s`
+without a message that quotes it. Messages of one client carry an increasing number. A message that was recorded, delivered twice by a
+broker, or delayed beyond the end of a lease therefore moves nothing.
 
-A stop ends the lease. After it, nobody is granted one for armed messages before having sent one that is not armed: hands that hold on
-through a stop have to let go.
+A stop ends the lease. After it, a client is granted a lease for armed messages only after it has sent one that is not armed: whoever holds on
+through a stop must release first.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GRACE = 4.0
 
 
 class Ruling(Enum):
-    """What becomes of a message."""
+    """Result of a message."""
 
     RENEWED = "renewed"
     GRANTED = "granted"
@@ -41,14 +41,14 @@ class _Known:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What a message says of its sender."""
+    """The sender information of a message."""
 
     way: str
     """How it came: the connection of a WebSocket, the name of a broker's client, or the broker."""
     client: str
     seq: int
     number: int
-    """Of the lease; 0: it asks for one."""
+    """Number of the lease; 0: a request for one."""
     held: bool
     armed: bool
 
@@ -61,9 +61,9 @@ class Lease:
         self.hold_s = hold_s
         self.number = int(1000.0 * time.time())  # beyond those of any earlier server
         self.client = ""
-        """Who holds it; empty: nobody."""
+        """The holder; empty: none."""
         self.stopped = False
-        """Whether it was ended by a stop and nobody has held it since."""
+        """Whether a stop ended it and no client has held it since."""
         self._holder: tuple[str, str] | None = None
         self._renewed_at = float("-inf")
         self._known: dict[tuple[str, str], _Known] = {}
@@ -100,7 +100,7 @@ class Lease:
         return bool(self.client) and now - self._renewed_at <= self.hold_s
 
     def expire(self, now: float) -> bool:
-        """End it where it has run out at a time [s]; return whether it has just now."""
+        """End the lease if it has expired at a time [s]; return whether it has expired now."""
         ran_out = bool(self.client) and not self.is_held(now)
         self.client = "" if ran_out else self.client
         return ran_out

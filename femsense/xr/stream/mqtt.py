@@ -1,4 +1,4 @@
-"""MQTT: a client that sends to any broker, and a broker for this machine alone."""
+"""MQTT: a client for any broker, and an embedded broker for this machine."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class BrokerAddress:
 
 
 def broker_address(text: str, *, password: str | None = None, authority: Path | None = None) -> BrokerAddress:
-    """Return what `HOST`, `HOST:PORT` or `mqtt[s]://[USER[:PASSWORD]@]HOST[:PORT]` says. Raises InputError."""
+    """Return the parts of `HOST`, `HOST:PORT` or `mqtt[s]://[USER[:PASSWORD]@]HOST[:PORT]`. Raises InputError."""
     parts = urlsplit(text if "://" in text else f"mqtt://{text}")
     try:
         port = parts.port
@@ -64,7 +64,7 @@ class Refusal:
     """Why a client is not connected to a broker."""
 
     def __init__(self, client: Client, address: BrokerAddress) -> None:
-        """Listen to what fails before the broker answers."""
+        """Register for failures before the broker answers."""
         self.text = NO_ANSWER
         self._address, self._said = address, False
         client.on_connect_fail = self._failed
@@ -84,12 +84,12 @@ class Refusal:
         self._said = False
 
     def _failed(self, _client: Any, _data: Any) -> None:
-        error = sys.exc_info()[1]  # paho calls this while it handles what the system said
+        error = sys.exc_info()[1]  # paho calls this while it handles the system's exception
         self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
 
 
 class MqttLink(ABC):
-    """A client of a broker that comes back by itself where the broker goes away."""
+    """A client of a broker that reconnects by itself."""
 
     def __init__(self, address: BrokerAddress, topics: Sequence[str]) -> None:
         """Prepare a client that listens to the topics that filters name. Raises MissingDependency."""
@@ -109,11 +109,11 @@ class MqttLink(ABC):
 
     @property
     def trouble(self) -> str:
-        """Why there is no connection; empty where there is one."""
+        """Why there is no connection; empty with one."""
         return "" if self.connected.is_set() else self._refusal.text
 
     def close(self) -> None:
-        """Take leave, so that the last will is not executed."""
+        """Disconnect cleanly, so that the last will is not sent."""
         self._client.disconnect()
         self._client.loop_stop()
 
@@ -136,8 +136,8 @@ class MqttLink(ABC):
 class MqttSink(MqttLink):
     """Sends a hub's messages to a broker.
 
-    While there is no broker nothing is kept: what is retained is sent again when it is back, all else is old by then. Where the
-    program ends without a word, the broker says for the first robot that it is lost (the last will).
+    Without a connection no messages are queued: retained ones are sent again after reconnection, others are outdated by then. If the
+    program ends unexpectedly, the broker reports the first robot as lost (last will).
     """
 
     def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
@@ -152,9 +152,9 @@ class MqttSink(MqttLink):
         hub.attach(self)
 
     def send(self, messages: tuple[Message, ...]) -> None:
-        """Hand messages to the broker if there is one; returns at once.
+        """Pass messages to the broker if it is connected; does not block.
 
-        While the connection has not taken the ones before, the newest of each topic wait; what is retained never does.
+        While earlier messages are pending, the newest of each topic waits; retained messages are never dropped.
         """
         if not self.connected.is_set():
             return
@@ -167,7 +167,7 @@ class MqttSink(MqttLink):
             self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
 
     def _hear(self, message: Message, *, kept: bool) -> None:
-        """Pass on what others send. What the broker kept from earlier is nobody's wish of now; a stop counts whenever it comes."""
+        """Pass on messages of others. Retained ones are no current requests and are ignored, except a stop."""
         if not kept or message.topic.endswith(f"/{STOP}"):
             self.hub.received(message, "MQTT")
 
@@ -182,7 +182,7 @@ class MqttSink(MqttLink):
 
 
 class MqttSource(MqttLink):
-    """Receives from a broker what streams there."""
+    """Receives a stream from a broker."""
 
     def __init__(
         self,
@@ -193,9 +193,9 @@ class MqttSource(MqttLink):
         lost: Callable[[], None] = lambda: None,
         kept: bool = True,
     ) -> None:
-        """Call receive(message) in a thread of its own, for the topics that filters name, and lost() when the broker goes away.
+        """Call receive(message) in a separate thread for topics that match the filters, and lost() when the broker disconnects.
 
-        `kept`: also with what the broker has kept from earlier. Raises MissingDependency.
+        `kept`: include retained messages. Raises MissingDependency.
         """
         super().__init__(address, topics)
         self._receive, self._lost, self._kept = receive, lost, kept
@@ -215,7 +215,7 @@ class MqttSource(MqttLink):
 
 
 def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | None:
-    """Return whether a broker accepts a client without a name and password; None where it does not answer in time [s]."""
+    """Return whether a broker accepts a client without a name and password; None if it does not answer in time [s]."""
     if address.user is None:
         return True
     answered, accepted = Event(), []
@@ -265,12 +265,12 @@ class EmbeddedBroker:
     messages reach clients in one step."""
 
     def __init__(self, hub: Hub, *, port: int = PLAIN_PORT, access: Access | None = None) -> None:
-        """Start to serve. Raises MissingDependency, InputError where the port is taken.
+        """Start to serve. Raises MissingDependency, InputError if the port is taken.
 
         Arguments:
-            hub: whose messages clients get; wishes and measurements of clients go there.
-            port: 0 takes a free one.
-            access: where it listens, its password, and the certificate that encrypts; 127.0.0.1 alone and none by default.
+            hub: its messages are sent to clients; requests and measurements of clients go to it.
+            port: 0 selects a free one.
+            access: address, password and TLS certificate; by default 127.0.0.1 without a password.
         """
         try:
             import amqtt.broker  # noqa: F401
@@ -278,7 +278,7 @@ class EmbeddedBroker:
             raise MissingDependency("a broker needs the package amqtt\n  try:      pip install 'femsense[xr]'") from None
         self.port = port or _free_port()
         self._access, self._hub = access or Access(), hub
-        self._access.tls()  # says at once what is wrong with a certificate
+        self._access.tls()  # raises early if the certificate is invalid
         self._loop = asyncio.new_event_loop()
         keep_quiet(self._loop)
         self._broker: Any = None
@@ -303,7 +303,7 @@ class EmbeddedBroker:
 
     @property
     def clients(self) -> int:
-        """How many different clients were let in so far."""
+        """Number of different clients that were accepted."""
         return len(self._arrived)
 
     def close(self) -> None:
@@ -335,7 +335,7 @@ class EmbeddedBroker:
         try:
             self._broker = EachOnce(settings)
             await self._broker.start()
-        except Exception as error:  # amqtt wraps what the system says in errors of its own
+        except Exception as error:  # amqtt wraps system errors in its own classes
             self._failed = error.__cause__ or error
             ready.set()
             return

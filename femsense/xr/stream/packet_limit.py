@@ -1,4 +1,4 @@
-"""Brokers that close the connection on packets larger than they take: what is too large for them is left out, with a warning."""
+"""Brokers that disconnect on packets above their size limit: such packets are left out, with a warning."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from femsense.xr.stream.hub import Message
 SOON_S = 3.0
 """A broker that refuses a packet closes the connection this soon after it was greeted [s]."""
 TIMES = 2
-"""So many such ends in a row are no accident."""
+"""Number of consecutive disconnections after which the packet size is the likely cause."""
 SMALLEST = 1024
 """No broker has a limit below this [bytes]."""
 
@@ -20,21 +20,21 @@ class PacketLimit:
     """The size of packets that one broker takes, by how its connections end."""
 
     def __init__(self, broker: str) -> None:
-        """broker: what the warning names."""
+        """broker: its name in the warning."""
         self.broker = broker
         self.limit = math.inf
         """Packets of this size and more are left out [bytes]."""
         self._largest, self._ends, self._greeted = 0, 0, -math.inf
 
     def fitting(self, messages: tuple[Message, ...]) -> tuple[Message, ...]:
-        """Return what may be sent to a broker that has just let us in."""
+        """Return the messages to send to a broker after a connection."""
         fits = tuple(message for message in messages if len(message.payload) < self.limit)
         self._largest = max((len(message.payload) for message in fits), default=0)
         self._greeted = time.monotonic()
         return fits
 
     def ended(self) -> None:
-        """Take note that the connection ended; warns where the largest packet is the likely cause, which is left out from then on."""
+        """Record a disconnection; warn if the largest packet is the likely cause, and leave it out from then on."""
         self._ends = self._ends + 1 if time.monotonic() - self._greeted < SOON_S else 0
         if self._ends < TIMES or self._largest < SMALLEST:
             return

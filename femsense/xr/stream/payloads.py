@@ -1,12 +1,12 @@
-"""What is sent about a robot: topics, and the bytes of each.
+"""Messages about a robot: topics, and the bytes of each.
 
-A pose is a header of 20 bytes and seven numbers a bone, little-endian:
+A pose is a header of 20 bytes and seven numbers per bone, little-endian:
 
     "FSP1" · seq uint32 · time float64 [s] · bones uint16 · 0 uint16 · (x y z qx qy qz qw) float32 each, robot frame [m]
 
-A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. A field,
-stress for instance, is that header with "FSV1", then the largest value float32 and the share of it at each vertex of the mesh,
-0 … 255. All else is JSON that Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
+A cloud has the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. A field,
+such as stress, has that header with "FSV1", then the largest value float32 and the share of it at each vertex of the mesh,
+0 … 255. All other messages are JSON that Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, FIELD, STATUS = (
 DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
 LEASE, STOP = "lease", "stop"
 RECEIVED = (DRAG, MEASURED, STOP)
-"""What others may send: wishes, where markers of the robot are, and that all motion ends."""
+"""Topics that clients may send: requests, measured markers of the robot, and the stop of all motion."""
 RETAINED = (MODEL, GLB, STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"
 FRAMES = {"robot": "robot: right-handed, Z up", "markers": "markers: as they were measured, not the robot's"}
-"""Frames of reference, and how `model` says them."""
+"""Frames of reference, and their names in `model`."""
 POSE_HEAD = struct.Struct("<4sIdHH")
 CLOUD_HEAD = struct.Struct("<4sIdI")
 POSE_MAGIC, CLOUD_MAGIC, FIELD_MAGIC = b"FSP1", b"FSC1", b"FSV1"
@@ -64,7 +64,7 @@ class Pose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Input:
-    """What drives a robot, and how far it may go."""
+    """An input of a robot, with its range."""
 
     name: str
     unit: str
@@ -72,8 +72,8 @@ class Input:
     low: float
     high: float
     range: str = "declared"
-    """Whose: "declared" (limits of the robot), "reached" (by the run that is shown; no limits are declared) or "learnt" (seen when a
-    model of sensors was learnt)."""
+    """Source of the range: "declared" (limits of the robot), "reached" (in the displayed run; no limits are declared) or "learnt" (in the training data
+    of a sensor model)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -97,7 +97,7 @@ class FieldKind:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Twin:
-    """What stays the same of a robot that streams."""
+    """The constant description of a streamed robot."""
 
     name: str
     glb: bytes
@@ -110,13 +110,13 @@ class Twin:
     commands: bool = False
     """Whether commands may be published once a viewer arms them."""
     landmarks: Landmarks = field(default_factory=Landmarks)
-    """What the real robot shares with it."""
+    """Points shared with the real robot."""
     duration_s: float = float("nan")
     """Of a run that is played over and over; nan: none is."""
     field: FieldKind | None = None
-    """What `TwinFrame.field` holds."""
+    """Content of `TwinFrame.field`."""
     error_m: float = float("nan")
-    """Root mean square distance of its markers from the measured ones, where a learnt model was tested [m]; nan: not known."""
+    """Root mean square marker error of a learnt model in its test [m]; nan: unknown."""
     frame: str = "robot"
     """Of reference of all that is sent, one of `FRAMES`; "markers": where these were never brought into the robot's frame."""
 
@@ -142,13 +142,13 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TwinFrame:
-    """What is sent of one moment."""
+    """The messages of one moment."""
 
     time_s: float
     bones: npt.NDArray[np.float32]
     """As in `Pose`, shape (B, 7)."""
     contacts: tuple[Contact, ...] | None = ()
-    """None: nothing estimates forces."""
+    """None: no estimator runs."""
     inputs: tuple[float, ...] = ()
     """One value for each of the twin's inputs."""
     residual_m: float = float("nan")
@@ -166,7 +166,7 @@ class TwinFrame:
 
 
 def topic(robot: str, kind: str) -> str:
-    """Return `femsense/<robot>/<kind>`; characters that topics give a meaning to become "_"."""
+    """Return `femsense/<robot>/<kind>`; characters with a meaning in topics become "_"."""
     return f"{PREFIX}/{re.sub(r'[^A-Za-z0-9._-]', '_', robot) or '_'}/{kind}"
 
 
@@ -278,7 +278,7 @@ def force_bytes(seq: int, frame: TwinFrame, frame_id: str = "robot") -> bytes:
 
 
 def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Sequence[float], frame_id: str = "robot") -> bytes:
-    """Return what drives the robot at a moment."""
+    """Return the inputs of the robot at a moment."""
     rows = [_known({"name": i.name, "unit": i.unit, "value": float(v)}) for i, v in zip(inputs, values)]
     return _json({"header": header(seq, time_s, frame_id), "inputs": rows})
 
@@ -305,9 +305,9 @@ def in_unity(bones: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def status_bytes(state: str, detail: str = "", since_s: float = float("nan")) -> bytes:
-    """Return a status: "live", "stale" (no new poses), "ended" (by us) or "lost" (said by the broker in our place).
+    """Return a status: "live", "stale" (no new poses), "ended" (by the sender) or "lost" (by the broker's last will).
 
-    `since_s`: when that was read which the last pose shows [s since 1970]; left out where nothing was.
+    `since_s`: time of the data of the last pose [s since 1970]; left out if there was none.
     """
     return _json(_known({"state": state, "detail": detail, "since_s": since_s}))
 
@@ -350,7 +350,7 @@ def _vector(values: npt.ArrayLike) -> dict[str, float]:
 
 
 def _known(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out numbers that are not finite: JSON has none."""
+    """Leave out numbers that are not finite, which JSON lacks."""
     return {key: value for key, value in table.items() if not (isinstance(value, float) and not np.isfinite(value))}
 
 

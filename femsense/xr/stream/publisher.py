@@ -34,14 +34,14 @@ from femsense.xr.stream.payloads import (
 
 FIRST_POSE = "the first pose"
 STALE_S = 0.4
-"""What has sent no pose for so long is stale."""
+"""Time without a pose after which a robot is stale [s]."""
 EARLY = 0.2
 """A frame may come early by this share of the shortest interval: clocks of sources jitter, and 60 Hz should not become 30."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublishOptions:
-    """What is sent, and how often at most."""
+    """Content and maximum rates of the messages."""
 
     rate_hz: float = 60.0
     """Of poses and forces."""
@@ -50,13 +50,13 @@ class PublishOptions:
     json_mirror: bool = False
     """Also `pose_json`, for clients that read only text."""
     glb_url: str = ""
-    """Where the mesh can be loaded; by default beside the page."""
+    """Address of the mesh; by default next to the page."""
     waits_for: str = FIRST_POSE
-    """What is waited for until the first pose goes out, in words."""
+    """What the stream waits for before the first pose, in words."""
 
 
 class RateLimit:
-    """Says whether something may go out now; what comes too early is dropped, since newer is on its way."""
+    """Limits a message rate; messages that are too early are dropped, since newer ones follow."""
 
     def __init__(self, rate_hz: float) -> None:
         self._interval = 1.0 / rate_hz
@@ -78,7 +78,7 @@ class Publisher:
     """Sends one twin's frames into a hub."""
 
     def __init__(self, hub: Hub, twin: Twin, options: PublishOptions | None = None) -> None:
-        """Announce the twin: its mesh, its description, and what it waits for."""
+        """Announce the twin: its mesh, its description, and what the stream waits for."""
         self.hub, self.twin = hub, twin
         self.options = options or PublishOptions()
         self.sent = 0
@@ -86,7 +86,7 @@ class Publisher:
         self._has_cloud = False
         self._lock = Lock()
         self._seq = 0
-        self._came = self._shown = float("-inf")  # when what came last, and what was sent last, was read
+        self._came = self._shown = float("-inf")  # times of the data of the last received frame, and of the last sent one
         self._since = float("nan")
         self._blind = ""  # why the frame before had no pose
         self._said = ("waiting", self.options.waits_for)
@@ -95,7 +95,7 @@ class Publisher:
         self.announce(twin)
 
     def announce(self, twin: Twin) -> None:
-        """Say what streams; also later, where something about it has changed."""
+        """Send the description; also later, when it has changed."""
         self.twin = twin
         glb = topic(twin.name, GLB)
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
@@ -104,9 +104,9 @@ class Publisher:
             self.hub.publish([Message(glb, twin.glb), model, self._status(*self._said)])
 
     def publish(self, frame: TwinFrame, *, now: float | None = None) -> bool:
-        """Send a frame unless the rate forbids it; return whether it was sent.
+        """Send a frame unless the rate limit forbids it; return whether it was sent.
 
-        A frame that shows what was read no later than that of the frame before has no pose: only what else is known goes out.
+        A frame with data no newer than the previous one is sent without a pose, with its other content.
         """
         moment = time.monotonic() if now is None else now
         with self._lock:
@@ -124,11 +124,11 @@ class Publisher:
         return True
 
     def wait_s(self) -> float:
-        """Return how long it takes until the next frame may go out [s]: who takes the newest then sends nothing that is old."""
+        """Return the time until the next frame may be sent [s]: a caller that then takes the newest data sends nothing outdated."""
         return self._pose_limit.wait_s(time.monotonic())
 
     def watch(self, *, now: float | None = None) -> None:
-        """Say that it is stale where nothing was read for `STALE_S`; the next pose says that it is live."""
+        """Report the stream as stale if there were no data for `STALE_S`; the next pose reports it as live."""
         moment = time.monotonic() if now is None else now
         with self._lock:
             if told := self._judged(moment):
@@ -136,12 +136,12 @@ class Publisher:
 
     @property
     def trouble(self) -> str:
-        """Why no pose is made of what is read; empty where one is, or nothing is read."""
+        """Why readings give no pose; empty if they do, or without readings."""
         with self._lock:
             return self._blind if self._said[0] in ("waiting", "stale") else ""
 
     def _judged(self, moment: float) -> list[Message]:
-        """Return the status at a moment of our clock [s] where it is another one than before."""
+        """Return the status at a time of our clock [s] if it has changed."""
         if self._shown == float("-inf"):
             told = ("waiting", self._blind or self.options.waits_for)
         else:
@@ -149,7 +149,7 @@ class Publisher:
         return [] if self._said[0] == "ended" or told == self._said else [self._status(*told)]
 
     def end(self, detail: str = "") -> None:
-        """Say that nothing more comes."""
+        """Announce the end of the stream."""
         with self._lock:
             self.hub.publish([self._status("ended", detail)])
 
@@ -159,7 +159,7 @@ class Publisher:
         return Message(topic(self.twin.name, STATUS), status_bytes(state, detail, since))
 
     def _messages(self, frame: TwinFrame, moment: float, *, is_new: bool) -> list[Message]:
-        """Return what is sent of a frame at a moment of our clock [s]; its pose only if it is new."""
+        """Return the messages of a frame at a time of our clock [s]; its pose only if it is new."""
         seq, name, t = self._seq, self.twin.name, frame.time_s
         messages = [Message(topic(name, POSE), pose_bytes(seq, t, frame.bones))] if is_new else []
         messages.append(Message(topic(name, FORCE), force_bytes(seq, frame, self.twin.frame)))
@@ -168,7 +168,7 @@ class Publisher:
         if self.options.json_mirror and is_new:
             messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
         if self._has_cloud and frame.cloud is None:
-            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, [])))  # what was seen before is not seen now
+            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, [])))  # clears the previous cloud
             self._has_cloud = False
         elif frame.cloud is not None and self._cloud_limit.allows(moment):
             messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, frame.cloud)))

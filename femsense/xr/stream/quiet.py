@@ -1,6 +1,6 @@
-"""Where goes what the libraries beneath say of connections that break off: to the log `femsense.stream`, which prints nothing by itself.
+"""Logging of library messages on broken connections: they go to the log `femsense.stream`, which prints nothing by default.
 
-A client that hangs up, or fails a handshake, is no error of the program. Why there is no connection is said in words (`connecting`).
+A client that disconnects, or fails a handshake, is not an error of the program. `connecting` reports why there is no connection.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def stream_log() -> logging.Logger:
 
 
 def keep_quiet(loop: asyncio.AbstractEventLoop) -> None:
-    """Have the log told what tasks of a loop raise that nobody waits for; by itself the loop would print it."""
+    """Log exceptions of background tasks of a loop, which would otherwise be printed."""
 
     def tell(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         stream_log().error(context["message"], exc_info=context.get("exception"))

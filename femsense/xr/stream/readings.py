@@ -34,10 +34,10 @@ WHOLE_PAIR = re.compile(r"[-+]?\d+,\d+")
 NOTATION = Notation(",")
 """Between semicolons or tabs numbers may have decimal commas."""
 QUIET_S = 3.0
-"""After which readings have stopped, as it is said to people."""
+"""Time after which readings are reported as stopped [s]."""
 
 Reading = tuple[float, FloatArray]
-"""Time [s], and one value for each channel; nan where there is none."""
+"""Time [s], and one value per channel; nan if missing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +49,7 @@ class _Made:
 
 
 class Readings(Iterator[Reading]):
-    """The newest reading of a source, again and again: what was replaced before it was asked for is only counted."""
+    """Yields the newest reading of a source; replaced ones are only counted."""
 
     def __init__(
         self,
@@ -63,9 +63,9 @@ class Readings(Iterator[Reading]):
 
         Arguments:
             read: returns the reading in an item, or None.
-            stop: ends it.
-            away: says why the source is not there, or nothing.
-            age_s: least age of the item that is heard now, by the source [s].
+            stop: ends the iteration.
+            away: returns why the source is unavailable, or an empty text.
+            age_s: returns the minimum age of the current item, by the source [s].
         """
         self._read, self._stop, self._away, self._age_s = read, stop, away, age_s
         self._begun = time.monotonic()
@@ -80,7 +80,7 @@ class Readings(Iterator[Reading]):
         """How many readings arrived after one that their sender had made later."""
 
     def hear(self, item: Any) -> None:
-        """Take what arrives; to be called in the order of arrival."""
+        """Receive an item; must be called in the order of arrival."""
         found = self._read(item)
         if found is None:
             self._pass_over(item)
@@ -109,12 +109,12 @@ class Readings(Iterator[Reading]):
 
     @property
     def dropped(self) -> int:
-        """How many readings were replaced by newer ones before they were asked for, or were overtaken on their way."""
+        """Number of readings that were replaced by newer ones before they were used, or were overtaken in transit."""
         return self._slot.dropped + self.overtaken
 
     @property
     def away(self) -> str:
-        """Why the source is not there; empty where it is."""
+        """Why the source is unavailable; empty if it is available."""
         return self._away()
 
     @property
@@ -131,27 +131,27 @@ class Readings(Iterator[Reading]):
 
     @property
     def refused(self) -> str:
-        """What was passed over, with the first of it; empty where all were readings."""
+        """Number of lines that were ignored, with the first of them; empty if all were readings."""
         text = self._first.decode("utf-8", "replace").strip() if isinstance(self._first, bytes) else ""
         comma = ": a decimal comma? Write a point, or semicolons between numbers" if WHOLE_PAIR.fullmatch(text) else ""
         return f"what comes is no reading of its channels, first {_shown(self._first)}{comma}" if self.passed else ""
 
 
 def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
-    """Open a source and return what yields its newest reading until `stop` is set; lines that are none are passed over.
+    """Open a source and return an iterator over its newest reading until `stop` is set; lines that are not readings are ignored.
 
     Arguments:
-        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, `ws://HOST:PORT/PATH`, or `serial:PORT?baud=115200`. What comes
-            by UDP, MQTT, WebSocket or a serial line is a JSON object channel → number,
-            or numbers with commas between in the order of the channels; `time_s` is optional.
+        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, `ws://HOST:PORT/PATH`, or `serial:PORT?baud=115200`. Messages
+            by UDP, MQTT, WebSocket or a serial line are JSON objects channel → number,
+            or numbers separated by commas in the order of the channels; `time_s` is optional.
         channels: names, in the order of the values that are yielded.
-        stop: ends it.
+        stop: ends the iteration.
 
     Returns:
-        the readings. A time that a source does not say counts from when the source was opened.
+        the readings. Without a time in the source, times count from its opening.
 
     Raises:
-        InputError: no such source, an address that is taken, a CSV file without a channel. A file or a port that is not there
+        InputError: an unknown source, an address that is taken, a CSV file without a channel. A file or a port that does not exist
             yet is waited for.
         MissingDependency: the package for it is not installed.
     """
@@ -177,7 +177,7 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:
 
 
 def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
-    """Return the reading in a line or message, or None where there is none."""
+    """Return the reading in a line or message, or None if there is none."""
     text = line[:LONGEST_LINE].decode("utf-8", "replace").strip()
     if not text:
         return None
@@ -209,7 +209,7 @@ def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
 
 
 def _shown(item: Any) -> str:
-    """Return the beginning of what came, for people."""
+    """Return the beginning of a message for display."""
     text = item.decode("utf-8", "replace") if isinstance(item, bytes) else str(item)
     return repr(text if len(text) <= SHOWN else text[:SHOWN] + "…")
 
@@ -224,7 +224,7 @@ def _number(value: Any) -> float:
 
 
 def _cell(text: str) -> float | None:
-    """Return what stands between commas: a number, nan where nothing does or none that is finite, None where it is something else."""
+    """Return a comma-separated field as a number: nan if it is empty or not finite, None if it is something else."""
     try:
         value = float(text) if text.strip() else float("nan")
     except ValueError:
@@ -233,11 +233,11 @@ def _cell(text: str) -> float | None:
 
 
 def _is_blank(item: Any) -> bool:
-    """Return whether nothing stands in a line, or in a row of a file."""
+    """Return whether a line, or a row of a file, is empty."""
     return not (item.strip() if isinstance(item, bytes) else any(cell.strip() for cell in item.values()))
 
 
-# Sources: each hands on what arrives, in a thread of its own
+# Sources: each delivers items in its own thread
 
 
 def _listening(readings: Readings, run: Callable[[], None]) -> Readings:
@@ -269,7 +269,7 @@ def _receive(endpoint: socket.socket, hear: Callable[[bytes], None], stop: Event
 
 
 def _subscribed(source: str, read: Callable[[Any], Reading | None], stop: Event) -> Readings:
-    """Listen to a topic of a broker; what the broker kept from earlier is no reading of now."""
+    """Subscribe to a topic of a broker; retained messages are not current readings and are ignored."""
     parts = urlsplit(source)
     name = parts.path.lstrip("/")
     if not name:

@@ -41,7 +41,7 @@ class RunStream:
     frames: tuple[Mapping[str, Any], ...]
     """As `contacts_of_run` has them, one for each pose."""
     clouds: MeasuredClouds
-    """Measured points and residuals of each pose, where the recording is still there."""
+    """Measured points and residuals of each pose, if the recording still exists."""
     field: npt.NDArray[np.uint8]
     """Share of the largest stress at each vertex of each pose, 0 … 255, shape (F, v)."""
 
@@ -52,15 +52,15 @@ class RunStream:
 
 
 def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True) -> RunStream:
-    """Read a run folder; its mesh is made where it is missing.
+    """Read a run folder; its mesh is created if it is missing.
 
     Arguments:
-        folder: of `femsense estimate`.
+        folder: written by `femsense estimate`.
         name: of the robot in topics; by default the run's own.
-        clouds: read the recording's clouds too, where they are still there.
+        clouds: read the recording's clouds too, if they still exist.
 
     Raises:
-        InputError: no readable states, or a broken table.
+        InputError: no readable states, or a malformed table.
     """
     run = run_folder(folder)
     told = contacts_of_run(run)
@@ -158,15 +158,15 @@ def _or_nan(value: float | None) -> float:
 
 
 class MeasuredClouds:
-    """Measured points of each pose with their residuals, read in the background in the order of the poses: what streams need not
-    wait for them (the library for distances alone takes seconds to load)."""
+    """Measured points of each pose with their residuals, read in the background in the order of the poses, so that the stream does not
+    wait for them (importing the distance library alone takes seconds)."""
 
     def __init__(self, count: int, read: Callable[[], Callable[[int], Cloud | None] | None] | None) -> None:
         """Begin to read.
 
         Arguments:
-            count: of poses.
-            read: returns what reads the cloud of a pose, or None where there are none; called in the background. None: no clouds.
+            count: number of poses.
+            read: returns a function that reads the cloud of a pose, or None if there are no clouds; called in the background. None: no clouds.
         """
         self._found: dict[int, Cloud | None] = {}
         self._stop = Event()
@@ -176,7 +176,7 @@ class MeasuredClouds:
             self._thread.start()
 
     def at(self, k: int) -> Cloud | None:
-        """Return points and residuals [m] of a pose, shape (n, 4); None where there are none, or not yet."""
+        """Return points and residuals [m] of a pose, shape (n, 4); None if there are none, or not yet."""
         return self._found.get(k)
 
     def wait(self) -> None:
@@ -200,7 +200,7 @@ class MeasuredClouds:
 
 
 def _cloud_reader(run: Path, frames: tuple[Mapping[str, Any], ...]) -> Callable[[], Callable[[int], Cloud | None] | None]:
-    """Return what opens the recording of a run, and then reads a pose's cloud; opens nothing where it is no longer there."""
+    """Return a function that opens the recording of a run and reads a pose's cloud; nothing is opened if it no longer exists."""
 
     def opened() -> Callable[[int], Cloud | None] | None:
         from femsense.calib.files import read_calibration
@@ -229,7 +229,7 @@ def _cloud_reader(run: Path, frames: tuple[Mapping[str, Any], ...]) -> Callable[
 
 
 def _points(recording: Recording, number: int, poses: Sequence[FloatArray]) -> FloatArray | None:
-    """Return what all cameras measured in one frame, robot frame [m], shape (n, 3), or None."""
+    """Return the points of all cameras in one frame, robot frame [m], shape (n, 3), or None."""
     from femsense.io.clouds.frame_clouds import read_frame_cloud
 
     try:

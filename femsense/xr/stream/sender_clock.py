@@ -1,12 +1,12 @@
-"""How late readings arrive, by the time that their sender gives them.
+"""Latency of readings, from the time stamps of their sender.
 
-A sender's clock has an unknown offset, so that only differences of delays are known. With t the sender's time of a reading and a its
-arrival on our clock, the delay beyond the smallest that was seen is
+The offset of a sender's clock is unknown, so that only differences of delays can be measured. With t the sender's time of a reading and a its
+arrival on our clock, the delay in excess of the smallest observed one is
 
     age = (a − t) − min (a − t),
 
 where the minimum may grow by `DRIFT` to follow clocks of another rate (Paxson 1998, On calibrating measurements of packet transit
-times). A time that is a date, seconds since 1970, needs no minimum: its age is today's time minus t.
+times). A time stamp in seconds since 1970 needs no minimum: its age is the current time minus t.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ DRIFT = 2e-4
 DAY_S = 86_400.0
 """A time within a day of ours is a date."""
 COARSE_S = 0.1
-"""A clock that repeats a time and then advances by more counts whole seconds or the like: it says nothing of ages."""
+"""A clock that repeats a time and then advances by more than this has a coarse resolution, such as whole seconds: ages cannot be computed."""
 SWAPPED_S = 1.0
-"""A reading older than the one before by less has overtaken it on the way; by more, the sender's clock has begun anew."""
+"""A reading older than the previous one by less than this was overtaken in transit; by more, the sender's clock has restarted."""
 
 
 class SenderClock:
@@ -32,18 +32,18 @@ class SenderClock:
         self._is_coarse = self._is_repeated = False
 
     def age_s(self, time_s: float, arrived: float) -> float | None:
-        """Return the age of a reading at its arrival [s]; None where a newer one has arrived before.
+        """Return the age of a reading at its arrival [s]; None if a newer one has arrived before.
 
         Arguments:
-            time_s: sender's time of the reading [s]; nan where it gives none: it is then new at its arrival.
-            arrived: of our monotonic clock [s].
+            time_s: sender's time of the reading [s]; nan without one: its age at arrival is then 0.
+            arrived: on our monotonic clock [s].
         """
         if math.isnan(time_s):
             return 0.0
         step = time_s - self._newest
         if -SWAPPED_S < step < 0.0:
             return None
-        if not step >= 0.0:  # the first reading, or the sender began anew
+        if not step >= 0.0:  # the first reading, or the sender has restarted
             self._least, self._at, self._is_coarse = arrived - time_s, arrived, False
         elif self._is_repeated and step > 0.0:
             self._is_coarse = step > COARSE_S

@@ -1,4 +1,4 @@
-"""Sensors as a stream: readings, the learnt model, bones, and the robot's own skin on them, or a tube where there is none."""
+"""Sensors as a stream: readings, the learnt model, bones, and the robot's skin on them, or a tube without one."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ THICKNESS = 1 / 16
 
 
 def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = None) -> Twin:
-    """Return what streams of a learnt model: a surface on its chain of bones.
+    """Return the streamed twin of a learnt model: a surface on its chain of bones.
 
     Arguments:
         model: with a chain of bones.
         name: of the robot in topics.
-        worn: its own surface, in the frame of reference of the model's markers; a tube without it.
+        worn: the robot's surface, in the frame of reference of the model's markers; None: a tube.
 
     Raises:
-        InputError: the model has no chain, or the surface is not where its bones are.
+        InputError: the model has no chain, or the surface is not at its bones.
     """
     rest = model.rest_bones
     if worn is None:
@@ -87,7 +87,7 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
         share, away = (part[np.arange(len(vertices)), owner] for part in (t, apart))
     if np.median(away) > 0.5 * length:
         raise InputError(
-            "the skin is not where the model's bones are",
+            "the skin is not at the model's bones",
             where="--skin",
             found=f"half of its vertices are more than {1e3 * float(np.median(away)):.3g} mm from them",
             expected=f"at most half of the chain's length, {500.0 * length:.3g} mm",
@@ -103,7 +103,7 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
 def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[TwinFrame]:
     """Yield a frame for each row of readings (see `readings_of`).
 
-    Where a reading that the model needs is no number, the last good pose is kept, with the time at which that was read.
+    If a required reading is not finite, the last valid pose is kept, with the time of its reading.
     """
     live, straight = model.live(), np.linalg.inv(model.rest_bones.T_robot_bone)
     straight[:, :3, 3] = 0.0
@@ -120,10 +120,10 @@ def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterato
 
 
 def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray], str]]:
-    """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading (see `readings_of`).
+    """Yield the time [s] and the positions of the markers [m], name → shape (3,), of each reading (see `readings_of`).
 
-    Of readings outside of what the model was taught there are no places, which would be guesses, but why there are none.
-    Those that are old when they come are left out.
+    Readings outside of the model's training domain give no positions, which would be guesses, but the reason.
+    Readings that are outdated on arrival are left out.
     """
     live = model.live()
     for time_s, row in readings:

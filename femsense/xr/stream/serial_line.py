@@ -38,7 +38,7 @@ class SerialLine:
             ) from None
         self._was_open = False
         self.away = ""
-        """Why the port is not there; empty where it is."""
+        """Why the port is unavailable; empty if it is available."""
         self._open()
 
     def run(self, hear: Callable[[bytes], None], stop: Event) -> None:

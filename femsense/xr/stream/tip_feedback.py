@@ -1,12 +1,12 @@
-"""Integral action on the measured place of a dragged point: what the model gets wrong is taken off the target.
+"""Integral action on the measured position of a dragged point: the model error is subtracted from the target.
 
     b ← clip(m − p* + (1 − exp(−Δt / τ)) (p* − y)),   target of the model: p* + b
 
-with p* where the point is wanted, y where it is measured, and m where the model's inputs bring it.
-m − p* is the b before without what the model cannot do, be it too few inputs or a limit: neither winds b up (back-calculation:
-Åström and Hägglund 1995, section 3.5). b changes only while the inputs stand still where the model wants them, so that the
-limited rate does not either. At rest y = p*, or as near as the inputs allow, whatever mesh, law or contact the model lacks, as
-long as its slopes have the right sign and half their size.
+with p* the target of the point, y its measured position, and m the position that the model's inputs give. m − p* is the previous b without the
+part that the model cannot reach because of too few inputs or a limit: neither winds b up (back-calculation: Åström and Hägglund 1995,
+section 3.5). b changes only while the inputs stand still at their targets, so that the rate limit does not wind it up either. At rest
+y = p*, or as close as the inputs allow, for any error of mesh, law or contact, as long as the model's gradient has the right sign and at least
+half the true size.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from femsense.core.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class FeedbackOptions:
-    """How fast and how far what is measured corrects what is wanted."""
+    """Rate and range of the correction."""
 
     time_s: float = 0.3
-    """τ: how fast an error is taken off."""
+    """τ: time constant of the integral action [s]."""
     fresh_s: float = 0.5
-    """A measurement that is older corrects nothing."""
+    """Maximum age of a measurement [s]."""
     most_share: float = 0.25
     """The correction is at most this share of the body's size."""
 
@@ -37,27 +37,27 @@ class TipFeedback:
         """size_m: of the body."""
         self.options = options or FeedbackOptions()
         self.correction_m: FloatArray = np.zeros(3)
-        """What is added to the target [m], shape (3,)."""
+        """The offset added to the target [m], shape (3,)."""
         self.missed_m = float("nan")
-        """How far the point was measured from where it is wanted [m]; nan where nothing fresh is known."""
+        """Distance between the measured position and the target [m]; nan without a recent measurement."""
         self.offset_m: FloatArray = np.zeros(3)
-        """Where the point was measured, from where the model had it at the same inputs [m], shape (3,)."""
+        """Measured position minus that of the model at the same inputs [m], shape (3,)."""
         self._most = self.options.most_share * size_m
         self._seen: tuple[float, FloatArray] | None = None
         self._used = float("-inf")
         self._wanted: FloatArray | None = None
 
     def measured(self, now: float, place_m: FloatArray) -> None:
-        """Take note of where the point is [m], robot frame, shape (3,), at a time [s]."""
+        """Store the measured position of the point [m], robot frame, shape (3,), at a time [s]."""
         self._seen = (now, np.asarray(place_m, dtype=np.float64))
 
     def forget(self) -> None:
-        """Begin anew: another point, or nobody holds on."""
+        """Restart, for another point or after a release."""
         self.correction_m, self.offset_m, self.missed_m = np.zeros(3), np.zeros(3), float("nan")
         self._seen, self._used, self._wanted = None, float("-inf"), None
 
     def expected(self, reached_m: FloatArray) -> FloatArray:
-        """Return where the point will be measured whose inputs bring it to a place by the model [m], shape (3,)."""
+        """Return the expected measured position of the point when its model position is given [m], shape (3,)."""
         return np.asarray(reached_m + self.offset_m)
 
     def target(
@@ -73,10 +73,10 @@ class TipFeedback:
 
         Arguments:
             now: the time [s].
-            wanted_m: where the point is to be [m], shape (3,).
-            settled_since: since when the inputs stand still where the model wants them [s]; None: they do not.
-            reached_m: where the model's inputs for the target before bring the point [m], shape (3,); None: to that target.
-            arrived: they bring it to that target, but for the search's tolerance, which is not to wind the correction up.
+            wanted_m: target of the point [m], shape (3,).
+            settled_since: time since which the inputs stand still at their targets [s]; None: they do not.
+            reached_m: position that the model's inputs for the previous target give [m], shape (3,); None: that target.
+            arrived: whether that position equals the target within the search tolerance, which must not wind the correction up.
         """
         wanted = np.asarray(wanted_m, dtype=np.float64)
         at, place = self._seen or (float("-inf"), wanted)

@@ -1,4 +1,4 @@
-"""A client of a WebSocket elsewhere, which may come later, go, and come back."""
+"""A client of a remote WebSocket that reconnects by itself."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class WebSource:
     def __init__(
         self, url: str, *, headers: Mapping[str, str] | None = None, lost: Callable[[], None] = lambda: None, **more: Any
     ) -> None:
-        """Open nothing yet.
+        """Prepare; no connection is opened yet.
 
         Arguments:
             url: ws:// or wss://.
             headers: of the request.
-            lost: called whenever a connection or an attempt has ended.
-            more: for `websockets.sync.client.connect`.
+            lost: called at the end of each connection or attempt.
+            more: arguments of `websockets.sync.client.connect`.
 
         Raises:
             MissingDependency: the package websockets is not installed.
@@ -41,7 +41,7 @@ class WebSource:
         self._url, self._headers, self._lost, self._more = url, dict(headers or {}), lost, more
         self._connection: Connection | None = None
         self.away = NO_ANSWER
-        """Why there is no connection; empty where there is one."""
+        """Why there is no connection; empty with one."""
 
     def run(self, receive: Callable[[bytes], None], stop: Event) -> None:
         """Call receive(frame), text as UTF-8, until `stop` is set; an InputError or OSError of it ends the connection."""
@@ -60,7 +60,7 @@ class WebSource:
             attempt += 1
 
     def send(self, frame: bytes) -> None:
-        """Send a frame if there is a connection: what is old later is not sent then."""
+        """Send a frame if connected; without a connection it is dropped as outdated."""
         if (connection := self._connection) is not None:
             with contextlib.suppress(Exception):  # gone meanwhile
                 connection.send(frame)

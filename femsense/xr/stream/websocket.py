@@ -1,11 +1,11 @@
 """The page and its WebSocket: one port, one thread, the newest message of each topic to every viewer.
 
-A frame of the WebSocket holds one or more messages: topic length uint16, payload length uint32 (little-endian), topic, payload.
-Each viewer has its own set of messages that wait, one a topic: a slow one misses some and holds up nobody.
+A frame of the WebSocket contains one or more messages: topic length uint16, payload length uint32 (little-endian), topic, payload.
+Each viewer has its own pending messages, one per topic: a slow viewer misses some and delays no other.
 
-Sockets and libraries buffer seconds of poses. So at most `IN_FLIGHT` frames are under way to a viewer: further ones wait, newest only,
-until it has confirmed one. A viewer confirms a frame by an empty frame once it has handled it, as the page does; for one that never does,
-the answer to a ping that follows each frame counts, which its library gives when it reads.
+Sockets and libraries buffer seconds of poses. Therefore at most `IN_FLIGHT` frames are in transit to a viewer: further ones wait, newest only,
+until one is confirmed. The page confirms a frame by an empty frame after processing it; for clients that do not, the reply to a ping after each
+frame counts, which their library sends when it reads.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
 ENTRY = struct.Struct("<HI")
 SMALLEST_BUFFER = 1 << 16
-"""Of a socket that sends [bytes]: what waits there is old when it arrives."""
+"""Send buffer of a socket [bytes]: its content is outdated on arrival."""
 IN_FLIGHT = 3
-"""Frames that a viewer has not confirmed yet: 60 Hz need two where a round trip takes 30 ms."""
+"""Number of frames that a viewer has not confirmed: 60 Hz need two with a round trip of 30 ms."""
 LARGEST_FRAME, MOST_FRAMES = 4096, 240
-"""Of what a viewer sends: bytes a frame, and frames a second."""
+"""Limits on messages of a viewer: bytes per frame, and frames per second."""
 ASKED_BY_PAGE = ("/ws", "/stream.json")
-"""What a page asks for again and again: it says itself that its password is refused, without a window of the browser each time."""
+"""Paths that a page requests repeatedly: it shows a refused password itself, without a dialog of the browser each time."""
 PASSWORD_NEEDED = b"""<!doctype html><meta name="viewport" content="width=device-width"><title>femsense</title>
 <p>A password is needed: load the page again and type that of the stream, with any user name.</p>
 """
@@ -75,7 +75,7 @@ def pack(messages: Iterable[Message]) -> bytes:
 
 
 def unpack(frame: bytes) -> Iterator[Message]:
-    """Yield the messages of a frame. Raises InputError where it is cut off."""
+    """Yield the messages of a frame. Raises InputError if it is truncated."""
     at = 0
     while at < len(frame):
         try:
@@ -90,7 +90,7 @@ def unpack(frame: bytes) -> Iterator[Message]:
 
 
 class _Viewer:
-    """What waits for one viewer, and what is under way to it."""
+    """Pending and unconfirmed messages of one viewer."""
 
     def __init__(self) -> None:
         self.waiting: dict[str, Message] = {}
@@ -120,7 +120,7 @@ class _Viewer:
         self.wake.set()
 
     def take(self) -> list[Message]:
-        """Return what may be sent now."""
+        """Return the messages that may be sent now."""
         self.wake.clear()
         if self.sent - (self.confirmed or self._answered) >= IN_FLIGHT:
             return []
@@ -151,9 +151,9 @@ class WebSocketServer:
         self.access, self.options = access or Access(), options or ServerOptions()
         self.port = 0
         self.trouble: Callable[[], str] = lambda: ""
-        """Why nothing comes to the hub, for a page that has no robot yet."""
+        """Why the hub receives no data, for a page without a robot."""
         self.visits = 0
-        """How many viewers came so far."""
+        """Number of viewers so far."""
         self._viewers: set[_Viewer] = set()
         self._fresh: dict[str, Message] = {}
         self._lock = Lock()
@@ -176,7 +176,7 @@ class WebSocketServer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         host = "127.0.0.1" if self.access.host in ("0.0.0.0", "::", "localhost") else self.access.host
         return f"{self.access.scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
@@ -249,7 +249,7 @@ class WebSocketServer:
             viewer.offer(fresh)
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """Send to one viewer until it leaves; what it sends is read beside."""
+        """Send to one viewer until it disconnects; its messages are read concurrently."""
         from websockets.exceptions import ConnectionClosed
 
         endpoint = connection.transport.get_extra_info("socket")
@@ -277,7 +277,7 @@ class WebSocketServer:
             listening.cancel()
 
     async def _listen(self, connection: ServerConnection, viewer: _Viewer) -> None:
-        """Pass on what a viewer wants of the robot; garbage and floods end the connection."""
+        """Pass on the requests of a viewer; invalid data and floods end the connection."""
         from websockets.exceptions import ConnectionClosed
 
         second, count = 0, 0
@@ -294,7 +294,7 @@ class WebSocketServer:
                 self.hub.received(wanted, str(connection.id))
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a file; None lets a viewer in."""
+        """Answer a request for a file; None accepts a viewer."""
         headers, path = request.headers, request.path.partition("?")[0]
         host = headers.get("Host")
         reached_at = str(connection.transport.get_extra_info("sockname")[0])
@@ -319,7 +319,7 @@ class WebSocketServer:
         return _response(HTTPStatus.OK, content, more)
 
     def _content(self, name: str) -> bytes | None:
-        """Return a file of the page, or the mesh of a robot; nothing else is ever read."""
+        """Return a file of the page, or the mesh of a robot; no other file is read."""
         if name.startswith("robots/") and name.endswith(".glb"):
             message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], GLB))
             return None if message is None else message.payload
@@ -333,7 +333,7 @@ class WebSocketServer:
 
 
 def _wanted(frame: str | bytes) -> Message | None:
-    """Return what a viewer sent if it is a message that viewers may send."""
+    """Return the message of a viewer if viewers may send it."""
     if isinstance(frame, str):
         return None
     try:
@@ -362,7 +362,7 @@ def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = 
 
 
 def require_websockets() -> None:
-    """Raise MissingDependency where the package is not installed."""
+    """Raise MissingDependency if the package is not installed."""
     try:
         import websockets  # noqa: F401
     except ImportError:

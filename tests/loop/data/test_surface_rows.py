@@ -392,7 +392,7 @@ def test_clouds_without_a_pose_say_what_to_give(rubbing: Recording):
 def test_a_recording_without_clouds_or_with_none_in_free_frames_says_so(rubbing: Recording):
     with pytest.raises(DataError, match="the recording has no clouds"):
         prepare(arm(COARSE), [record(sweeps()[0][:4])[0]], [], "clouds")
-    with pytest.raises(DataError, match="no frame with clouds is free"):
+    with pytest.raises(DataError, match="no contact-free frame has clouds"):
         prepare(arm(COARSE), [replace(rubbing, free=np.zeros(len(rubbing.time_s), dtype=bool))], [], "clouds")
     with pytest.raises(InputError, match="auto, markers, clouds, both"):
         prepare(arm(COARSE), [rubbing], [], "images")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -31,8 +32,8 @@ def one_at_a_time() -> Recording:
 def test_what_recordings_lack_is_said_with_what_it_brings() -> None:
     said = steps_after(one_at_a_time())
     assert {text.split()[0] for text in said} == {"weigh", "record", "hang", "pull"}
-    after, before = (float(part.split()[0]) for part in said[0].split("±")[1:])
-    assert said[0].startswith("hang") and "is then known to ±" in said[0] and 0.0 < after < 0.8 * before
+    before, after = (float(number) for number in re.findall(r"(?:from|to) ([\d.e+-]+)", said[0][said[0].index("deviation") :]))
+    assert said[0].startswith("hang") and "the standard deviation of" in said[0] and 0.0 < after < 0.8 * before
 
 
 def test_what_is_recorded_already_is_not_asked_for() -> None:
@@ -46,4 +47,4 @@ def test_what_is_recorded_already_is_not_asked_for() -> None:
 
 @pytest.mark.parametrize("measured", [True, False])
 def test_states_are_asked_for_again_where_nothing_tells_the_noise(measured: bool) -> None:
-    assert steps_after(one_at_a_time(), measured=measured)[0].startswith("reach three") != measured
+    assert steps_after(one_at_a_time(), measured=measured)[0].startswith("repeat three") != measured

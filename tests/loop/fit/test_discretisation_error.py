@@ -14,10 +14,10 @@ from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.discretisation_error import (
     as_shown,
-    errs_alike,
     make_finer,
     mesh_errors,
     on_its_clamp,
+    same_mesh_error,
     with_mesh_errors,
     with_mesh_errors_of,
     without_mesh_error,
@@ -125,7 +125,7 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another(name: str, size:
     after = fit_model(
         data, Hypothesis(data.robot, (*hypothesis.terms, (effect, {}, own))), wider, noise, coordinates, max_iterations=0
     )
-    assert errs_alike(before, after) == alike
+    assert same_mesh_error(before, after) == alike
 
 
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():

@@ -13,7 +13,7 @@ from fitted_arm import NOISE, fitted_arm
 from femsense.core.errors import DataError
 from femsense.core.least_squares import GaussNewtonOptions, gauss_newton
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.joint_fit import Jets, JointProblem, lent_start
+from femsense.loop.fit.joint_fit import Jets, JointProblem, nearby_start
 from femsense.loop.fit.noise_components import whiten
 from femsense.loop.search.refit import with_term
 from femsense.model.effects import find_effect
@@ -72,8 +72,8 @@ def test_states_that_are_far_apart_lend_each_other_no_factors() -> None:
     k = next(k for k, state in kept.items() if state.factor is not None)
     free = ~np.isin(np.arange(len(body.mesh.nodes)), body.clamped)[:, None]
     beside, far = (replace(kept[k], positions=kept[k].positions + by * body.reach * free, factor=None) for by in (0.005, 0.02))
-    assert lent_start(kept[k], beside, body).factor is kept[k].factor and lent_start(kept[k], far, body).factor is None
-    assert all(lent_start(kept[k], state, body).positions is state.positions for state in (beside, far))
+    assert nearby_start(kept[k], beside, body).factor is kept[k].factor and nearby_start(kept[k], far, body).factor is None
+    assert all(nearby_start(kept[k], state, body).positions is state.positions for state in (beside, far))
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -37,7 +37,7 @@ def recorded(inputs: np.ndarray, labels: list[str], noise: float = 2e-4) -> Reco
 def test_states_that_are_reached_again_tell_the_noise_whatever_the_model_leaves() -> None:
     inputs, labels = sweeps(each=1)
     found = measured(recorded(np.repeat(inputs, 3, axis=0), [name for name in labels for _ in range(3)]))
-    assert found.known and found.std == pytest.approx(2e-4, rel=0.1) and "reached again" in found.source
+    assert found.known and found.std == pytest.approx(2e-4, rel=0.1) and "repeated states" in found.source
     assert found.total == pytest.approx(np.sqrt(3.0) * found.std)
 
 

@@ -135,7 +135,7 @@ def test_improve_names_what_all_recordings_lack_from_some_of_them() -> None:
     assert [e.name for e in loop.effects if e.name == "cable_gain"] == ["cable_gain"]
     assert loop.everywhere is not None and (loop.everywhere.recordings, loop.everywhere.searched) == (5, 3)
     assert loop.everywhere.after_validation_rms_m < 0.8 * loop.everywhere.before_validation_rms_m
-    assert "Effects were sought in 3 of 5 recordings" in loop.sentence
+    assert "3 of 5 recordings were searched" in loop.sentence
 
 
 def test_an_effect_of_the_searched_recordings_alone_is_taken_out() -> None:

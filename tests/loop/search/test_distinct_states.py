@@ -61,7 +61,7 @@ def test_nothing_is_found_where_nothing_is_hidden_with_few_equilibria() -> None:
     loop, work, told = improved(1.0)
     assert loop.verdict == "none" and not loop.effects
     assert work.equilibria < 24 * FRAMES
-    assert told[-1].startswith("testing what is left (") and any("% " in t or "%," in t for t in told)
+    assert told[-1].startswith("testing the remaining residual (") and any("% " in t or "%," in t for t in told)
 
 
 def test_a_hidden_gain_is_found_with_few_equilibria() -> None:
@@ -75,7 +75,7 @@ def test_linear_elements_suffice_only_where_they_leave_plainly_less() -> None:
     declared = linear(arm((4, 2, 2)))
     own, other = recorded(declared, 1), recorded(arm((6, 2, 2), law="neo_hookean"), 1)
     record_own = linear_suffice(prepare(declared, [own], [recorded(declared, 2)]))
-    assert record_own is not None and "they leave" in record_own.verdict
+    assert record_own is not None and "quadratic elements leave" in record_own.verdict
     assert linear_suffice(prepare(declared, [other], [recorded(declared, 2)])) is None
 
 

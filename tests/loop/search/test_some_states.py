@@ -13,7 +13,7 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.representative_states import FEWEST
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
-from femsense.loop.search.search import search_begun, search_effects
+from femsense.loop.search.search import new_search, search_effects
 from femsense.loop.search.search_state import Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
 
@@ -38,7 +38,7 @@ def sought() -> tuple[Data, SearchProgress, Search]:
     assert some is not None
     data, before, start = calibrated(some, lambda text: None)
     data = with_discretisation_error(data, start[-1][1], ["cable_gain"], lambda text: None)
-    course = search_begun((data, before, start), ["cable_gain"], [], quadratic=False)
+    course = new_search((data, before, start), ["cable_gain"], [], quadratic=False)
     return some, course, search_effects(course, Checkpoint(None), lambda text: None)[1]
 
 

@@ -17,7 +17,7 @@ from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, surely_predicts
+from femsense.loop.search.acceptance import acceptance_test, cv_lower_bound
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
 from femsense.loop.search.location_search import closer, without_last
@@ -25,7 +25,7 @@ from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
 from femsense.loop.search.search import scored, search_effects
 from femsense.loop.search.search_state import Refit, SearchProgress
-from femsense.loop.search.swaps import surely_closer, swapped
+from femsense.loop.search.swaps import predicts_better, swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import find_effect
 
@@ -146,7 +146,7 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
 
 def test_what_predicts_surely_goes_before_what_may_predict():
     def predicts(gain: float, spread: float) -> float:
-        return surely_predicts(Refit(None, None, 0.0, replace(RECORD, cv_gain=gain, cv_std=spread)))
+        return cv_lower_bound(Refit(None, None, 0.0, replace(RECORD, cv_gain=gain, cv_std=spread)))
 
     assert predicts(44.0, 14.0) > predicts(48.0, 45.0)
     assert predicts(44.0, np.inf) == 44.0
@@ -258,10 +258,10 @@ def test_what_is_closer_in_one_state_alone_is_not_surely_closer():
     own, everywhere = leaving(base, lambda k: np.full(len(k), 1.0)), leaving(base, lambda k: 0.9 + 0.001 * k)
     by_one = leaving(base, lambda k: np.where(k == first, 0.0, 1.01))
     assert rms_of(by_one.held_residuals) < rms_of(own.held_residuals)
-    assert surely_closer(data, own, everywhere) and not surely_closer(data, everywhere, own)
-    assert not surely_closer(data, own, by_one)
+    assert predicts_better(data, own, everywhere) and not predicts_better(data, everywhere, own)
+    assert not predicts_better(data, own, by_one)
     two = replace(data, held=[t.part(t.scene.frames[:2]) for t in data.held])
-    assert not surely_closer(two, own, everywhere)
+    assert not predicts_better(two, own, everywhere)
 
 
 def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():

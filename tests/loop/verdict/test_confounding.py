@@ -58,7 +58,7 @@ def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_know
         "dbic_gap": 3.0,
         "cosine": pytest.approx(0.9975, abs=1e-4),
     }
-    assert in_words(pairs, ["cable_friction"], DEFAULTS) == " These data do not tell cable_friction from cable_gain."
+    assert in_words(pairs, ["cable_friction"], DEFAULTS) == " These data do not distinguish cable_friction from cable_gain."
 
 
 def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_said() -> None:
@@ -67,7 +67,7 @@ def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_
     search.last[:] = [candidate("creep", 0, 0, 1)]  # creep still explains something beside the payload
     pairs = confounded(search, ["payload"], DEFAULTS)
     assert [(p.pair, p.dbic_gap) for p in pairs] == [(("payload", "density"), 74.0)]
-    assert in_words(pairs, ["payload"], DEFAULTS) == " As the model still errs, payload may stand for density."
+    assert in_words(pairs, ["payload"], DEFAULTS) == " Because of the remaining model error, payload may stand for density."
     assert not confounded(searched(refits), ["payload"], DEFAULTS)  # by the noise, evidence tells them apart
 
 
@@ -76,7 +76,7 @@ def test_what_took_the_place_of_more_evidence_is_not_told_from_it() -> None:
     density = refit("density", 80.0, "named", in_place_of="payload")
     pairs = confounded(searched([refit("payload", 200.0), payload, density], errs=True), ["density"], DEFAULTS)
     assert [(p.pair, p.dbic_gap) for p in pairs] == [(("density", "payload"), 0.0)]
-    assert in_words(pairs, ["density"], DEFAULTS) == " These data do not tell density from payload."
+    assert in_words(pairs, ["density"], DEFAULTS) == " These data do not distinguish density from payload."
 
 
 def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> None:
@@ -136,5 +136,5 @@ def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None
     pairs = confounded(searched([], [hidden]), ["stiffness"], DEFAULTS)
     assert table_of(pairs) == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
     assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"], DEFAULTS) == (
-        " These data do not tell stiffness from cable_friction, nor gravity from cable_offset."
+        " These data do not distinguish stiffness from cable_friction, nor gravity from cable_offset."
     )

@@ -58,7 +58,7 @@ def test_mere_noise_is_no_correction_and_one_that_does_not_help_is_refused() -> 
     assert not judged_correction(*single_then_both(0.0))[0].accepted
     found, learned = judged_correction(*single_then_both(3e-4, held=-1.0))
     assert not found.accepted and learned is None and found.validation_rms_after_m > found.validation_rms_before_m
-    assert "not surely" in found.verdict
+    assert "not predicted significantly better" in found.verdict
 
 
 def test_what_calibration_can_move_is_left_to_calibration() -> None:

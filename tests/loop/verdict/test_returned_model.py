@@ -29,7 +29,7 @@ def test_a_model_without_equilibrium_is_not_handed_back() -> None:
     theta[fit.own] = np.log(1e-3)  # a modulus with which nothing stands
     fallen = replace(search.final, fit=replace(fit, fit=replace(fit.fit, theta=theta)))
     search = replace(search, final=fallen)
-    assert returned_model.worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], search.before)
+    assert returned_model.returnable_effects(data, search, ["stiffness"], ["stiffness"]) == ([], search.before)
     chain = summary.chain_of_effects(data, search, ["stiffness"], ["stiffness"], fallen, {})
     assert [c.validation_rms_after_m for c in chain] == [fallen.held_rms]
 
@@ -81,7 +81,7 @@ def with_gain(modulus: float) -> tuple[Data, Search]:
 
 def handed_back(data: Data, search: Search) -> tuple[list[str], float]:
     """Return the names that are handed back, and the gain."""
-    names, back = returned_model.worth_handing_back(data, search, [], ["cable_gain"])
+    names, back = returned_model.returnable_effects(data, search, [], ["cable_gain"])
     (entry,) = [e for e in back.fit.hypothesis.entries(back.fit.coordinates) if e["name"] == "cable_gain"]
     return names, entry["scale"]["left"]
 
@@ -100,7 +100,7 @@ def test_a_nuisance_that_held_out_data_speak_against_stays_as_declared() -> None
     data, search = with_gain(300e3)
     alone = returned_model.keeping(data, search.final, ["cable_gain"], search.noise)
     worse = replace(search.final, held_rms=2.0 * search.before.held_rms)
-    names, back = returned_model.worth_handing_back(data, replace(search, final=worse), [], ["cable_gain"])
+    names, back = returned_model.returnable_effects(data, replace(search, final=worse), [], ["cable_gain"])
     assert names == ["cable_gain"] and back.fit.hypothesis.names == ("cable_gain",)
     assert back.fit.coordinates == pytest.approx(alone.fit.coordinates, abs=1e-6)
 
@@ -113,7 +113,7 @@ def test_a_nuisance_that_is_as_declared_without_what_is_not_named_is_not_named()
     theta[fit.own] = np.log(1.2)
     moved = replace(search.final, fit=replace(fit, fit=replace(fit.fit, theta=theta)))
     assert returned_model.moved_nuisance(data, moved, "stiffness")
-    names, _ = returned_model.worth_handing_back(data, replace(search, final=moved), ["stiffness"], ["stiffness"])
+    names, _ = returned_model.returnable_effects(data, replace(search, final=moved), ["stiffness"], ["stiffness"])
     assert names == []
 
 
@@ -121,7 +121,7 @@ def test_a_nuisance_that_is_as_declared_without_what_is_not_named_is_not_named()
 def test_an_effect_is_named_only_where_its_own_value_is_away_from_none_by_three_deviations(std: float, sure: bool) -> None:
     data, search = with_gain(300e3)
     assert search.final.fit.coordinates[-1] == pytest.approx(np.log(0.92), abs=0.004)
-    names = returned_model.sure_effects(data, search.final, ["cable_gain"], {"cable_gain": np.array([std])})
+    names = returned_model.significant_effects(data, search.final, ["cable_gain"], {"cable_gain": np.array([std])})
     assert names == (["cable_gain"] if sure else [])
 
 
@@ -132,7 +132,7 @@ def test_what_is_named_is_sure_without_what_is_not_handed_back_too(scatter: floa
         search, final=replace(search.final, held_rms=2.0 * search.before.held_rms)
     )  # so that the gain is fitted alone
     seed_std = {"cable_gain": np.array([scatter])}
-    names, back, unsure = returned_model.surely_handed_back(data, worse, [], ["cable_gain"], seed_std)
+    names, back, unsure = returned_model.returned_effects(data, worse, [], ["cable_gain"], seed_std)
     assert (names, unsure) == ((["cable_gain"], []) if sure else ([], ["cable_gain"]))
     assert back.fit.hypothesis.names == (("cable_gain",) if sure else search.before.fit.hypothesis.names)
 
@@ -149,14 +149,14 @@ def test_where_a_load_hangs_is_not_what_makes_it_sure() -> None:
 
     def sure(force_std: float) -> bool:
         std = {"payload": np.array([force_std] * 3 + [1e-4] * 3)}
-        return bool(returned_model.sure_effects(data, loaded, ["payload"], std))
+        return bool(returned_model.significant_effects(data, loaded, ["payload"], std))
 
     assert sure(0.005) and not sure(0.01)
 
 
 def test_the_robot_that_is_handed_back_predicts_what_the_fitted_model_does() -> None:
     data, search = with_gain(300e3 * 0.9)
-    names, back = returned_model.worth_handing_back(data, search, [], ["cable_gain"])
+    names, back = returned_model.returnable_effects(data, search, [], ["cable_gain"])
     entries = returned_model.entries_of(back, names)
     assert [e["name"] for e in entries] == [*names, *(n for n in ("stiffness", "cable_offset") if n not in names)]
     whole = apply_effects(data.declared, entries)

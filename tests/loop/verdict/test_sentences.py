@@ -32,15 +32,15 @@ def said(verdict: str, error: float, parts: ModelError, effects: Sequence[NamedE
 def test_how_much_of_the_error_is_the_model_s_own_is_said_first() -> None:
     sentence = said("unexplained", 8.9, budget(8.8, 0.2))
     assert sentence == (
-        "A residual is left that no effect of the list explains: held-out error 8.90 mm, of it 8.80 mm is an error of the model, 0.20 mm noise."
+        "A residual remains that no known effect fits: held-out error 8.90 mm, of which 8.80 mm is model error and 0.20 mm noise."
     )
     stiff = NamedEffect("stiffness", {"scale": Value(0.8, 0.02, "1")}, 1.0, 1.0)
     sentence = said("unexplained", 8.9, budget(8.8, 0.2), [stiff])
-    assert "8.90 mm after, of it 8.80 mm is an error of the model, 0.20 mm noise. A residual is left" in sentence
-    assert "perhaps 0.20 mm (no state repeats) noise" in said("effects", 8.9, budget(8.8, 0.2, measured=False), [stiff])
+    assert "8.90 mm after, of which 8.80 mm is model error and 0.20 mm noise. A residual remains" in sentence
+    assert "about 0.20 mm (assumed: no state repeats) noise" in said("effects", 8.9, budget(8.8, 0.2, measured=False), [stiff])
     assert "0.20 mm noise, 0.30 mm discretisation." in said("effects", 8.9, budget(8.8, 0.2, mesh=0.3), [stiff])
     assert said("effects", 8.9, budget(8.8, 0.2, note="it is huge"), [stiff]).endswith(
-        "discretisation error is not known: it is huge."
+        "discretisation error is unknown: it is huge."
     )
 
 
@@ -56,7 +56,7 @@ def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_s
 def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explained(mesh: float | None, costs: str) -> None:
     sentence = said("none", 0.9, budget(0.7, 0.5, mesh=mesh))
     assert sentence.startswith(
-        "Nothing that was tried explains more of the data: held-out error 0.90 mm, of it 0.70 mm is an error"
+        "No effect that was tried improves the fit: held-out error 0.90 mm, of which 0.70 mm is model error"
     )
     assert sentence.endswith(f"0.50 mm {costs}")
 
@@ -64,7 +64,7 @@ def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explaine
 def test_what_is_found_and_not_sure_is_said_apart_from_what_is_worse_on_held_out_data() -> None:
     data, _ = fitted_arm(arm((4, 2, 2)), 1.0)
     sentence = sentences.evidence_for(data, ["payload", "gravity"], ["payload"])
-    assert "payload would explain more, but with values no surer than three deviations" in sentence
+    assert "payload would improve the fit, but no value is significant" in sentence
     assert "There is evidence for gravity," in sentence and sentences.evidence_for(data, [], []) == ""
 
 
@@ -89,6 +89,6 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(linear: b
     back = replace(fitted, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=settled)))
     trials = [replace(t, mesh_error=np.full((len(t.scene.frame), 3, 1), 1e-3)) for t in data.train]
     data = replace(data, train=trials)
-    assert ("try discretisation" in sentences.on_linear(data, back, [], 0.1e-3)) == (linear and named)
-    assert ("try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1e-3)) == linear
-    assert ("try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1)) == (linear and named)
+    assert ("also try discretisation" in sentences.on_linear(data, back, [], 0.1e-3)) == (linear and named)
+    assert ("also try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1e-3)) == linear
+    assert ("also try discretisation" in sentences.on_linear(data, back, ["stiffness"], 0.1)) == (linear and named)

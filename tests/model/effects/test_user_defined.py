@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import arm, record, sweeps
-from helpers import ROOT, write_block_robot
+from helpers import write_block_robot
 
 from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot, save_robot
@@ -15,7 +15,6 @@ from femsense.loop.improve import ImproveOptions, improve
 from femsense.model.camera_frame import redo_depth, undo_depth
 from femsense.model.effects import apply_effects, build_entry, load_own_effect, try_own_effect
 
-MAGNET = ROOT / "examples" / "magnet.py"
 OUTSIDE = "ignore:.*outside the mesh.*:UserWarning"
 DRAUGHT = '''
 """A draught from the side."""
@@ -35,6 +34,17 @@ def change(robot, per_m):
     body = robot.body
     heights = body.mesh.nodes[body.mesh.tets[:, :4]].mean(axis=1)[:, 0]
     return robot.with_body(body.with_stiffness_scale(1 + per_m * heights))
+"""
+MAGNET = """
+import numpy as np
+
+name = "magnet"
+parameters = {"force_n": {"unit": "N", "low": -0.5, "high": 0.5, "size": 3}}
+seeds = [{"center_m": [0.1, 0.0, 0.0]}, {"center_m": [0.05, 0.0, 0.0]}]
+
+def forces(nodes_m, force_n, center_m):
+    weight = np.exp(-(((nodes_m - center_m) / 0.02) ** 2).sum(axis=1))
+    return np.outer(weight / weight.sum(), force_n)
 """
 BARREL = """
 name = "barrel"
@@ -185,14 +195,16 @@ def test_entries_are_checked(tmp_path):
 
 
 def test_an_effect_of_ones_own_competes_and_the_better_robot_can_be_written(tmp_path):
+    (tmp_path / "own").mkdir()
+    magnet = written(tmp_path / "own", MAGNET, "magnet.py")
     inputs, labels = sweeps(each=1)
-    hidden = {"name": "magnet", "file": str(MAGNET), "center_m": [0.1, 0.0, 0.0], "force_n": [0.0, 0.16, 0.1]}
+    hidden = {"name": "magnet", "file": str(magnet), "center_m": [0.1, 0.0, 0.0], "force_n": [0.0, 0.16, 0.1]}
     recording, _ = record(inputs[:9], effects=[hidden], labels=labels[:9], truth=arm((3, 1, 1)))
     loop = improve(
-        arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], options=ImproveOptions(user_effects=[MAGNET])
+        arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], options=ImproveOptions(user_effects=[magnet])
     )
     tried = next(row for row in loop.candidates if row.name == "magnet")
-    assert tried.dchi2 > 100.0 and tried.seed["file"] == str(MAGNET)
+    assert tried.dchi2 > 100.0 and tried.seed["file"] == str(magnet)
     save_robot(arm((3, 1, 1)), tmp_path, effects=[hidden])
     assert (tmp_path / "magnet.py").is_file()
     np.testing.assert_allclose(load_robot(tmp_path).body.dead_forces.sum(axis=0), hidden["force_n"], atol=1e-9)

@@ -373,7 +373,7 @@ def test_frames_of_reference_are_not_mixed(model) -> None:
         ("time_s\n0\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "no channel"),
         ("time_s,red\n0,1\n", "frame,marker,x_m,y_m,z_m\n5,a,0,0,0\n", "no frame is in both files"),
         ("time_s,red\n0,1\n", "frame,marker,x_m,y_m,z_m\n0,,0,0,0\n", "a marker without a name"),
-        ("frame,time_s,red\n0,0,1\n0,1,2\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "a frame stands twice"),
+        ("frame,time_s,red\n0,0,1\n0,1,2\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "a frame appears twice"),
         ("time_s,red\n0,x\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "not a number"),
     ],
 )

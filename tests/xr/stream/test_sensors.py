@@ -414,7 +414,7 @@ def test_the_robot_s_own_skin_bends_as_the_markers_do_and_elsewhere_it_is_refuse
         middle[:, :2], np.outer(middle[:, 2], [0.2, 0.1]), atol=1e-4
     )  # on the line that the markers are on
     for wrong in (replace(worn, rest=1000.0 * rest), replace(worn, rest=np.add(rest, [0.0, 0.2, 0.0]))):
-        with pytest.raises(InputError, match="not where the model's bones are"):
+        with pytest.raises(InputError, match="the skin is not at the model's bones"):
             sensor_twin(model, "arm", wrong)
 
 

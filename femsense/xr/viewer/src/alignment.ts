@@ -1,17 +1,17 @@
-// The twin over the real robot: points that both have (markers, and cameras where calibration put them) are touched one after another.
+// Alignment of the twin with the real robot: the user touches its markers, and cameras with a calibrated pose, one after another.
 
 import { Matrix4, Mesh, MeshBasicMaterial, Quaternion, SphereGeometry, Vector3, type Object3D } from "three";
 
 const FEWEST = 3;
-const FLAT = 0.02; // points spread less than this share of their length across a line say nothing of the turn about it
+const FLAT = 0.02; // minimum ratio of the spread across the principal line to that along it: otherwise the rotation about the line is undetermined
 
 export interface Landmark {
   name: string;
-  place: () => Vector3; // now, in the frame of the robot's group
+  place: () => Vector3; // current position, in the frame of the robot's group
 }
 
 export class Alignment {
-  /** Root mean square of what the fit leaves [m]. */
+  /** Root mean square residual of the fit [m]. */
   rms = NaN;
   private readonly touched: Vector3[] = [];
   private readonly meant: Vector3[] = [];
@@ -30,12 +30,12 @@ export class Alignment {
     this.ask();
   }
 
-  /** Whether points are still to be touched. */
+  /** Whether further points must be touched. */
   get open(): boolean {
     return !this.done;
   }
 
-  /** Takes a place of the room for the next point; returns the pose of the robot when all are there. */
+  /** Assigns a position in the room to the next point; returns the pose of the robot after the last one. */
   take(place: Vector3): Matrix4 | null {
     this.meant.push(this.landmarks[this.touched.length]!.place());
     this.touched.push(place.clone());
@@ -55,7 +55,7 @@ export class Alignment {
     return pose;
   }
 
-  /** Keeps the mark on the point that is asked for. */
+  /** Moves the marker ring to the requested point. */
   step(): void {
     const next = this.landmarks[this.touched.length];
     this.mark.visible = this.open && next !== undefined;
@@ -73,12 +73,12 @@ export class Alignment {
   }
 }
 
-/** Whether these are enough to lay one robot over another. */
+/** Whether these points determine an alignment. */
 export function enough(landmarks: Landmark[]): boolean {
   return landmarks.length >= FEWEST;
 }
 
-/** Returns the rotation and shift that bring points to others with the least squares, or null where the points leave it open.
+/** Returns the rigid transform between two point sets with the smallest sum of squares, or null if the points do not determine it.
  *
  * Horn (1987), Closed-form solution of absolute orientation using unit quaternions: the eigenvector of the largest eigenvalue. */
 export function rigidFit(from: Vector3[], to: Vector3[]): Matrix4 | null {

@@ -1,5 +1,5 @@
-// Contact forces as arrows whose tip is the place of contact. What is not known of them is pale: a collar at the tail (size), a cone
-// about the shaft (direction), a spheroid at the tip (place); each shows one standard deviation to either side.
+// Contact forces as arrows that end at the contact point. Uncertainty is shown in a pale colour: a collar at the tail (magnitude), a cone
+// around the shaft (direction), an ellipsoid at the tip (position); each shows ± one standard deviation.
 
 import {
   CanvasTexture,
@@ -26,17 +26,17 @@ const COLORS = { "": 0xff9c33, doubtful: 0xa08a70, stale: 0x7d838c };
 const COLOR = COLORS[""];
 type Doubt = keyof typeof COLORS;
 const UP = new Vector3(0, 1, 0);
-const LONGEST = 0.42; // arrow, of the body's size
-const NOISE = 3; // standard deviations: what may be noise gets no long arrow
-const HANGING = [0.5, -0.25] as const; // a label stands above its point
-const LABEL_HEIGHT = 0.046; // of the distance to the viewer
+const LONGEST = 0.42; // length of the longest arrow, relative to the body's size
+const NOISE = 3; // significance threshold in standard deviations: forces below it get no long arrow
+const HANGING = [0.5, -0.25] as const; // offset of a label above its point
+const LABEL_HEIGHT = 0.046; // relative to the distance from the viewer
 
 export class ForceArrows {
-  /** To be placed in the robot's frame. */
+  /** In the robot's frame. */
   readonly group = new Group();
-  /** The largest force so far [N]. */
+  /** Largest force so far [N]. */
   largest = 1e-9;
-  /** The force that gets the longest arrow now [N]. */
+  /** Force of the longest arrow at present [N]. */
   full = 1e-9;
   private arrows: Arrow[] = [];
   private doubt: Doubt = "";
@@ -44,7 +44,7 @@ export class ForceArrows {
   /** size: of the body [m]. */
   constructor(private readonly size: number) {}
 
-  /** Takes colour away from what is old or may be wrong. */
+  /** Desaturates forces that are stale or not reliable. */
   tell(doubt: Doubt): void {
     this.doubt = doubt;
     for (const arrow of this.arrows) arrow.tell(doubt);
@@ -63,7 +63,7 @@ export class ForceArrows {
     this.arrows.forEach((arrow, i) => arrow.set(placed[i], (LONGEST * this.size) / this.full));
   }
 
-  /** Returns where arrows begin, in glTF's frame (Y up). */
+  /** Returns the tails of the arrows, in glTF's frame (Y up). */
   ends(contacts: Contact[]): Vector3[] {
     const placed = contacts.filter((c) => c.point_m && c.force_vector_n);
     return placed.map((c) => {
@@ -72,7 +72,7 @@ export class ForceArrows {
     });
   }
 
-  /** Keeps labels readable: their size follows the distance to the viewer, and they stay in the room between the panels. */
+  /** Keeps labels readable: scales them with the distance from the viewer, and keeps them between the panels. */
   face(camera: Camera, height: number, room: Box2 | null): void {
     for (const arrow of this.arrows) arrow.face(camera, height, room);
   }
@@ -99,11 +99,11 @@ class Arrow {
     this.shaft = new Mesh(new CylinderGeometry(1, 1, 1, 20).translate(0, -0.5, 0), paint);
     this.head = new Mesh(new ConeGeometry(1, 1, 24).translate(0, -0.5, 0), paint);
     this.collar = new Mesh(new CylinderGeometry(1, 1, 1, 20), pale);
-    this.cone = new Mesh(new ConeGeometry(1, 1, 32, 1, true).translate(0, -0.5, 0), paler); // its tip is that of the arrow
+    this.cone = new Mesh(new ConeGeometry(1, 1, 32, 1, true).translate(0, -0.5, 0), paler); // with its apex at the tip of the arrow
     this.place = new Mesh(new SphereGeometry(1, 20, 14), paler);
     for (const part of [this.shaft, this.head]) {
       part.castShadow = true;
-      part.add(new Mesh(part.geometry, behind)); // shows through the body
+      part.add(new Mesh(part.geometry, behind)); // visible through the body
     }
     const point = new Mesh(new SphereGeometry(0.6 * this.radius, 16, 12), new MeshBasicMaterial({ color: 0xffffff }));
     this.group.add(this.shaft, this.head, this.collar, this.cone, this.place, point, this.label.sprite);
@@ -133,7 +133,7 @@ class Arrow {
     this.cone.scale.set(aside, length, aside);
     const [x, y, z] = contact.point_std_m ?? [0, 0, 0];
     this.place.visible = Math.max(x, y, z) > 0.3 * this.radius;
-    this.place.quaternion.copy(this.group.quaternion).invert(); // its axes are the robot's
+    this.place.quaternion.copy(this.group.quaternion).invert(); // aligned with the robot's axes
     this.place.scale.set(Math.max(x, 1e-6), Math.max(y, 1e-6), Math.max(z, 1e-6));
     this.label.sprite.position.y = -length;
     this.label.write(newtons(contact.force_n, contact.std_n));
@@ -145,7 +145,7 @@ class Arrow {
   }
 }
 
-/** Standard deviation of a force across its direction [N]: the root mean square of the two. */
+/** Standard deviation of a force transverse to its direction [N]: the root mean square of the two components. */
 function sideways(force: Vector3, std: Vector | null): number {
   if (!std) return 0;
   const along = force.clone().normalize();
@@ -163,7 +163,7 @@ export class Label {
   private readonly canvas = document.createElement("canvas");
   private readonly texture: CanvasTexture;
   private text = "";
-  private share = 1; // of the picture's width that is written on
+  private share = 1; // share of the texture's width with text
 
   constructor() {
     this.canvas.width = 512;
@@ -204,7 +204,7 @@ export class Label {
     this.sprite.scale.set((height * this.canvas.width) / this.canvas.height / parent, height / parent, 1);
   }
 
-  /** Moves what is written into a part of the picture, which is −1 … 1 wide and high; null: it stays above its point. */
+  /** Moves the label into a part of the image, in coordinates −1 … 1; null: it stays above its point. */
   keepIn(camera: Camera, room: Box2 | null): void {
     this.sprite.center.set(...HANGING);
     if (!room || !this.sprite.visible) return;

@@ -1,4 +1,4 @@
-// One robot in the scene: its skinned mesh, what it is at rest, what was measured, and the forces on it.
+// One robot in the scene: its skinned mesh, the rest state, measurements, and contact forces.
 
 import {
   AxesHelper,
@@ -25,10 +25,10 @@ import type { Contact, NamedPoint } from "./data";
 import { Painter, type Paint } from "./paint";
 import { tie } from "./ties";
 
-const SAMPLED = 600; // vertices that tell about where a body is
-const GREY = 0x6b7177; // of what is old
-const AMBER = 0xf08c00; // of what may be wrong
-const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
+const SAMPLED = 600; // number of vertices for the approximate bounding box
+const GREY = 0x6b7177; // colour of stale data
+const AMBER = 0xf08c00; // colour of unreliable data
+const FAR = 4; // residuals beyond this multiple of the scale belong to the surroundings
 
 export async function loadMesh(url: string): Promise<GLTF> {
   const answer = await fetch(url);
@@ -39,14 +39,14 @@ export async function loadMesh(url: string): Promise<GLTF> {
 export class Body {
   /** All of the robot, in glTF's frame (Y up). */
   readonly group = new Group();
-  /** For what is given in the robot frame (Z up). */
+  /** For objects in the robot frame (Z up). */
   readonly robotFrame = new Group();
   readonly skins: SkinnedMesh[];
   readonly bones: Bone[];
   readonly size: number;
   readonly arrows: ForceArrows;
   readonly painter: Painter;
-  /** Residual that has the full colour [m]. */
+  /** Residual with full saturation [m]. */
   readonly residualScale: number;
   private readonly ghost = new Group();
   private readonly cloud = new Points(new BufferGeometry(), cloudMaterial());
@@ -59,7 +59,7 @@ export class Body {
   private cloudSeen = false;
 
   constructor(readonly gltf: GLTF) {
-    gltf.scene.getObjectByName("forces")?.removeFromParent(); // arrows for viewers that have none of their own
+    gltf.scene.getObjectByName("forces")?.removeFromParent(); // arrows for viewers without their own
     this.skins = skinned(gltf.scene);
     this.bones = this.skins.flatMap((skin) => skin.skeleton.bones);
     const rest = new Box3().setFromObject(gltf.scene);
@@ -83,7 +83,7 @@ export class Body {
     poseBones(this.bones, rows);
   }
 
-  /** Takes the markers that are shown with the bones. */
+  /** Sets the markers that are shown with the bones. */
   setMarkers(markers: NamedPoint[]): void {
     this.markers = markers.map((marker) => tie(this, marker.position));
   }
@@ -93,7 +93,7 @@ export class Body {
     this.base.visible = this.joints.visible = this.marks.visible = visible;
   }
 
-  /** Prepares what depends on the view, before each picture. */
+  /** Updates view-dependent objects, before each image. */
   face(camera: Camera, height: number, room: Box2 | null): void {
     this.arrows.face(camera, height, room);
     if (!this.base.visible) return;
@@ -101,7 +101,7 @@ export class Body {
     this.marks.geometry.setFromPoints(this.markers.map((place) => place()));
   }
 
-  /** Returns the space that the body takes now, in glTF's frame. */
+  /** Returns the bounding box of the body, in glTF's frame. */
   space(): Box3 {
     const box = new Box3();
     this.gltf.scene.updateMatrixWorld(true);
@@ -112,7 +112,7 @@ export class Body {
     return box;
   }
 
-  /** Returns about what body and arrows take now, in glTF's frame; quick enough to be asked again and again. */
+  /** Returns an approximate bounding box of body and arrows, in glTF's frame; fast enough for repeated calls. */
   extent(contacts: Contact[]): Box3 {
     const box = new Box3().setFromPoints(this.arrows.group.visible ? this.arrows.ends(contacts) : []);
     this.gltf.scene.updateMatrixWorld(true);
@@ -130,14 +130,14 @@ export class Body {
     this.painter.contacts(contacts);
   }
 
-  /** Greys the body out: what it shows is old. */
+  /** Shows the body in grey: its data are stale. */
   setStale(stale: boolean): void {
     if (stale === this.stale) return;
     this.stale = stale;
     this.fade();
   }
 
-  /** Colours all of the body: what it shows may be wrong. */
+  /** Colours the whole body: its data may be wrong. */
   setDoubtful(doubtful: boolean): void {
     if (doubtful === this.doubtful) return;
     this.doubtful = doubtful;
@@ -166,7 +166,7 @@ export class Body {
     this.painter.show(paint, this.motionScale);
   }
 
-  /** Motion that has the full colour [m]. */
+  /** Displacement with full saturation [m]. */
   get motionScale(): number {
     return 0.15 * this.size;
   }
@@ -179,7 +179,7 @@ export class Body {
     return this.cloudSeen;
   }
 
-  /** Shows measured points, coloured by their distance from the surface: blue inside, red outside, grey where they belong to something else. */
+  /** Shows measured points, coloured by their distance from the surface: blue inside, red outside, grey if they belong to another object. */
   setCloud(rows: Float32Array): void {
     const count = rows.length / 4;
     this.cloudSeen ||= count > 0;
@@ -207,7 +207,7 @@ export class Body {
   }
 }
 
-/** Small points that show through the body. */
+/** Small points, visible through the body. */
 function dots(color: number, size: number): Points {
   const points = new Points(new BufferGeometry(), new PointsMaterial({ color, size, sizeAttenuation: false, depthTest: false, transparent: true }));
   points.frustumCulled = false;
@@ -215,7 +215,7 @@ function dots(color: number, size: number): Points {
   return points;
 }
 
-/** Points of a measured cloud: drawn a little nearer than they are, since half of them lie behind the surface that they measure. */
+/** Points of a measured cloud, drawn slightly closer to the viewer, since half of them lie behind the measured surface. */
 function cloudMaterial(): PointsMaterial {
   const material = new PointsMaterial({ size: 4, sizeAttenuation: false, vertexColors: true });
   material.onBeforeCompile = (shader) => {
@@ -233,7 +233,7 @@ export function poseBones(bones: Bone[], rows: Float32Array): void {
   }
 }
 
-/** Blue where a point lies inside the surface, white on it, red outside; grey far away. */
+/** Blue for points inside the surface, white on it, red outside; grey far away. */
 export function residualColor(share: number, into: Color): Color {
   if (!Number.isFinite(share) || Math.abs(share) > FAR) return into.setRGB(0.32, 0.35, 0.4);
   const s = Math.max(-1, Math.min(1, share));

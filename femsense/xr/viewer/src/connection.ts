@@ -1,15 +1,15 @@
-// The WebSocket of a stream: comes back by itself when it was gone.
+// The WebSocket of a stream, with automatic reconnection.
 
 import { unpack, type Message } from "./messages";
 
 export const NO_CONNECTION = "no connection";
-const CONFIRMED = new Uint8Array(0); // an empty frame: what came was handled, and the newest may follow
+const CONFIRMED = new Uint8Array(0); // an empty frame acknowledges the last one
 const AGAIN_MS = [200, 500, 1000, 2000];
 
 export class Connection {
   private socket: WebSocket | null = null;
   private attempt = 0;
-  private away = NO_CONNECTION; // what is said where there is none
+  private away = NO_CONNECTION; // message while disconnected
 
   constructor(
     private readonly url: string,
@@ -47,13 +47,13 @@ export class Connection {
   }
 }
 
-/** Returns why there is no connection: a socket that is refused does not say it. */
+/** Returns the reason of a missing connection, which a refused socket does not provide. */
 async function whyAway(): Promise<string> {
   const answer = await fetch("stream.json", { cache: "no-store" }).catch(() => null);
   return answer?.status === 401 ? "password refused: load the page again" : NO_CONNECTION;
 }
 
-/** The address of the stream beside this page. */
+/** The address of the stream on the server of this page. */
 export function streamUrl(): string {
   return new URL("ws", location.href.replace(/^http/, "ws").replace(/[?#].*$/, "")).href;
 }

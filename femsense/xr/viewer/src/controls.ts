@@ -1,4 +1,4 @@
-// Buttons and keys that a recorded run and a stream have in common.
+// Buttons and keys shared by recorded runs and streams.
 
 import { Alignment, enough, type Landmark } from "./alignment";
 import type { Body } from "./body";
@@ -6,7 +6,7 @@ import { PAINTS, type Paint } from "./paint";
 import { element } from "./readout";
 import type { Stage } from "./stage";
 
-/** Makes a button that is on or off; returns what its key does. */
+/** Creates a toggle button; returns the handler of its key. */
 export function toggle(id: string, change: (on: boolean) => void): () => void {
   const button = element<HTMLButtonElement>(id);
   const act = (): void => {
@@ -19,7 +19,7 @@ export function toggle(id: string, change: (on: boolean) => void): () => void {
   return act;
 }
 
-/** Connects the choice of what colours the body; returns what its key does. */
+/** Connects the selection of the colouring; returns the handler of its key. */
 export function paintChoice(change: (paint: Paint) => void): () => void {
   const choice = element<HTMLSelectElement>("paint");
   const act = (): void => change(choice.value as Paint);
@@ -31,14 +31,14 @@ export function paintChoice(change: (paint: Paint) => void): () => void {
   };
 }
 
-/** Says below the panel's figures what the colours mean. */
+/** Shows the legend of the colours below the figures of the panel. */
 export function paintLegend(paint: Paint, body: Body | null, stress = ""): void {
   const said = { none: "", motion: body ? `${(1000 * body.motionScale).toPrecision(2)} mm of motion` : "", stress, contact: "contact likely" }[paint];
   element("scale").hidden = !said;
   element("scale-top").textContent = said;
 }
 
-/** In AR, and where `Align` is on, lays the twin over the real robot: the person touches its markers and cameras in turn. */
+/** In AR, and with `Align`, aligns the twin with the real robot: the user touches its markers and cameras one after another. */
 export function alignWith(stage: Stage, body: Body, landmarks: Landmark[]): Alignment | null {
   const wanted = element("align").getAttribute("aria-pressed") === "true" && document.documentElement.dataset.xr === "immersive-ar";
   if (!wanted || !enough(landmarks)) return null;
@@ -63,7 +63,7 @@ export function connectTools(stage: Stage, keys: Record<string, () => void>): vo
   });
 }
 
-/** Shows the ways into a headset where there are any. */
+/** Shows the buttons for headset sessions, if supported. */
 export function offerHeadset(stage: Stage): void {
   for (const [id, mode] of [
     ["enter-vr", "immersive-vr"],
@@ -83,13 +83,13 @@ export function offerHeadset(stage: Stage): void {
   for (const id of ["panel", "dock", "dragging", "top"]) element(id).addEventListener("beforexrselect", (event) => event.preventDefault());
 }
 
-/** Says to the styles how tall the bar is: other things stand on it. */
+/** Passes the height of the bar to the styles of the elements above it. */
 export function announceDock(): void {
   const dock = element("dock");
   new ResizeObserver(() => document.documentElement.style.setProperty("--dock", `${dock.offsetHeight}px`)).observe(dock);
 }
 
-/** Shows, where the panel is longer than its place, that there is more below. */
+/** Indicates that the panel continues below its visible part. */
 export function announceMore(): void {
   const [panel, more] = [element("panel"), element("more")];
   const look = (): void => {

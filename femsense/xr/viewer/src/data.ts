@@ -1,10 +1,10 @@
-// What the page shows of a moment, from the files of a run or from a stream.
+// The displayed data of one moment, from the files of a run or from a stream.
 
 export type Vector = [number, number, number];
 
 export interface Input {
   name: string;
-  unit: string; // "N", "m", "Pa", or what a sensor's file says
+  unit: string; // "N", "m", "Pa", or the unit of a sensor
   low: number;
   high: number;
 }
@@ -29,14 +29,14 @@ export interface NamedPoint {
 }
 
 export interface Frame {
-  time_s: number; // from the first frame, as in the animation; in a stream on the source's clock
+  time_s: number; // since the first frame, as in the animation; in a stream the source's clock
   frame: number | null; // number in the recording
   status: string | null;
   rms_after_m: number | null;
-  run_s?: number | null; // from the beginning of a run that is played over and over
+  run_s?: number | null; // since the beginning of a repeated run
   inputs: (number | null)[] | null;
   contacts: Contact[];
-  forceless?: boolean; // nothing estimates forces
+  forceless?: boolean; // no forces are estimated
 }
 
 export interface Run {
@@ -45,10 +45,10 @@ export interface Run {
   frames: Frame[];
   markers: NamedPoint[];
   cameras: NamedPoint[];
-  field?: { name: string; unit: string } | null; // of fields.bin: the largest value, then its share at each vertex of each frame
+  field?: { name: string; unit: string } | null; // in fields.bin: the largest value, then the ratio to it at each vertex of each frame
 }
 
-/** Returns the run, or null where none is served: the mesh alone can be shown too. */
+/** Returns the run, or null without one: the mesh is then shown alone. */
 export async function loadRun(url: string): Promise<Run | null> {
   const answer = await fetch(url);
   if (answer.status === 404) return null;
@@ -58,7 +58,7 @@ export async function loadRun(url: string): Promise<Run | null> {
   return { ...run, inputs: run.inputs ?? [], markers: run.markers ?? [], cameras: run.cameras ?? [] };
 }
 
-/** Returns the index of the frame whose time is nearest. */
+/** Returns the index of the frame nearest in time. */
 export function frameAt(frames: { time_s: number }[], time: number): number {
   let low = 0;
   let high = frames.length - 1;
@@ -70,7 +70,7 @@ export function frameAt(frames: { time_s: number }[], time: number): number {
   return high >= 0 && Math.abs(frames[high]!.time_s - time) < Math.abs(frames[low]!.time_s - time) ? high : low;
 }
 
-/** Whether what is shown may be wrong: the frame says why. */
+/** Whether the frame may be wrong, by its status. */
 export function isDoubtful(frame: Frame): boolean {
   return Boolean(frame.status) && frame.status !== "ok";
 }
@@ -79,7 +79,7 @@ export function totalForce(frame: Frame): number {
   return frame.contacts.reduce((sum, c) => sum + (c.force_n ?? 0), 0);
 }
 
-/** Standard deviation of the sum, taken as independent. */
+/** Standard deviation of a sum of independent forces. */
 export function totalStd(frame: Frame): number | null {
   const known = frame.contacts.filter((c) => c.std_n !== null);
   return known.length ? Math.hypot(...known.map((c) => c.std_n!)) : null;
@@ -91,7 +91,7 @@ export function newtons(force: number | null, std: number | null): string {
   return std === null ? `${force.toFixed(digits)} N` : `${force.toFixed(digits)} ± ${std.toFixed(digits)} N`;
 }
 
-/** A value with a unit that people read: kPa for pressures, mm for lengths. */
+/** A value in a readable unit: kPa for pressures, mm for lengths. */
 export function amount(value: number | null, unit: string): string {
   if (value === null || !Number.isFinite(value)) return "–";
   if (unit === "Pa") return `${(value / 1000).toFixed(1)} kPa`;
@@ -101,7 +101,7 @@ export function amount(value: number | null, unit: string): string {
 
 const DAY_S = 86400;
 
-/** A time of a source: of the day where it counts as clocks do, else since it began, in seconds or with minutes. */
+/** The time of a source: the time of day if it has such a clock, otherwise the time since its start, in seconds or with minutes. */
 export function timeText(time: number, digits = 1, withMinutes = Math.abs(time) >= 60): string {
   if (Math.abs(time - Date.now() / 1000) < DAY_S) return new Date(1000 * time).toLocaleTimeString();
   if (!withMinutes) return `${time.toFixed(digits)} s`;
@@ -110,7 +110,7 @@ export function timeText(time: number, digits = 1, withMinutes = Math.abs(time) 
   return minutes < 60 ? `${minutes}:${two(seconds)}` : `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two(seconds)}`;
 }
 
-/** The time within a run of some length where one is played over and over, else that of the source. */
+/** The time within a repeated run, otherwise that of the source. */
 export function clockText(time: number, within: number | null, length: number | null): string {
   return within === null || length === null ? timeText(time) : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
 }

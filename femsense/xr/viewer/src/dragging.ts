@@ -1,4 +1,4 @@
-// Back to the robot: a point of the twin is dragged, the server answers how near the robot can bring it, and commands go out while armed and held.
+// Control of the robot: a point of the twin is dragged, the server answers with the reachable state, and commands are sent while armed and held.
 
 import {
   BufferGeometry,
@@ -26,14 +26,14 @@ import { element } from "./readout";
 import { tie } from "./ties";
 import type { Stage } from "./stage";
 
-const EVERY_MS = 33; // wishes are sent so often while held, however slowly pictures come: the robot stops when they stop
-const BLIND_MS = 1000; // who has seen no new picture for so long leads nobody
+const EVERY_MS = 33; // interval of the targets while held, independent of the frame rate: the robot stops when they stop
+const BLIND_MS = 1000; // without a new image for this long no target is sent
 const BY_FINGER = matchMedia("(pointer: coarse)").matches;
 const HINT = BY_FINGER ? "Drag a green point with a finger." : "Drag a green point, or hold Shift and use the arrow keys.";
-const FINGER = 28; // a finger so near to a handle takes it [px]
-const STEP = 0.01; // of the body's size, for a key
-const TOUCH = 0.03; // a hand that is nearer to a handle touches it [m]
-const NEAR = 0.04; // of the body's size: a ray that passes a handle so closely points at it
+const FINGER = 28; // distance within which a finger grabs a handle [px]
+const STEP = 0.01; // step of a key, relative to the body's size
+const TOUCH = 0.03; // distance within which a hand grabs a handle [m]
+const NEAR = 0.04; // distance from a handle within which a ray points at it, relative to the body's size
 
 interface Subject {
   id: string;
@@ -53,16 +53,16 @@ export class Dragging {
   private enabled = false;
   private armed = false;
   private sent = 0;
-  private seen = 0; // when the last picture was prepared
-  private heard: Reach | null = null; // the newest answer, and that which is shown
+  private seen = 0; // time of the last image
+  private heard: Reach | null = null; // the newest answer, and the displayed one
   private shown: Reach | null = null;
   private seq = 0;
   private lease: Lease | null = null;
-  /** Who this page is among those who may steer. */
+  /** Identifier of this page among the clients. */
   readonly client = Array.from(crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16).padStart(2, "0")).join("");
   private readonly plane = new Plane();
   private readonly ray = new Raycaster();
-  private readonly wish = new Vector3(); // in the world
+  private readonly wish = new Vector3(); // target, in world coordinates
   private places: (() => Vector3)[] = [];
 
   constructor(
@@ -84,7 +84,7 @@ export class Dragging {
     window.setInterval(() => this.repeat(), EVERY_MS);
   }
 
-  /** Takes another robot as the one that is dragged. */
+  /** Selects another robot for dragging. */
   attend(subject: Subject | null): void {
     if (subject?.body === this.subject?.body) return;
     this.release();
@@ -122,7 +122,7 @@ export class Dragging {
     if (this.twin) this.twin.root.visible = false;
     this.line.visible = this.target.visible = false;
     element("dragging").hidden = !on;
-    this.shown = this.heard; // what was answered before was answered to somebody else
+    this.shown = this.heard; // earlier answers belong to another client
     if (on) this.tell(HINT, "", "");
     this.stage.panelsChanged();
   }
@@ -131,14 +131,14 @@ export class Dragging {
     return this.armed;
   }
 
-  /** Ends a drag and disarms, and says so: after a stop nobody moves the robot before that. */
+  /** Ends a drag and disarms, with a message: after a stop it is required before the robot can move again. */
   letGo(): void {
     this.release();
     this.arm(false);
     this.open();
   }
 
-  /** Takes note of who steers. */
+  /** Records the holder of the lease. */
   leased(lease: Lease): void {
     if (lease === this.lease) return;
     this.lease = lease;
@@ -150,17 +150,17 @@ export class Dragging {
     }
   }
 
-  /** What each message says of its sender: the lease that it has, or 0 to ask for one. */
+  /** The sender's part of each message: its lease, or 0 to request one. */
   private sender(): object {
     return { client: this.client, seq: this.seq++, lease: this.lease?.client === this.client ? this.lease.number : 0 };
   }
 
-  /** Says that nothing is held. */
+  /** Sends that nothing is held. */
   private open(): void {
     if (this.subject) this.send(this.subject.id, { ...this.sender(), handle: "", held: false, armed: false });
   }
 
-  /** Repeats the wish while it is held and seen. */
+  /** Repeats the target while a point is held and the page is drawn. */
   private repeat(): void {
     const now = performance.now();
     if (this.held !== null && now - this.sent >= EVERY_MS - 5 && now - this.seen < BLIND_MS) this.say();
@@ -183,7 +183,7 @@ export class Dragging {
     });
   }
 
-  /** Sends where the held point is wanted. */
+  /** Sends the target of the held point. */
   private say(): void {
     if (this.held === null || !this.subject) return;
     this.sent = performance.now();
@@ -193,7 +193,7 @@ export class Dragging {
     this.draw();
   }
 
-  /** Takes a handle that a hand touches, or that it points at; the wish then moves with the hand. */
+  /** Grabs a handle that a hand touches or points at; the target then moves with the hand. */
   take(hand: Hand): Hold | null {
     if (!this.enabled || !this.subject || this.held !== null) return null;
     const places = this.balls.map((ball) => ball.getWorldPosition(new Vector3()));
@@ -208,7 +208,7 @@ export class Dragging {
     return { follow, ...this.byBothHands() };
   }
 
-  /** The robot follows while the other hand is closed too. */
+  /** The robot follows while the other hand is closed as well. */
   private byBothHands(): Pick<Hold, "release" | "second"> {
     const { headset } = this.stage;
     const second = (closed: boolean): void => {
@@ -225,7 +225,7 @@ export class Dragging {
     return { release, second };
   }
 
-  /** Shows what the server found, and where the robot would be. */
+  /** Shows the answer of the server, and the reachable shape. */
   answered(reach: Reach, ghost: Float32Array | null = null): void {
     this.heard = reach;
     if (!this.enabled || reach === this.shown) return;
@@ -256,7 +256,7 @@ export class Dragging {
   }
 
   private arm(on: boolean): void {
-    if (on && this.held === null) this.open(); // after a stop an open hand has to be seen first
+    if (on && this.held === null) this.open(); // after a stop the hand must be opened first
     this.armed = on && this.subject?.commands === true;
     const button = element("arm");
     button.setAttribute("aria-pressed", String(this.armed));
@@ -276,7 +276,7 @@ export class Dragging {
     this.begin(index);
   }
 
-  /** Returns the handle that a finger is at: it covers more than the ball. */
+  /** Returns the handle under a finger, whose contact is larger than the ball. */
   private near(event: PointerEvent): number | null {
     const { left, top, width, height } = this.stage.renderer.domElement.getBoundingClientRect();
     const away = this.balls.map((ball) => {
@@ -310,7 +310,7 @@ export class Dragging {
     this.stage.touch();
   }
 
-  /** Shift and arrows move the chosen point without a mouse, in the plane of the picture. */
+  /** Shift and arrow keys move the selected point in the image plane. */
   private key(event: KeyboardEvent): void {
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (!this.enabled || !this.subject || !event.shiftKey || !way) return;
@@ -346,7 +346,7 @@ export class Dragging {
   }
 }
 
-/** Returns which of some distances is the least, or null where none is below a limit. */
+/** Returns the index of the smallest distance, or null if none is below a limit. */
 function closest(distances: number[], limit: number): number | null {
   const best = distances.reduce((b, d, i) => (d < distances[b]! ? i : b), 0);
   return distances.length && distances[best]! < limit ? best : null;

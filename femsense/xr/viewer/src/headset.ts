@@ -1,14 +1,14 @@
-// In a headset: the robot on a table or on a surface that the device sees, carried by controllers and hands, laid over the real one.
+// Headset sessions: the robot on a table or on a detected surface, moved by controllers and hands, or aligned with the real robot.
 
 import { Box3, BufferGeometry, Line, LineBasicMaterial, Matrix4, Mesh, MeshBasicMaterial, Object3D, Ray, RingGeometry, Vector3, type Group } from "three";
 import type { Alignment } from "./alignment";
 import { Label } from "./arrows";
 import type { Stage } from "./stage";
 
-const TABLE = new Vector3(0, 1.1, -0.6); // where the robot's ground stands in front of a person [m]
-const REACH = 3; // of the line that shows where a controller points [m]
+const TABLE = new Vector3(0, 1.1, -0.6); // position of the robot's ground in front of the user [m]
+const REACH = 3; // length of the pointing ray of a controller [m]
 
-/** A hand or a controller: where it points, and the point that touches. */
+/** A hand or a controller: its pointing ray, and its touching point. */
 export class Hand {
   readonly ray = new Ray();
   readonly point = new Vector3();
@@ -18,7 +18,7 @@ export class Hand {
     private readonly joints: Group & { joints?: Record<string, Object3D | undefined> },
   ) {}
 
-  /** Brings ray and point up to date, in the world. */
+  /** Updates ray and point, in world coordinates. */
   update(): void {
     this.pointer.updateWorldMatrix(true, false);
     this.ray.origin.setFromMatrixPosition(this.pointer.matrixWorld);
@@ -29,26 +29,26 @@ export class Hand {
   }
 }
 
-/** What is held: follows the hand until it lets go. */
+/** A held object, which follows the hand until it is released. */
 export interface Hold {
   follow(): void;
   release(): void;
-  /** The other hand closes or opens: both hands together let the robot follow. Without it, the other hand holds something of its own. */
+  /** The other hand closes or opens: with both hands closed the robot follows. Without this method, the other hand holds another object. */
   second?: (closed: boolean) => void;
 }
 
-/** Ties a place of the world to a hand: returns what tells where it is now. */
+/** Attaches a point of the world to a hand; returns a function of its current position. */
 export function tied(hand: Hand, place: Matrix4): () => Matrix4 {
   const offset = hand.pointer.matrixWorld.clone().invert().multiply(place);
   return () => hand.pointer.matrixWorld.clone().multiply(offset);
 }
 
 export class Headset {
-  /** Asked first when a hand closes; null where it takes nothing. */
+  /** Called first when a hand closes; null if nothing is grabbed. */
   grab: (hand: Hand) => Hold | null = () => null;
-  /** Begins and ends with a session. */
+  /** Called at the beginning and the end of a session. */
   changed: (presenting: boolean) => void = () => undefined;
-  /** While it is there, what a hand selects are points of the real robot. */
+  /** While it is set, selections of a hand are points of the real robot. */
   alignment: Alignment | null = null;
   private readonly hands: Hand[] = [];
   private readonly holds: (Hold | null)[] = [null, null];
@@ -58,7 +58,7 @@ export class Headset {
   );
   private hits: XRHitTestSource | null = null;
   private anchor: XRAnchor | null = null;
-  private placing = false; // a selection asks for an anchor in the next frame
+  private placing = false; // a selection requests an anchor in the next frame
   private box = new Box3();
 
   private readonly words = new Label();
@@ -77,17 +77,17 @@ export class Headset {
     return this.stage.renderer.xr.isPresenting;
   }
 
-  /** Whether nobody sees the page around the picture: in VR, and in AR where the device does not lay it over the room. */
+  /** Whether the page around the image is invisible: in VR, and in AR without a DOM overlay. */
   get alone(): boolean {
     return this.presenting && !this.stage.renderer.xr.getSession()?.domOverlayState;
   }
 
-  /** The space that the robot needs, in glTF's frame [m]. */
+  /** The bounding box of the robot, in glTF's frame [m]. */
   fit(box: Box3): void {
     this.box = box.clone();
   }
 
-  /** Enters a headset, or leaves it. In VR the robot stands in its true size on a table; in AR it goes where the person selects. */
+  /** Starts or ends a session. In VR the robot stands in its true size on a table; in AR at the selected place. */
   async toggle(mode: XRSessionMode): Promise<void> {
     const { xr } = this.stage.renderer;
     if (this.presenting) return void (await xr.getSession()?.end());
@@ -105,18 +105,18 @@ export class Headset {
     if (mode === "immersive-ar") await this.seekSurfaces(session);
   }
 
-  /** Shows words above the robot; none where there is no text. */
+  /** Shows a text above the robot; none if it is empty. */
   say(text: string): void {
     this.words.write(text);
     this.words.sprite.visible = text !== "";
   }
 
-  /** Called before each picture of a session. */
+  /** Called before each image of a session. */
   step(frame: XRFrame): void {
     const space = this.stage.renderer.xr.getReferenceSpace();
     if (!space) return;
     const kept = this.anchor && frame.trackedAnchors?.has(this.anchor) ? frame.getPose(this.anchor.anchorSpace, space) : null;
-    if (kept) this.stand(new Matrix4().fromArray(kept.transform.matrix)); // the device may have corrected itself
+    if (kept) this.stand(new Matrix4().fromArray(kept.transform.matrix)); // the device may have corrected its tracking
     const hit = this.hits ? frame.getHitTestResults(this.hits)[0] : undefined;
     const seen = hit?.getPose(space) ?? null;
     this.reticle.visible = seen !== null && this.holds.every((hold) => hold === null);
@@ -152,7 +152,7 @@ export class Headset {
     pointer.addEventListener("select", () => this.select(index));
   }
 
-  /** A hand closes: on a handle of the robot, else on the robot itself. */
+  /** A hand closes: on a handle of the robot, otherwise on the robot itself. */
   private close(index: number, pinch: boolean): void {
     if (this.holds[index] || this.alignment?.open) return;
     const hand = this.hands[index]!;
@@ -168,7 +168,7 @@ export class Headset {
 
   private open(index: number): void {
     this.holds[index]?.release();
-    // "select" comes before "selectend": what was held has not been placed
+    // "select" precedes "selectend": the held object has not been placed
     this.holds[index] = null;
   }
 
@@ -204,7 +204,7 @@ export class Headset {
     return this.stage.renderer.xr.getSession()?.inputSources[0]?.targetRayMode === "screen";
   }
 
-  /** Lays the twin over the real robot. */
+  /** Aligns the twin with the real robot. */
   private lay(pose: Matrix4): void {
     this.forget();
     this.stage.touch();
@@ -212,7 +212,7 @@ export class Headset {
     pose.decompose(robot.position, robot.quaternion, robot.scale);
   }
 
-  /** Puts the middle of the robot's ground at a pose of the room. */
+  /** Moves the centre of the robot's ground to a pose in the room. */
   private stand(pose: Matrix4): void {
     this.stage.touch();
     const { robot } = this.stage;
@@ -221,17 +221,17 @@ export class Headset {
     robot.position.sub(new Vector3(middle.x, this.box.min.y, middle.z).applyQuaternion(robot.quaternion));
   }
 
-  /** Follows the surfaces that the device sees. */
+  /** Tracks the surfaces that the device detects. */
   private async seekSurfaces(session: XRSession): Promise<void> {
     try {
       const space = await session.requestReferenceSpace("viewer");
       this.hits = (await session.requestHitTestSource?.({ space })) ?? null;
     } catch {
-      this.hits = null; // without hit tests the robot stays in front of the person
+      this.hits = null; // without hit tests the robot stays in front of the user
     }
   }
 
-  /** Asks the device to hold the place even where it corrects its own position; devices without anchors go on as they are. */
+  /** Requests an anchor, so that the place is kept when the device corrects its tracking; devices without anchors continue without. */
   private keep(hit: XRHitTestResult | undefined): void {
     this.placing = false;
     this.forget();

@@ -1,4 +1,4 @@
-// Robots that stream: the newest of each, how old it is, and the last minute of it.
+// Streamed robots: the newest data of each, their age, and the last minute.
 
 import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
@@ -15,11 +15,11 @@ import { showPlaying } from "./recorded";
 import type { Stage } from "./stage";
 import { landmarksOf } from "./ties";
 
-const STALE_S = 0.4; // what is older is greyed out: within half a second, the picture included
+const STALE_S = 0.4; // age above which a robot is shown in grey: within half a second in total
 const KEPT_S = 60;
 const PLOTTED_S = 30;
-const ASKED_MS = 2000; // how often it is asked why no robot comes
-const FRAMED_MS = 300; // how often it is asked whether all is in the picture
+const ASKED_MS = 2000; // interval of requests for the reason of a missing robot
+const FRAMED_MS = 300; // interval of checks of the view
 
 interface Moment extends Frame {
   bones: Float32Array;
@@ -27,7 +27,7 @@ interface Moment extends Frame {
   cloud: Float32Array | null; // x y z residual of each measured point
 }
 
-/** Shows all robots of the stream beside this page; returns what programs may look at. */
+/** Shows all robots of the stream on the server of this page; returns the objects that programs may inspect. */
 export function showStreams(stage: Stage): Streams {
   return new Streams(stage);
 }
@@ -38,9 +38,9 @@ class Streams {
   private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
   private readonly dragging: Dragging;
   private chosen: Robot | null = null;
-  private away = NO_CONNECTION; // why there is none; empty where there is one
+  private away = NO_CONNECTION; // reason of a missing connection; empty while connected
   private paused = false;
-  private at = 0; // time that is shown while paused [s]
+  private at = 0; // displayed time while paused [s]
   private drawn = 0;
   private framed = 0;
 
@@ -67,7 +67,7 @@ class Streams {
     }
   }
 
-  /** As long as there is no robot, says why: `view --stream` knows what keeps it from the stream. */
+  /** Shows the reason of a missing robot, which `view --stream` provides. */
   private async ask(): Promise<void> {
     if (this.robots.size || this.away) return;
     const told: unknown = await fetch("stream.json").then((answer) => answer.json(), () => null);
@@ -75,7 +75,7 @@ class Streams {
     if (!this.robots.size) element("about").textContent = typeof trouble === "string" && trouble ? trouble : "waiting for a robot …";
   }
 
-  /** Ends all motion, whoever steers. */
+  /** Ends all motion, independent of the holder of the lease. */
   private stopAll(): void {
     for (const robot of this.robots.values()) {
       if (robot.model.commands) this.connection.send(pack(robot.id, "stop", { client: this.dragging.client }));
@@ -95,7 +95,7 @@ class Streams {
     this.tabs();
   }
 
-  /** In a headset points can be dragged without the button, and the twin can be laid over the real robot. */
+  /** In a headset points can be dragged without the button, and the twin can be aligned with the real robot. */
   private presenting(on: boolean): void {
     const robot = this.chosen;
     if (robot?.model.handles.length && on !== this.dragging.on) element("drag").click();
@@ -104,7 +104,7 @@ class Streams {
     this.stage.headset.alignment = alignWith(this.stage, robot.body, landmarksOf(robot.body, markers.length ? markers : handles, cameras));
   }
 
-  /** Puts robots side by side, in the order of their names. */
+  /** Arranges robots side by side, in the order of their names. */
   private arrange(): void {
     const bodies = [...this.robots.entries()].sort(([a], [b]) => a.localeCompare(b)).flatMap(([, r]) => (r.body ? [r.body] : []));
     const width = 0.8 * Math.max(...bodies.map((b) => b.size));
@@ -158,7 +158,7 @@ class Streams {
     if (now - this.framed > FRAMED_MS) this.frame(now);
   }
 
-  /** Keeps all robots and their arrows in the picture. */
+  /** Keeps all robots and their arrows in view. */
   private frame(now: number): void {
     this.framed = now;
     for (const { body, shown } of this.robots.values()) {
@@ -166,7 +166,7 @@ class Streams {
     }
   }
 
-  /** Brings the badge, the buttons and what answers up to date, and the rest of the page where it can be seen. */
+  /** Updates badge, buttons and answers, and the rest of the page while it is visible. */
   private read(now: number): void {
     const robot = this.chosen;
     const badge = element("badge");
@@ -187,7 +187,7 @@ class Streams {
     if (robot && !this.stage.headset.alone) this.describe(robot, state);
   }
 
-  /** Says so that nobody overlooks it that the robot moves, or will when a point is held. */
+  /** Shows prominently that the robot moves, or will move when a point is held. */
   private alarm(): void {
     const driven = [...this.robots.values()].filter((robot) => robot.model.commands && !this.away);
     const moving = driven.some((robot) => robot.reach?.armed);
@@ -201,7 +201,7 @@ class Streams {
     if (said.textContent !== words) said.textContent = words;
   }
 
-  /** Brings the panel and the time line up to date. */
+  /** Updates the panel and the time line. */
   private describe(robot: Robot, state: string): void {
     element("about").textContent = robot.about();
     element<HTMLOptionElement>("paint-stress").hidden = !robot.model.field;
@@ -296,7 +296,7 @@ class Streams {
 
 /** One robot of the stream. */
 class Robot {
-  /** Dresses a body as the buttons say. */
+  /** Applies the state of the buttons to a body. */
   static dress: (body: Body) => void = () => undefined;
 
   body: Body | null = null;
@@ -309,10 +309,10 @@ class Robot {
   private forces: ReturnType<typeof readForces> = null;
   private inputs: (number | null)[] | null = null;
   private field: Field | null = null;
-  private painted: Field | null = null; // the field that the body has now
+  private painted: Field | null = null; // the displayed field
   private cloud: Float32Array | null = null;
-  private measured: Float32Array | null = null; // the cloud that the body has now
-  private arrived = -Infinity; // when the newest pose came [ms of the page]
+  private measured: Float32Array | null = null; // the displayed cloud
+  private arrived = -Infinity; // arrival time of the newest pose [ms of the page]
   private told: Status = { state: "", detail: "", since_s: null };
   readonly pace = new Pace();
   private gone = false;
@@ -351,7 +351,7 @@ class Robot {
     this.join();
   }
 
-  /** Shows the newest moment, or that of a time while paused; grey as soon as the stream is not live, paused or not. */
+  /** Shows the newest moment, or that at the displayed time while paused; in grey if the stream is not live, paused or not. */
   step(now: number, at: number | null, away: string, stage: Stage): void {
     const body = this.body;
     if (!body) return;
@@ -368,13 +368,13 @@ class Robot {
     body.face(stage.camera, stage.pixelHeight, stage.room);
   }
 
-  /** Returns whether it is live, and that in words. */
+  /** Returns whether it is live, and its state in words. */
   state(now: number, away: string): [string, string] {
     const { state, detail, since_s } = this.told;
-    const silent = state === "stale"; // the sender says so: who comes late cannot know how old its first pose is
+    const silent = state === "stale"; // stated by the sender: a new viewer does not know the age of its first pose
     const told = silent && since_s !== null ? Date.now() / 1000 - since_s : 0;
     const age = Math.max((now - this.arrived) / 1000, told);
-    if (state === "ended" && (!away || away === NO_CONNECTION)) return ["ended", "ended"]; // so it said before it closed the connection
+    if (state === "ended" && (!away || away === NO_CONNECTION)) return ["ended", "ended"]; // stated before the connection was closed
     if (away) return ["lost", away];
     if (state === "lost") return ["lost", detail ? `no connection to ${detail}` : "source lost"];
     if (state === "waiting" || !Number.isFinite(age)) return ["waiting", `waiting for ${(state === "waiting" && detail) || "the first pose"}`];
@@ -395,8 +395,8 @@ class Robot {
     const now = performance.now();
     this.arrived = now;
     this.pace.take(now, pose.seq);
-    if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
-    // as long as nobody speaks of forces, nothing estimates them
+    if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source restarted
+    // without force messages no forces are estimated
     this.newest = {
       time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], forceless: true, field: null, cloud: null,
     };

@@ -1,4 +1,4 @@
-// The page: a recorded run, or what streams.
+// The page: a recorded run, or a stream.
 
 import "./style.css";
 import { announceDock, announceMore, notice, offerHeadset } from "./controls";
@@ -16,7 +16,7 @@ async function main(): Promise<void> {
   announceDock();
   const live = document.documentElement.dataset.mode === "live";
   const shown = live ? showStreams(stage) : await showRun(stage);
-  Object.assign(globalThis, { femsense: { stage, shown } }); // for the console, and for programs that look at the scene
+  Object.assign(globalThis, { femsense: { stage, shown } }); // for the console, and for programs that inspect the scene
   document.documentElement.dataset.state = "ready";
 }
 

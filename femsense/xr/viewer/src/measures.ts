@@ -1,4 +1,4 @@
-// What tells directions and lengths in the picture: the axes of the robot's frame, a scale bar, the size of the grid.
+// Directions and lengths in the image: the axes of the robot's frame, a scale bar, the size of the grid.
 
 import { Quaternion, Vector3, type Camera, type Object3D } from "three";
 import { niceLength } from "./body";
@@ -9,8 +9,8 @@ const AXES = [
   ["y", 0x7ee08a, new Vector3(0, 0, -1)],
   ["z", 0x7db8ff, new Vector3(0, 1, 0)],
 ] as const; // of the robot (Z up), in glTF's frame (Y up)
-const LONG = 28; // of an axis in the picture [units of the svg]
-const WIDEST = 120; // of the scale bar [px]
+const LONG = 28; // length of an axis in the image [units of the svg]
+const WIDEST = 120; // maximum width of the scale bar [px]
 const NS = "http://www.w3.org/2000/svg";
 
 export class Measures {
@@ -32,13 +32,13 @@ export class Measures {
     }
   }
 
-  /** Says how large a cell of the ground is [m]. */
+  /** Shows the size of a cell of the ground [m]. */
   grid(cell: number): void {
     element("grid-size").textContent = `grid ${lengthText(cell)}`;
     element("measures").hidden = false;
   }
 
-  /** Follows the view: the robot's turn in the room, and the pixels of a metre where it stands. */
+  /** Updates to the view: the robot's rotation in the room, and the pixels per metre at its position. */
   follow(camera: Camera, robot: Object3D, pixelsPerMetre: number): void {
     const turn = camera.getWorldQuaternion(new Quaternion()).invert().multiply(robot.getWorldQuaternion(new Quaternion()));
     AXES.forEach(([, , axis], i) => {
@@ -55,7 +55,7 @@ export class Measures {
   }
 }
 
-/** A length that people read: 5 mm, 2 cm, 1 m. */
+/** A length in a readable unit: 5 mm, 2 cm, 1 m. */
 function lengthText(metres: number): string {
   if (metres < 0.01) return `${Number((1000 * metres).toPrecision(2))} mm`;
   return metres < 1 ? `${Number((100 * metres).toPrecision(2))} cm` : `${Number(metres.toPrecision(2))} m`;

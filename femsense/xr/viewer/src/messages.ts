@@ -11,7 +11,7 @@ export interface Message {
 
 export interface Model {
   name: string;
-  inRobotFrame: boolean; // else that of the markers that it was learnt from
+  inRobotFrame: boolean; // otherwise the frame of the markers of the training data
   glb: string;
   digest: string;
   bones: string[];
@@ -21,8 +21,8 @@ export interface Model {
   cameras: NamedPoint[];
   commands: boolean;
   error: number | null; // of a learnt model, root mean square distance of its markers from measured ones [m]
-  duration: number | null; // of a run that is played over and over [s]
-  field: { name: string; unit: string } | null; // what colours the body
+  duration: number | null; // duration of a repeated run [s]
+  field: { name: string; unit: string } | null; // the field that colours the body
 }
 
 export interface Pose {
@@ -46,11 +46,11 @@ export interface Reach {
   inputs: { name: string; value: number; unit: string }[];
 }
 
-/** Who steers the robot. */
+/** The holder of the lease. */
 export interface Lease {
   client: string; // "": nobody
   number: number;
-  stopped: boolean; // by somebody who pressed stop; who was armed is not any more
+  stopped: boolean; // by a stop of any client, which disarms all
 }
 
 const text = new TextDecoder();
@@ -99,7 +99,7 @@ export function readCloud(payload: Uint8Array): Float32Array | null {
   return payload.byteLength === 20 + 16 * count ? floats(payload, 20, 4 * count) : null;
 }
 
-/** Returns the largest value, and its share at each vertex, 0 … 255. */
+/** Returns the largest value, and the ratio to it at each vertex, 0 … 255. */
 export function readField(payload: Uint8Array): Pick<Field, "largest" | "values"> | null {
   const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
   if (payload.byteLength < 24 || text.decode(payload.subarray(0, 4)) !== "FSV1") return null;
@@ -215,7 +215,7 @@ function vector(value: unknown): Vector | null {
   return a === null || b === null || c === null ? null : [a, b, c];
 }
 
-/** A copy, since floats must stand at multiples of four bytes. */
+/** A copy, since floats must be aligned to four bytes. */
 function floats(payload: Uint8Array, at: number, count: number): Float32Array {
   return new Float32Array(payload.slice(at, at + 4 * count).buffer);
 }

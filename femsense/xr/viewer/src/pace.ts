@@ -1,16 +1,16 @@
-// How many poses a second a source sends.
+// The rate of poses of a source.
 
-const OVER_MS = 2000; // it is counted
-export const COUNT_MS = 100; // between two counts
+const OVER_MS = 2000; // length of the counting window
+export const COUNT_MS = 100; // interval between counts
 
-/** Counts by the numbers of the poses: a page that is busy drawing takes poses late, fewer of them, and in bursts. */
+/** Uses the sequence numbers of the poses: a busy page receives them late, incompletely and in bursts. */
 export class Pace {
-  private newest = { at: -Infinity, seq: 0 }; // when it came [ms of the page], and its number
+  private newest = { at: -Infinity, seq: 0 }; // arrival time [ms of the page], and sequence number
   private readonly counts: { at: number; seq: number }[] = [];
 
-  /** Takes note of a pose. */
+  /** Records a pose. */
   take(at: number, seq: number): void {
-    if (seq < this.newest.seq) this.counts.length = 0; // the source counts anew
+    if (seq < this.newest.seq) this.counts.length = 0; // the source restarted
     this.newest = { at, seq };
   }
 
@@ -20,7 +20,7 @@ export class Pace {
     while (this.counts.length && this.counts[0]!.at < now - OVER_MS) this.counts.shift();
   }
 
-  /** Returns the middle of the slopes between counts (Theil and Sen), so that one that was late moves nothing; null as long as too few are there. */
+  /** Returns the median of the slopes between counts (Theil–Sen), which is robust to late counts; null if there are too few. */
   hz(): number | null {
     const { counts } = this;
     const span = counts.length ? counts[counts.length - 1]!.at - counts[0]!.at : 0;

@@ -1,4 +1,4 @@
-// What colours the body: nothing, motion from rest, stress, or how likely a contact is at each point.
+// Colouring of the body: none, displacement from rest, stress, or the probability density of a contact at each point.
 
 import { BufferAttribute, Color, Vector4, type MeshStandardMaterial, type SkinnedMesh } from "three";
 import type { Contact } from "./data";
@@ -6,15 +6,15 @@ import type { Contact } from "./data";
 export const PAINTS = ["none", "motion", "stress", "contact"] as const;
 export type Paint = (typeof PAINTS)[number];
 
-const CONTACTS = 8; // at once
-const FINEST = 0.004; // of the body's size: a contact that is known better is shown so wide
+const CONTACTS = 8; // maximum number of displayed contacts
+const FINEST = 0.004; // minimum displayed width of a contact, relative to the body's size
 
-/** A quantity at each vertex and frame, 0 … 255 for 0 … largest. */
+/** A field at each vertex and frame, 0 … 255 for 0 … largest. */
 export interface Field {
   name: string;
   unit: string;
   largest: number;
-  values: Uint8Array; // frame after frame
+  values: Uint8Array; // ordered by frame
 }
 
 export class Painter {
@@ -30,7 +30,7 @@ export class Painter {
   /** size: of the body [m]. */
   constructor(private readonly size: number) {}
 
-  /** Lets a material take its colour from here. */
+  /** Connects a material to this colouring. */
   prepare(material: MeshStandardMaterial, skin: SkinnedMesh): void {
     const attribute = new BufferAttribute(new Uint8Array(skin.geometry.getAttribute("position")!.count), 1, true);
     skin.geometry.setAttribute("paintField", attribute);
@@ -51,14 +51,14 @@ export class Painter {
     };
   }
 
-  /** largest: motion that has the full colour [m]. */
+  /** largest: displacement with full saturation [m]. */
   show(paint: Paint, largest: number): void {
     this.paint = paint;
     this.choose();
     this.scale.value = Math.max(largest, 1e-9);
   }
 
-  /** Replaces a share of all colour by another. */
+  /** Blends all colours with another one. */
   fade(share: number, to: number): void {
     this.faded.value = share;
     this.fadedTo.value.set(to);
@@ -86,7 +86,7 @@ export class Painter {
     this.mode.value = this.paint === "stress" && !this.field ? 0 : PAINTS.indexOf(this.paint);
   }
 
-  /** A contact is as likely at a point as its place, known to one standard deviation, and its patch allow. */
+  /** The density of a contact at a point, from the standard deviation of its place and the size of its patch. */
   contacts(contacts: Contact[]): void {
     this.places.value.forEach((place, i) => {
       const contact = contacts[i];

@@ -1,4 +1,4 @@
-// Forces over time: one line for each contact's identity, with one standard deviation as a band.
+// Forces over time: one line per tracked contact, with a band of ± one standard deviation.
 
 import { timeText, type Frame } from "./data";
 
@@ -89,7 +89,7 @@ export class Plot {
   }
 }
 
-/** Returns the stretches of time in which a contact is there. */
+/** Returns the time intervals in which a contact exists. */
 function runsOf(frames: Frame[], track: number): { t: number; n: number; std: number }[][] {
   const runs: { t: number; n: number; std: number }[][] = [];
   let open = false;

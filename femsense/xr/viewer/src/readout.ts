@@ -1,4 +1,4 @@
-// The panel beside the robot: contacts, what drives it, and what is known of the frame.
+// The panel beside the robot: contacts, inputs, and properties of the frame.
 
 import { amount, isDoubtful, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
 import { trackColor } from "./plot";
@@ -57,7 +57,7 @@ function showContact(contact: Contact, row: HTMLElement, largest: number): void 
   part(row, "span", "detail").textContent = place(contact);
 }
 
-/** Where a contact is and how well that is known, in words. */
+/** The place of a contact and its uncertainty, in words. */
 function place(contact: Contact): string {
   const said = [{ cloud: "seen", shape: "from the shape", given: "given" }[contact.source] ?? contact.source];
   if (contact.point_m) said.push(`at ${contact.point_m.map(millimetres).join(", ")}\u00a0mm`);
@@ -86,14 +86,14 @@ function showInput(input: Input, value: number | null, row: HTMLElement): void {
   part(bar, "i").style.width = `${(100 * share).toFixed(1)}%`;
 }
 
-/** Makes as many rows as there are items and fills each; rows that are there are used again, so that nothing flickers. */
+/** Creates one row per item and fills it; existing rows are reused to avoid flicker. */
 function fill<T>(list: Element, items: T[], show: (item: T, row: HTMLElement, index: number) => void, tag = "li"): void {
   while (list.children.length > items.length) list.lastElementChild!.remove();
   while (list.children.length < items.length) list.append(document.createElement(tag));
   items.forEach((item, i) => show(item, list.children[i] as HTMLElement, i));
 }
 
-/** Returns the child of a kind, made where it is missing. */
+/** Returns the child of a kind, created if it is missing. */
 function part(parent: Element, tag: string, name = ""): HTMLElement {
   const found = parent.querySelector<HTMLElement>(`:scope > ${tag}${name ? `.${name}` : ""}`);
   if (found) return found;

@@ -1,4 +1,4 @@
-// A run that was recorded: plays its animation, shows what belongs to each frame.
+// A recorded run: its animation, with the data of each frame.
 
 import { AnimationMixer, type AnimationAction, type Box3 } from "three";
 import { Body, loadMesh } from "./body";
@@ -21,13 +21,13 @@ export async function showRun(stage: Stage): Promise<Player> {
   return player;
 }
 
-/** Draws the sign of the button that plays or pauses. */
+/** Draws the symbol of the play/pause button. */
 export function showPlaying(playing: boolean): void {
   element("play").setAttribute("aria-label", playing ? "Pause" : "Play");
   element("play-icon").setAttribute("d", playing ? PAUSE : PLAY);
 }
 
-/** What is shown at a time, and the time that is shown. */
+/** The displayed data, and the displayed time. */
 class Player {
   readonly duration: number;
   time = 0;
@@ -38,7 +38,7 @@ class Player {
   private readonly times: number[];
   private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
   private shown = -1;
-  private told = -1; // the frame that panel and plot have
+  private told = -1; // the frame of panel and plot
   private field: Field | null = null;
 
   constructor(
@@ -53,7 +53,7 @@ class Player {
     this.duration = clip?.duration ?? 0;
     this.times = Array.from(clip?.tracks[0]?.times ?? [0]);
     const box = this.space();
-    const floor = box.min.y; // of the body; arrows may reach below
+    const floor = box.min.y; // of the body; arrows may extend below
     stage.robot.add(body.group);
     body.arrows.largest = body.arrows.full = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
     for (const frame of run?.frames ?? []) for (const end of body.arrows.ends(frame.contacts)) box.expandByPoint(end);
@@ -62,7 +62,7 @@ class Player {
     const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
     stage.headset.changed = (on) => {
       if (on) stage.headset.alignment = alignWith(stage, this.body, landmarks);
-      else this.seek(this.time); // the page did not follow
+      else this.seek(this.time); // the page was blocked
     };
     new ResizeObserver(() => {
       this.told = -1;
@@ -92,7 +92,7 @@ class Player {
     this.stage.touch();
   }
 
-  /** Brings the clock, the panel and the plot to what is shown. */
+  /** Updates clock, panel and plot. */
   private tell(frames: Frame[]): void {
     this.clock();
     const frame = this.shown === this.told ? undefined : frames[this.shown];
@@ -102,7 +102,7 @@ class Player {
     this.plot.draw(frames, 0, this.duration, frame.time_s);
   }
 
-  /** Goes some frames on or back. */
+  /** Steps some frames forward or back. */
   jump(frames: number): void {
     this.play(false);
     const nearest = this.times.reduce((best, t, i) => (Math.abs(t - this.time) < Math.abs(this.times[best]! - this.time) ? i : best), 0);
@@ -114,7 +114,7 @@ class Player {
     showPlaying(this.playing);
   }
 
-  /** Colours the body; the field that this needs is fetched at its first use. */
+  /** Colours the body; a field is loaded at its first use. */
   async paint(paint: Paint): Promise<void> {
     const told = this.run?.field;
     if (paint === "stress" && told && !this.field) {
@@ -147,7 +147,7 @@ class Player {
     clock.append(` / ${this.duration.toFixed(2)} s`);
   }
 
-  /** Returns the space that the body needs during the run. */
+  /** Returns the bounding box of the body over the run. */
   private space(): Box3 {
     const box = this.body.space();
     const every = Math.max(1, Math.floor(this.times.length / 24));

@@ -1,4 +1,4 @@
-// The room around the robot: light, ground, camera.
+// The scene around the robot: light, ground, camera.
 
 import {
   ACESFilmicToneMapping,
@@ -28,10 +28,10 @@ import { Headset } from "./headset";
 import { Measures } from "./measures";
 
 const FIELD_OF_VIEW = 38; // on a screen [deg]
-const WIDEST = 10; // times as wide as what was in view: what is still farther away is no robot
-const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stands at first
+const WIDEST = 10; // maximum growth of the view: objects farther away are not robots
+const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // initial direction of the camera
 
-/** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
+/** Margins of the image covered by panels and bar [px], as in style.css. */
 function free(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
   const tabs = document.querySelector("#robots:not([hidden])") ? 50 : 0;
   const tall = (id: string): number => document.querySelector<HTMLElement>(`#${id}:not([hidden])`)?.offsetHeight ?? 0;
@@ -49,7 +49,7 @@ export class Stage {
   readonly renderer: WebGLRenderer;
   readonly controls: OrbitControls;
   readonly headset: Headset;
-  /** Everything that belongs to the robot; moves as one onto the table of a headset's room. */
+  /** All objects of the robot; moved as a whole in a headset session. */
   readonly robot = new Group();
   private readonly ground = new Group();
   private readonly sun = new DirectionalLight(0xfff2e0, 2.6);
@@ -57,7 +57,7 @@ export class Stage {
   private box = new Box3();
   private floor = 0; // height of the ground, in glTF's frame [m]
   private readonly measures = new Measures();
-  private moved = false; // by the person who looks
+  private moved = false; // by the user
 
   constructor(private readonly canvas: HTMLCanvasElement) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
@@ -66,7 +66,7 @@ export class Stage {
     this.renderer.toneMappingExposure = 1.05;
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = PCFShadowMap;
-    this.renderer.shadowMap.autoUpdate = false; // in a headset every picture is drawn, and few of them change the shadow
+    this.renderer.shadowMap.autoUpdate = false; // in a headset every image is drawn, and few of them change the shadow
     this.renderer.xr.enabled = true;
     const room = new PMREMGenerator(this.renderer);
     this.scene.environment = room.fromScene(new RoomEnvironment(), 0.04).texture;
@@ -113,12 +113,12 @@ export class Stage {
     this.lookFromStart();
   }
 
-  /** Steps back where something stands outside of what was fitted, unless the person who looks has chosen the view. */
+  /** Zooms out if an object lies outside the fitted view, unless the user has chosen the view. */
   include(box: Box3): void {
     if (this.moved || this.headset.presenting || box.isEmpty() || this.box.containsBox(box)) return;
     const wider = this.box.clone().union(box);
     const size = wider.getSize(new Vector3()).length();
-    if (size < WIDEST * this.box.getSize(new Vector3()).length()) this.fit(wider.expandByScalar(0.03 * size)); // not soon too small again
+    if (size < WIDEST * this.box.getSize(new Vector3()).length()) this.fit(wider.expandByScalar(0.03 * size)); // with a margin, to avoid frequent changes
   }
 
   lookFromStart(): void {
@@ -135,7 +135,7 @@ export class Stage {
     this.touch();
   }
 
-  /** How far away the camera sees the whole box between the panels [m]. */
+  /** Distance at which the camera sees the whole box between the panels [m]. */
   private distance(middle: Vector3): number {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const { left, right, top, bottom } = free(width, height);
@@ -161,7 +161,7 @@ export class Stage {
     this.dirty = true;
   }
 
-  /** Calls step(seconds) before every picture; draws only where something has changed. */
+  /** Calls step(seconds) before every image; draws only after changes. */
   run(step: (seconds: number) => void): void {
     let before = performance.now();
     this.renderer.setAnimationLoop((now: number, frame?: XRFrame) => {
@@ -183,13 +183,13 @@ export class Stage {
     return this.renderer.xr.isPresenting ? 0 : this.canvas.clientHeight;
   }
 
-  /** Pixels of a metre where the view turns about. */
+  /** Pixels per metre at the centre of rotation. */
   private pixelsPerMetre(): number {
     const away = this.camera.position.distanceTo(this.controls.target);
     return this.canvas.clientHeight / (2 * away * Math.tan((this.camera.fov * Math.PI) / 360)) || 1;
   }
 
-  /** What the panels leave free of the picture, which is −1 … 1 wide and high; null in a headset. */
+  /** The part of the image not covered by panels, in coordinates −1 … 1; null in a headset. */
   get room(): Box2 | null {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (this.renderer.xr.isPresenting || !width || !height) return null;
@@ -197,14 +197,14 @@ export class Stage {
     return new Box2(new Vector2((2 * left) / width - 1, (2 * bottom) / height - 1), new Vector2(1 - (2 * right) / width, 1 - (2 * top) / height));
   }
 
-  /** Makes room for panels that come or go. */
+  /** Adapts the view to opened and closed panels. */
   panelsChanged(): void {
     this.resize();
   }
 
-  /** Brings back the view of the screen after a headset had its own. */
+  /** Restores the view of the screen after a headset session. */
   restore(): void {
-    this.camera.fov = FIELD_OF_VIEW; // the session left the headset's
+    this.camera.fov = FIELD_OF_VIEW; // the session leaves that of the headset
     this.camera.zoom = 1;
     this.resize();
     this.fit(this.box);
@@ -244,7 +244,7 @@ export class Stage {
     this.camera.setViewOffset(width, height, (right - left) / 2, (bottom - top) / 2, width, height);
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(width, height, false);
-    if (!this.moved) this.lookFromStart(); // a phone that was turned
+    if (!this.moved) this.lookFromStart(); // a rotated phone
     this.touch();
   }
 }

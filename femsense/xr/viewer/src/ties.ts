@@ -1,13 +1,13 @@
-// Points of the robot that follow its skin: markers that are dragged or touched, and cameras, which stay where they are.
+// Points attached to the skin of the robot: draggable or touchable markers, and cameras, which are fixed.
 
 import { SkinnedMesh, Vector3 } from "three";
 import type { Landmark } from "./alignment";
 import type { Body } from "./body";
 import type { NamedPoint, Vector } from "./data";
 
-/** Ties a point at rest to the vertex that is nearest to it; what lies between turns with the vertex's first bone.
+/** Attaches a point at rest to the nearest vertex; their offset rotates with the vertex's first bone.
  *
- * Returns what tells where the point is now, in the frame of the body's group. point: robot frame [m]. */
+ * Returns a function of its current position, in the frame of the body's group. point: robot frame [m]. */
 export function tie(body: Body, point: Vector): () => Vector3 {
   const at = new Vector3(...point);
   const { vertex, skin, offset } = nearest(body, at);
