@@ -68,8 +68,6 @@ class Shape:
     """How far behind what was seen of it its surface may lie: the thickness of a plate whose other side touches [m]."""
     surface: Surface | None = field(default=None, repr=False)
     """Of a known one, where it stands."""
-    edge_m: float = 0.0
-    """Where its points lie within this of a body's surface, a camera may have seen that body's edge [m]."""
     covariance: FloatArray | None = field(default=None, repr=False)
     """Of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
     seen_by: FloatArray = field(default_factory=lambda: np.ones(1), repr=False)
@@ -166,7 +164,7 @@ def find_shapes(
     *,
     local_m: float,
     fit: Fit | None = None,
-    edge: FloatArray | None = None,
+    is_edge: Callable[[IntArray], bool] | None = None,
     halo: BoolArray | None = None,
     view: IntArray | None = None,
 ) -> list[Shape]:
@@ -179,7 +177,7 @@ def find_shapes(
         near: distance of each from the surface that may be touched [m], shape (o,).
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
         fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
-        edge: how far off the surface a camera may have put points of its edge [m], shape (o,): what lies within that is no object.
+        is_edge: whether points, by their indices, are what a camera shows of the edge of that surface: they are no object.
         halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
         view: camera of each point, shape (o,); one camera if not given.
     """
@@ -194,7 +192,7 @@ def find_shapes(
         close = group[gap <= gap.min() + local_m]
         if (
             len(close) < 3
-            or (edge is not None and is_edge(gap, edge[group]))
+            or (is_edge is not None and is_edge(group))
             or (halo is not None and halo[group].mean() > 1.0 - OUTLIERS)
         ):
             continue
@@ -210,9 +208,9 @@ def find_shapes(
         if _ends(shape, points[close], near[close]):
             end = near[close] <= near[close].min() + 0.5 * local_m
             cap = _completed(fit, points[close[end]], std[close[end]], origins[close[end]], own[end])
-            shape = replace(cap, points=shape.points) if cap.kind == "sphere" else _raw(points[close], std[close])
+            shape = replace(cap, points=shape.points) if cap.kind == "sphere" else shape
         seen_by = np.bincount(view[close], minlength=cameras) / len(close)
-        result.append(replace(shape, seen_by=seen_by, edge_m=0.0 if edge is None else float(np.median(edge[close]))))
+        result.append(replace(shape, seen_by=seen_by))
     return result
 
 
@@ -248,11 +246,6 @@ def same_object(first: Shape, second: Shape) -> bool:
     return apart < 0.5 * extent
 
 
-def is_edge(gap: FloatArray, edge: FloatArray | float) -> bool:
-    """Return whether points that lie so far from a body's surface [m], shape (k,), are what a camera shows of its edge, up to `edge` off [m]."""
-    return bool((np.abs(gap) > edge).mean() < OUTLIERS)
-
-
 def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
     """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
     ray = points - origins
@@ -268,7 +261,7 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
         return _raw(points, std)
     least = min(cost for cost, _ in good)
     order = ("plate", "sphere", "cylinder")
-    allowed = least * (1.0 + SIMPLER * np.sqrt(2.0 / len(points)))
+    allowed = least * (1.0 + SIMPLER * np.sqrt(2.0 / len(points))) + 0.02
     fitting = [(cost, shape) for cost, shape in good if cost <= allowed]
     return _as_well_as_it_fits(*min(fitting, key=lambda fit: order.index(fit[1].kind)), share)
 

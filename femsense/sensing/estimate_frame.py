@@ -27,7 +27,7 @@ from femsense.sensing.places import away_from_scenery, given_touches, object_tou
 from femsense.sensing.proposals import SAME, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
-from femsense.sensing.status import SQUEEZED, checked, stretch_under_contacts
+from femsense.sensing.status import checked
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
@@ -132,10 +132,8 @@ def measurements(rows: Rows) -> int:
 
 
 def _searched(model: Model, best: Fit) -> Fit:
-    """Return the best fit after proposals have stopped to lower J, or where it squeezes the body beyond what law and mesh hold."""
+    """Return the best fit after proposals have stopped to lower J."""
     for _ in range(ROUNDS):
-        if stretch_under_contacts(model, best) < SQUEEZED:
-            break
         best = _with_objects(model, best)
         better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:
@@ -190,7 +188,7 @@ def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
     Their forces are not significant. Left out, they would bias those of their neighbours and make their intervals too narrow. An object whose surface
     lies at the body's becomes a contact with a wide interval, another one a latent force.
     """
-    touching = away_from_scenery(model.sensor, object_touches(model.sensor, list(best.frame.objects), best.state))
+    touching = away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.scan, best.frame.objects, best.state))
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
@@ -283,7 +281,7 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
     ):
         return None
     start = _expected(frame.predicted, previous)
-    seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(frame.objects), start))
+    seen = away_from_scenery(model.sensor, object_touches(model.sensor, frame.scan, frame.objects, start))
     kept = [i for i, contact in enumerate(previous.touches) if not contact.undetermined]
     if not kept:
         return None
@@ -296,7 +294,9 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
 
 
 def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
-    """Return a contact of the previous frame at the object that is seen to touch near it now; inferred where none is."""
+    """Return a contact of the previous frame at its object, or at one that is seen to touch near it now; inferred where none is."""
+    if own := next((one for one in seen if contact.source == "cloud" and is_with(contact, one.shape)), None):
+        return own
     distance = [float(np.linalg.norm(one.place - contact.place)) for one in seen] if contact.source == "cloud" else []
     if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * seen[int(np.argmin(distance))].std_m):
         return seen[int(np.argmin(distance))]

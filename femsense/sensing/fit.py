@@ -33,8 +33,8 @@ SWAYING = 0.1
 """The same of a hanging weight, across gravity: a thread that is not quite plumb."""
 TAU = (0.02, 5.0)
 """Bounds of the prior scale of a force [N]."""
-FIRST_TAU = 0.3
-"""Prior scale of a force that is not known yet [N]."""
+FIRST_TAU, GIVEN_TAU = 0.3, 2.0
+"""Prior scale of a force that is not known yet [N], and at a given place, where the data may not determine it."""
 CATCH = 3.0
 """κ at the start at most where colour does not separate the robot."""
 SIZINGS, SETTLED = 8, 0.02
@@ -101,7 +101,8 @@ def fit(
         linear = linearised if near and linearised is not None else model.linearised(state)
     except FemsenseError:  # unstable there
         return None
-    here = _point(model, frame, contacts, forces, np.full(m, FIRST_TAU) if tau is None else np.array(tau), state, linear)
+    scales = [GIVEN_TAU if contact.source == "given" else FIRST_TAU for contact in contacts] if tau is None else tau
+    here = _point(model, frame, contacts, forces, np.array(scales, dtype=np.float64), state, linear)
     eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
@@ -264,7 +265,8 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
     """Return the Gauss–Newton step from a point.
 
     τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
-    expected under the posterior (MacKay 1992).
+    expected under the posterior (MacKay 1992), or that of the first where it is larger: a force along the surface that is known to be small does not
+    tell how hard it presses.
     """
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
@@ -280,7 +282,8 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
         for i, contact in enumerate(here.contacts):
             f = slice(5 * i, 5 * i + 3)
             if not contact.undetermined:
-                tau[i] = np.clip(tau[i] * np.sqrt((u[f] @ u[f] + np.trace(inverse[f, f])) / 3.0), *TAU)
+                square = u[f] ** 2 + np.diag(inverse)[f]
+                tau[i] = np.clip(tau[i] * np.sqrt(max(square[0], square.mean())), *TAU)
         if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
             break
     change = u - np.append(at, eta)

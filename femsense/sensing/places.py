@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
-from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape, is_edge
+from femsense.pointcloud.primitives import FEWEST, OUTLIERS, Shape, find_shapes, fit_ball, fit_shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
@@ -76,7 +76,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
     points, gap, view = points[near], gap[near], scan.others_view[near]
     origins = np.array([T[:3, 3] for T in poses])[view]
     std = sensor.knowledge.depth_std(np.linalg.norm(points - origins, axis=1), view)
-    edge, halo = _edge_of(sensor, scan, body, points, gap, origins, view)
+    edges = _edges(sensor, scan, state, body, points, gap, origins, view)
     tools = sensor.recording.tools
     whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
     return find_shapes(
@@ -86,31 +86,82 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
         gap,
         local_m=np.inf if whole else LOCAL * sensor.size,
         fit=partial(fit_tool, tools) if tools else partial(fit_again, seen),
-        edge=edge + 3.0 * std,
-        halo=halo,
+        is_edge=edges.consist_of,
+        halo=edges.halo,
         view=view,
     )
 
 
-def _edge_of(
-    sensor: Sensor, scan: Scan, body: Surface, points: FloatArray, gap: FloatArray, origins: FloatArray, view: IntArray
-) -> tuple[FloatArray, BoolArray]:
-    """Return how far beside the body a camera may show points of its edge [m], shape (o,), and which points are a stereo camera's halo, shape (o,).
+@dataclass(frozen=True, eq=False, slots=True)
+class Edges:
+    """How points lie to the edges of a body that cameras see, where depth is mixed."""
+
+    close: BoolArray
+    """Whether a point lies within what a camera may add to an edge, shape (o,)."""
+    halo: BoolArray
+    """Whether stereo matching may have added it around the silhouette, shape (o,)."""
+    passes: FloatArray
+    """How far its ray passes the body [m], 0 where it meets a face, shape (o,)."""
+    behind: FloatArray
+    """How far behind the point that is [m], shape (o,)."""
+    std: FloatArray
+    """Of each point along its ray, times √T: neighbours err together [m], shape (o,)."""
+    model: float
+    """Error of the model's surface [m]."""
+
+    def consist_of(self, group: IntArray) -> bool:
+        """Return whether points may be of the body's own edge: all lie close to its surface, and not in front of its faces by more than their mean errs."""
+        met = group[self.passes[group] == 0.0]
+        if len(met) > 0.5 * len(group):
+            noise = float(np.median(self.std[met])) / np.sqrt(len(met))
+            if float(np.median(self.behind[met])) > 3.0 * np.hypot(noise, self.model):
+                return False
+        return bool(self.close[group].mean() > 1.0 - OUTLIERS)
+
+
+def _edges(
+    sensor: Sensor,
+    scan: Scan,
+    state: Equilibrium,
+    body: Surface,
+    points: FloatArray,
+    gap: FloatArray,
+    origins: FloatArray,
+    view: IntArray,
+) -> Edges:
+    """Return how points at some gaps from the body (o,) [m] lie to its edges.
 
     A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely. What lies in front of
     the body by as much is none.
     """
-    cameras, noises = sensor.recording.cameras, sensor.knowledge.noises
-    pixel = np.array([pixel_of(scan, v) if camera is None else 1.0 / camera.fx for v, camera in enumerate(cameras)])
+    known, noises = sensor.knowledge, sensor.knowledge.noises
+    pixel = np.array([_pixel_of(sensor, scan, v) for v in range(len(noises))])
     depth = np.linalg.norm(points - origins, axis=1)
-    edge = np.asarray(BLEEDING * pixel[view] * depth)
-    matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (sensor.knowledge.together > WINDOWED)
-    halo, asked = np.zeros(len(points), dtype=np.bool_), np.flatnonzero(matched)
-    beside, behind = body.beside_rays(points[asked], origins[asked])
-    edge_asked = edge[asked]
-    passes = (gap[asked] < edge_asked) | ((beside > 0.0) & (beside < edge_asked))
-    halo[asked] = passes & (behind < edge_asked)
-    return edge, halo
+    std, width = known.depth_std(depth, view), BLEEDING * pixel[view] * depth
+    matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (known.together > WINDOWED)
+    close = np.abs(gap) < width + 3.0 * std
+    asked = np.flatnonzero(matched | close)
+    passes, behind = np.full(len(points), np.inf), np.zeros(len(points))
+    passes[asked], behind[asked] = body.beside_rays(points[asked], origins[asked])
+    halo = matched & (behind < width) & ((gap < width) | ((passes > 0.0) & (passes < width)))
+    way = float(np.linalg.norm(state.positions - sensor.robot.body.mesh.nodes, axis=1).max())
+    model = float(np.hypot(known.bias_m, known.model_share * way))
+    return Edges(close, halo, passes, behind, np.sqrt(known.together) * std, model)
+
+
+def _pixel_of(sensor: Sensor, scan: Scan, view: int) -> float:
+    """Return the angle between neighbouring rays of a camera [rad]."""
+    camera = sensor.recording.cameras[view]
+    return pixel_of(scan, view) if camera is None else 1.0 / camera.fx
+
+
+def _is_edge(sensor: Sensor, scan: Scan, state: Equilibrium, body: Surface, shape: Shape) -> bool:
+    """Return whether the points of an object may be what a camera shows of the body's own edge in a state."""
+    points = shape.points[:: max(1, len(shape.points) // ASKED)]
+    view = np.full(len(points), int(np.argmax(shape.seen_by)))
+    origins = sensor.calibration.poses[view[0]][:3, 3] + np.zeros((len(points), 1))
+    edges = _edges(sensor, scan, state, body, points, body.gap(points), origins, view)
+    return edges.consist_of(np.arange(len(points)))
 
 
 def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
@@ -152,20 +203,15 @@ def _fit_of(tool: Tool, points: FloatArray, std: FloatArray, origins: FloatArray
     return register(known, points, std, origins)
 
 
-def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> list[Touch]:
+def object_touches(sensor: Sensor, scan: Scan | None, shapes: Sequence[Shape], state: Equilibrium) -> list[Touch]:
     """Return where completed objects touch a state, the nearest part of each.
 
     A force may have moved the body to where points of its own, at an edge or in a dark crease, were taken for an object.
     """
     body = Surface(state.positions, sensor.surface.triangles)
-    others = [shape for shape in shapes if shape.edge_m == 0.0 or not is_edge(body.gap(_some(shape.points)), shape.edge_m)]
+    others = [shape for shape in shapes if scan is None or not _is_edge(sensor, scan, state, body, shape)]
     found = [_touch(sensor, shape, state) for shape in others]
     return [touch for touch in found if touch is not None]
-
-
-def _some(points: FloatArray) -> FloatArray:
-    """Return about ASKED of many points."""
-    return points[:: max(1, len(points) // ASKED)]
 
 
 def away_from_scenery(sensor: Sensor, touches: Sequence[Touch]) -> list[Touch]:

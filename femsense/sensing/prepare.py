@@ -186,6 +186,6 @@ def _with_scenery(sensor: Sensor) -> Sensor:
             continue
         corners = state.positions[sensor.surface.nodes]
         inside = [one for one in shapes if one.kind != "points" and one.towards(corners).distance(corners).min() < 0.0]
-        touching = np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
+        touching = np.array([touch.place for touch in object_touches(sensor, scan, shapes, state)]).reshape(-1, 3)
         return replace(sensor, scenery=touching, overlapping=tuple(inside))
     return sensor

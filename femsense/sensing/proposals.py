@@ -47,7 +47,7 @@ class Proposal:
 def proposals(model: Model, best: Fit) -> list[Proposal]:
     """Return hypotheses next to the best one so far, the most promising first."""
     near = vicinity(model, best)
-    seen = away_from_scenery(model.sensor, object_touches(model.sensor, list(best.frame.objects), best.state))
+    seen = away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.scan, best.frame.objects, best.state))
     found = [*_dropped(best), *_at_objects(near, seen), *_at_candidates(near)]
     return sorted(found, key=lambda one: -one.gain)
 
