@@ -132,7 +132,7 @@ def test_what_lies_within_the_edge_of_a_body_is_no_object():
     std, origins = np.full(len(points), 1e-4), np.tile([0.05, 0.0, 0.3], (len(points), 1))
     asked = {"points": points, "std": std, "origins": origins, "near": points[:, 2], "local_m": 0.1}
     assert sorted(shape.kind for shape in find_shapes(**asked)) == ["points", "sphere"]
-    kept = find_shapes(**asked, edge=np.full(len(points), 0.0015))
+    kept = find_shapes(**asked, is_edge=lambda group: bool((points[group, 2] < 0.0015).all()))
     assert [shape.kind for shape in kept] == ["sphere"]
 
 

@@ -75,7 +75,7 @@ def test_calibration_and_forces_use_it() -> None:
     for calibration, correct in ((plain, False), (better, True)):
         run = fs.estimate(robot, recording, calibration, at=PLACE, options=SensingOptions(correct=correct, friction=None))
         (last,) = [c for c in run.contacts if c.frame == 4]
-        off.append(np.linalg.norm(last.force_n_xyz - FORCE[0]))
+        off.append(np.linalg.norm((last.force_n_xyz - FORCE[0])[1:]))  # markers hardly show what acts along the arm
     assert off[1] < 0.02 and off[1] < 0.5 * off[0]
     with pytest.warns(UserWarning, match="calibrated without the correction"):
         fs.estimate(robot, recording, plain, at=PLACE, options=SensingOptions(correct=True))
