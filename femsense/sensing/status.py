@@ -35,7 +35,7 @@ class Status(Enum):
 
     OK = "ok"
     NOT_CONVERGED = "not converged: the forces still changed after the last step"
-    SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: use a finer mesh or the effect hyperelastic"
+    SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: its force may be far off"
     NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.2f} times what contact-free frames let expect"
     NOT_EXPLAINED_MARKERS = "not explained: the markers are off by {times:.1f} standard deviations"
     LARGE_ERROR_FIELD = (

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import T_ROBOT_CAMERA, arm, record
+from touched_arm import touched
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.pose import invert_pose, moved_poses, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
-from femsense.io.clouds.cloud_files import write_cloud
+from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
@@ -72,3 +73,16 @@ def test_what_clouds_leave_does_not_judge_frames_with_markers_alone(tmp_path):
     ).reshape(-1, 1)
     run = estimate(robot, replace(recording, marker_xyz=shaken), calibrate(robot, recording))
     assert [frame.status for frame in run.frames] == ["ok"] * 5
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05])
+def test_mixed_pixels_are_counted_on_their_side(tmp_path: Path, share: float):
+    """Some points lie 3 mm, or ten standard deviations, behind the face that they should show, as at edges of depth."""
+    recording, rng = touched(tmp_path, np.zeros(3), ball=False), np.random.default_rng(4)
+    for (file,) in recording.cloud_files:
+        assert file is not None
+        cloud = read_cloud(file)
+        away = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
+        write_cloud(file, replace(cloud, points=cloud.points + 3e-3 * away * (rng.random((len(away), 1)) < share)))
+    model = learn(make_sensor(arm(), recording, calibrate(arm(), recording)))
+    assert model.stray[0] < 3.0 and (model.stray[1] > 30.0) == (share > 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ from scipy.spatial import cKDTree
 from touched_arm import touched
 
 from femsense.calib.calibrate import calibrate
+from femsense.core.pose import invert_pose, transform_points
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import sense
-from femsense.sensing.places import object_touches
+from femsense.sensing.places import object_touches, objects_near
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.touches import contact_radius, make_touch, pressed
 from femsense.sensing.types import SensedFrame, Sensor
@@ -69,3 +71,27 @@ def test_a_patch_is_as_wide_as_hertz_has_it(pushed: tuple[Sensor, SensedFrame]) 
     square = wide.patch.weights @ ((nodes[wide.patch.nodes] - middle) ** 2).sum(axis=1)
     assert square == pytest.approx(0.4 * a**2, rel=0.15)
     assert pressed(sensor, wide, np.array([0.0, 0.0, -41.0])) is wide
+
+
+def test_what_stereo_adds_beside_the_silhouette_is_no_object_and_what_lies_in_front_of_it_is(pushed: tuple[Sensor, SensedFrame]):
+    """A ball that hovers 12 mm in front of the arm's edge, and points of the same rays at the depth of that edge."""
+    sensor, frame = pushed
+    known = sensor.knowledge
+    noises = tuple(replace(one, kind="stereo") for one in known.noises)
+    stereo = replace(sensor, knowledge=replace(known, noises=noises, together=6.0))
+    scan, body, camera = scan_of(sensor, 3, frame.state), frame.free_state, sensor.calibration.poses[0]
+    assert scan is not None
+    scan = replace(scan, camera_points=scan.camera_points[::16], view=scan.view[::16])  # a coarse camera: its halo is wide
+    edge = body.positions[np.argmax(body.positions[:, 1] - np.abs(body.positions[:, 0] - 0.06))]
+    towards = (camera[:3, 3] - edge) / np.linalg.norm(camera[:3, 3] - edge)
+    out = np.random.default_rng(1).normal(size=(3000, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    ball = edge + 0.012 * towards + [0.0, 0.0025, 0.0] + 0.002 * out[out @ towards > 0.2]
+    rays = (ball - camera[:3, 3]) / np.linalg.norm(ball - camera[:3, 3], axis=1, keepdims=True)
+    strip = camera[:3, 3] + np.linalg.norm(edge - camera[:3, 3]) * rays
+    strip = strip[(strip[:, 1] > edge[1] + 1e-4) & (strip[:, 1] < edge[1] + 2e-3)]
+    assert len(strip) > 12
+    for points, kinds in ((ball, ["sphere"]), (strip, [])):
+        others = transform_points(invert_pose(camera), points)
+        seen = replace(scan, others=others, others_view=np.zeros(len(others), dtype=np.int64))
+        assert [shape.kind for shape in objects_near(stereo, seen, body)] == kinds
