@@ -265,8 +265,8 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
     """Return the Gauss–Newton step from a point.
 
     τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
-    expected under the posterior (MacKay 1992), or that of the first where it is larger: a force along the surface that is known to be small does not
-    tell how hard it presses.
+    expected under the posterior (MacKay 1992). At given places, which need no evidence, it is that of the normal force where that is larger: of two fingers
+    that squeeze a body, small forces along the surface do not tell how hard they press.
     """
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
@@ -283,7 +283,8 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
             f = slice(5 * i, 5 * i + 3)
             if not contact.undetermined:
                 square = u[f] ** 2 + np.diag(inverse)[f]
-                tau[i] = np.clip(tau[i] * np.sqrt(max(square[0], square.mean())), *TAU)
+                normal = square[0] if contact.source == "given" else 0.0
+                tau[i] = np.clip(tau[i] * np.sqrt(max(normal, square.mean())), *TAU)
         if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
             break
     change = u - np.append(at, eta)
