@@ -5,7 +5,7 @@
 | visible, at a seen object | 1 : 10 | one in ten objects near the body touches it; times the density of its gap (`no_penetration`) |
 | … whose pixels make no shape | 1 : 10 more | a scrap of the scene, or what a camera adds around a silhouette |
 | inferred | 1 : 1000 | one frame in 1000 has one; contact-free frames of the same recording lower the odds |
-| … where the surface is in sight | 1 : 10 more | its object or thread would be seen, or hide the surface |
+| … that pushes where the surface is in sight | 1 : 10 more | its object would be seen, or hide the surface |
 | … that hangs | 1 : 10 more | a thread or a thin hook, along gravity |
 """
 
@@ -39,7 +39,9 @@ def odds_of(model: Model, contact: Touch, rows: Rows) -> float:
     if contact.source == "cloud":
         unresolved = contact.shape is None or contact.shape.kind == "points"
         return VISIBLE + UNRESOLVED * unresolved + gap_odds(model, contact)
-    return model.inferred_odds + HANGING * contact.pulls + IN_SIGHT * float(in_sight(model, rows, contact.place[None])[0])
+    if contact.pulls:
+        return model.inferred_odds + HANGING
+    return model.inferred_odds + IN_SIGHT * float(in_sight(model, rows, contact.place[None])[0])
 
 
 def in_sight(model: Model, rows: Rows, places: FloatArray) -> BoolArray:

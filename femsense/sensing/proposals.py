@@ -275,7 +275,7 @@ def _inferred(
     c = len(at.normals)
     axes = axes_of(np.broadcast_to(model.upward, (c, 3)) if pulls else at.normals)
     gains, forces = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
-    gains = gains - model.inferred_odds - HANGING * pulls - IN_SIGHT * at.seen
+    gains = gains - model.inferred_odds - (HANGING if pulls else IN_SIGHT * at.seen)
     if not np.isfinite(gains).any():
         return -np.inf, []
     top = float(gains.max())
