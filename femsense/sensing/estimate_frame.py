@@ -308,12 +308,12 @@ def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
 
 def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: SensedFrame | None) -> Fit:
     """Return the fit with forces at the given places, whatever its evidence."""
-    forces, start, tau = np.zeros((len(given), 3)), frame.predicted, None
+    forces, start = np.zeros((len(given), 3)), frame.predicted
     if previous is not None and len(previous.touches) == len(given):
-        forces, start, tau = previous.forces, _expected(frame.predicted, previous), previous.tau
-    tried = [fit(model, frame, given, forces, start, tau=tau)]
+        forces, start = previous.forces, _expected(frame.predicted, previous)
+    tried = [fit(model, frame, given, forces, start)]
     if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
-        tried.append(fit(model, frame, given, forces, start, tau=tau, catch=np.inf))
+        tried.append(fit(model, frame, given, forces, start, catch=np.inf))
         if (near := tried[-1]) is not None:  # the noise is widened anew from where that ends
             tried.append(fit(model, frame, near.contacts, near.forces, near.state, tau=near.tau, catch=np.inf))
     found = [one for one in tried if one is not None]

@@ -37,6 +37,8 @@ FIRST_TAU, GIVEN_TAU = 0.3, 2.0
 """Prior scale of a force that is not known yet [N], and at a given place, where the data may not determine it."""
 CATCH = 3.0
 """κ at the start at most where colour does not separate the robot."""
+TOLD = 0.1
+"""Data determine a force at a given place where they leave less than this share of its prior variance."""
 SIZINGS, SETTLED = 8, 0.02
 """Updates of τ in one linear problem at most, and the relative change below which one is the last."""
 STEPS, LENGTHS = 25, (1.0, 0.3, 0.1, 0.03)
@@ -265,8 +267,8 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
     """Return the Gauss–Newton step from a point.
 
     τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
-    expected under the posterior (MacKay 1992). At given places, which need no evidence, it is that of the normal force where that is larger: of two fingers
-    that squeeze a body, small forces along the surface do not tell how hard they press.
+    expected under the posterior (MacKay 1992). At given places, which need no evidence, it stays where the data do not determine the normal force: of two
+    fingers that squeeze a body they tell the difference, and the smallest τ would call both forces zero.
     """
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
@@ -281,10 +283,9 @@ def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Widt
         last = tau.copy()
         for i, contact in enumerate(here.contacts):
             f = slice(5 * i, 5 * i + 3)
-            if not contact.undetermined:
-                square = u[f] ** 2 + np.diag(inverse)[f]
-                normal = square[0] if contact.source == "given" else 0.0
-                tau[i] = np.clip(tau[i] * np.sqrt(max(normal, square.mean())), *TAU)
+            left = np.diag(inverse)[f]
+            if not contact.undetermined and (contact.source != "given" or left[0] < TOLD):
+                tau[i] = np.clip(tau[i] * np.sqrt((u[f] ** 2 + left).mean()), *TAU)
         if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
             break
     change = u - np.append(at, eta)
