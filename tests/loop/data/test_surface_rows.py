@@ -238,9 +238,9 @@ def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording)
         hypothesis, prior = with_nuisance(data)
         nothing, own = np.zeros(len(prior.mean)), np.r_[off, np.zeros(data.train[0].size - 6)]
         start = fit_model(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
-        data = rematched(data, start, noise, anew=True)  # rows as they are found from there
+        data = rematched(data, start, noise, reselect=True)  # rows as they are found from there
         data = replace(data, effort=replace(EFFORT, matchings=rounds))
-        found, fitted = matched(data, start, noise, anew=True)
+        found, fitted = matched(data, start, noise, reselect=True)
         again = fit_model(rematched(found, fitted, noise), hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
         return again.fit.fit.cost[0] - again.fit.chi2
 
