@@ -208,7 +208,8 @@ def find_shapes(
         if _ends(shape, points[close], near[close]):
             end = near[close] <= near[close].min() + 0.5 * local_m
             cap = _completed(fit, points[close[end]], std[close[end]], origins[close[end]], own[end])
-            shape = replace(cap, points=shape.points) if cap.kind == "sphere" else shape
+            if cap.kind == "sphere":
+                shape = replace(cap, points=shape.points)
         seen_by = np.bincount(view[close], minlength=cameras) / len(close)
         result.append(replace(shape, seen_by=seen_by))
     return result
@@ -230,7 +231,7 @@ def _ends(shape: Shape, points: FloatArray, near: FloatArray) -> bool:
     """Return whether the part of an object that is nearest to a body is its end, of another form than the rest: the tip of a finger or of a rod, the
     ball on a stick. points, near: as for `find_shapes`."""
     if shape.kind == "points":
-        return shape.surface is None and len(points) >= FEWEST
+        return len(points) >= FEWEST
     if shape.kind != "cylinder":
         return False
     nearest = points[near <= np.quantile(near, NEAREST)].mean(axis=0)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Several(Enum):
-    """How a command takes several of what it works on."""
+    """How a command handles several inputs."""
 
     EACH = "each"
     """Each is a job."""

@@ -142,7 +142,7 @@ def inspect_cad(file: Path, report: Report, problems: Problems) -> None:
 
 
 def inspect_unknown(path: Path, report: Report, problems: Problems) -> None:
-    """Report a file of no known kind, or a folder by what it holds."""
+    """Report a file of an unknown kind, or the contents of a folder."""
     if path.is_dir():
         _inspect_folder(path, report, problems)
         return

@@ -1,4 +1,4 @@
-"""What a person says about a source of another program, in Python and on the command line."""
+"""Options of a source of another program, in Python and on the command line."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class Zero(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class InputOptions:
-    """What a person says about the inputs of a recording."""
+    """Options of the inputs of a recording."""
 
     inputs: Annotated[Inputs | None, Flag("--inputs", help="What the cables' values are.")] = None
-    """None: as the source says."""
+    """None: as declared by the source."""
     zero: Annotated[Zero | None, Flag("--zero", help="What they count from.")] = None
     actuation: Annotated[Path | None, Flag("--actuation", "FILE", "A CSV file with the inputs over time.")] = None
     offset: Annotated[float | None, Flag("--offset", "S", "The frames' time minus that file's; else from motion.")] = None
@@ -100,7 +100,7 @@ def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Options:
-    """What a person says about a source; empty where nothing was said."""
+    """Options of a source; the defaults leave all to the file."""
 
     format: Annotated[str | None, Flag("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None
     topics: Annotated[Sequence[str], Flag("--topic", "NAME", "What to take, where there is a choice.", read=tuple)] = ()
