@@ -155,12 +155,20 @@ def _print(answer: Answer, as_json: bool, notes: list[str]) -> int:
         from femsense.io.files import json_text
 
         document = answer.document if "warnings" in answer.document else {**answer.document, "warnings": notes}
-        typer.echo(json_text(document))
+        text = json_text(document)
     else:
-        typer.echo(answer.text)
-    if answer.then is not None:
-        sys.stdout.flush()
-        answer.then()
+        text = answer.text
+    if answer.then is None:
+        typer.echo(text)
+        return answer.exit_status
+    # Whoever reads the address may end the command at once, before it waits: that is its normal end, too.
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            typer.echo(text)
+            sys.stdout.flush()
+            answer.then.wait()
+    finally:
+        answer.then.end()
     return answer.exit_status
 
 

@@ -99,15 +99,16 @@ def sense_live(
         )
         holder.append(session)
         undo.callback(session.close)
-        if url:
-            say(url)
-            on_url(url)
         stop = Event()
         undo.callback(stop.set)
         Thread(target=_tell, args=(session, outlet, brokers, options.seconds, stop, url), daemon=True).start()
         keys = {"t": session.tare, "q": session.stop}
-        with shown(session.snapshot, lambda key: keys[key](), say, url), contextlib.suppress(KeyboardInterrupt):
-            session.run()
+        with contextlib.suppress(KeyboardInterrupt):  # from the address on, Ctrl-C is the normal end
+            if url:
+                say(url)
+                on_url(url)
+            with shown(session.snapshot, lambda key: keys[key](), say, url):
+                session.run()
         session.close()
         stop.set()
         if outlet is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,15 @@ class ManyJobs:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Served:
+    """What a command serves until it ends by itself or by Ctrl-C."""
+
+    wait: Callable[[], None]
+    end: Callable[[], None]
+    """Called at the end, however it came."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Answer:
     """The answer of a command."""
 
@@ -45,8 +54,8 @@ class Answer:
     text: str
     """For people."""
     exit_status: int = 0
-    then: Callable[[], None] | None = field(default=None)
-    """Called after the answer was printed; runs until Ctrl-C."""
+    then: Served | None = None
+    """What goes on after the answer was printed."""
     many: ManyJobs | None = None
     """Jobs whose outcomes replace this answer."""
 

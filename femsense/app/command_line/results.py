@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from femsense.app.command_line.adapter import command
-from femsense.app.command_line.answer import Answer, say
+from femsense.app.command_line.answer import Answer, Served, say
 from femsense.app.command_line.parameters import RunPath, argument, option, run_of
 from femsense.app.command_line.several import Several
 from femsense.app.stream_options import StreamOptions, is_encrypted, need_model, need_one, need_stream, need_with
@@ -105,12 +104,11 @@ def view(
         return Answer({"page": str(page)}, f"written: {page}")
     server = serve(run, port=port, open_browser=browser)
 
-    def wait() -> None:
-        with contextlib.suppress(KeyboardInterrupt), server:
-            server.wait()
+    def end() -> None:
+        server.stop()
         say("the page is closed")
 
-    return Answer({"url": server.url}, f"{server.url}\nCtrl-C ends it", then=wait)
+    return Answer({"url": server.url}, f"{server.url}\nCtrl-C ends it", then=Served(server.wait, end))
 
 
 @command()
@@ -169,12 +167,11 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
         webbrowser.open(live.url)
 
-    def wait() -> None:
-        with contextlib.suppress(KeyboardInterrupt), live:
-            live.wait(say)
+    def end() -> None:
+        live.close()
         say(live.streamed.text if live.publishers else "the page is closed")
 
-    return Answer(stream_document(live), stream_text(live), then=wait)
+    return Answer(stream_document(live), stream_text(live), then=Served(lambda: live.wait(say), end))
 
 
 @command(Several.EACH)
