@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.pointcloud.objects import euclidean_clusters
 from femsense.pointcloud.rays import Surface
-from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
+from femsense.pointcloud.round_fits import BALL, CYLINDER, ROUND_END, SPHERE, fit_round
 
 LONGER = {"cylinder": (True, False, False), "plate": (True, True, False)}
 """Along which of its axes a shape may go on beyond what was seen of it."""
@@ -37,6 +37,8 @@ FIT_STEPS = 25
 """Steps of a fit at most."""
 NEAREST, END = 0.1, 0.5
 """A rod meets a body with its end where this share of its points, the nearest, lie within so many radii of that end."""
+ROD = 3.0
+"""How much farther than for other shapes the points of a rod count, for the direction of its axis."""
 MOST_POINTS = 400
 """More points than this are thinned out: the shape of an object is known well enough."""
 FEWEST = 12
@@ -197,6 +199,7 @@ def find_shapes(
         ):
             continue
         own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
+        own_group = group if halo is None else group[~halo[group]]
         shape = _completed(fit, points[close], std[close], origins[close], own)
         # the other end of a rod that passes behind, the table in pieces
         more = [g for g in left if shape.holds(points[g], std[g])]
@@ -205,7 +208,10 @@ def find_shapes(
             close = np.concatenate([close, *more])
             own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
             shape = _completed(fit, points[close], std[close], origins[close], own)
-        if _ends(shape, points[close], near[close]):
+        rod = _round_end(points[own_group], std[own_group], origins[own_group], near[own_group], ROD * local_m)
+        if rod is not None:
+            shape = replace(rod, points=shape.points)
+        elif _ends(shape, points[close], near[close]):
             end = near[close] <= near[close].min() + 0.5 * local_m
             cap = _completed(fit, points[close[end]], std[close[end]], origins[close[end]], own[end])
             if cap.kind == "sphere":
@@ -351,6 +357,58 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     middle = center + 0.5 * (low + high) * axis
     shape = Shape("cylinder", middle, axes, half, size, _spread(curve, 2), points, covariance=covariance)
     return typical_square(residual), shape
+
+
+def _round_end(points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, reach_m: float) -> Shape | None:
+    """Return the half ball at the end of a rod that meets a body with it, as a sphere: a fingertip, a rounded stick. None where the points are of no such
+    rod, or do not tell where it ends.
+
+    The half ball alone is seen in part, next to a body and its silhouette; the side of the rod gives its radius and its axis.
+
+    Arguments:
+        points, std, origins, near: as for `find_shapes`, of one object.
+        reach_m: how much of it counts: points up to so far beyond its nearest one [m].
+    """
+    if len(points) < 2 * FEWEST or not np.isfinite(reach_m):
+        return None
+    within = np.flatnonzero(near <= near.min() + reach_m)
+    within = within[:: max(1, len(within) // MOST_POINTS)]
+    points, std, near = points[within], std[within], near[within]
+    ray = points - origins[within]
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    middle, look = points.mean(axis=0), ray.mean(axis=0)
+    frame = np.linalg.svd(points - middle, full_matrices=False)[2]
+    nearest = points[near <= np.quantile(near, NEAREST)].mean(axis=0)
+    frame = frame * np.array([[np.sign((nearest - middle) @ frame[0])], [1.0], [1.0]])
+    last = float(((points - middle) @ frame[0]).max())
+    tried = []
+    for r in (0.003, 0.01):
+        start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0, last - r])
+        tried.append(fit_round(ROUND_END, points, std, ray, start, steps=FIT_STEPS, frame=frame, middle=middle))
+    x, curve, residual, _ = min(tried, key=lambda fit: fit[3])
+    axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
+    axis = axis / np.linalg.norm(axis)
+    center, size = middle + x[0] * frame[1] + x[1] * frame[2] + x[5] * axis, float(np.exp(x[2]))
+    along = (points - center) @ axis
+    away = points - center - np.outer(np.minimum(along, 0.0), axis)
+    covariance = np.linalg.pinv(curve)
+    cost = typical_square(residual)
+    if (
+        size > LARGEST
+        or cost > FITS
+        or float(np.mean(np.einsum("pc,pc->p", away, ray) < 0)) < 0.7
+        or (nearest - center) @ axis < -END * size
+        or float(along.min()) > -size
+        or covariance[5, 5] > (END * size) ** 2
+    ):
+        return None
+    by = np.zeros((4, 6))
+    by[:3, :2], by[3, 2] = frame[1:].T, size
+    by[:3, 3], by[:3, 4], by[:3, 5] = x[5] * frame[1], x[5] * frame[2], axis
+    shape = Shape(
+        "sphere", center, np.eye(3), np.full(3, size), size, _spread(curve, 2), points, covariance=by @ covariance @ by.T
+    )
+    return _as_well_as_it_fits(cost, shape, 1.0)
 
 
 def least_squares(

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Spheres and cylinders fitted to noisy points: compiled.
+"""Spheres, cylinders and round ends of rods fitted to noisy points: compiled.
 
 A robust fit (Huber's function, Levenberg's damping) of the distances of points from the surface, over their noise along the ray.
 """
@@ -11,8 +11,9 @@ import numpy as np
 from femsense.core.arrays import FloatArray, read_only
 from femsense.core.kernels import njit
 
-SPHERE, BALL, CYLINDER = 0, 1, 2
-"""A sphere: centre, log radius. A ball of known radius: centre. A cylinder: two shifts across the first axis of its frame, log radius, two tilts."""
+SPHERE, BALL, CYLINDER, ROUND_END = 0, 1, 2, 3
+"""A sphere: centre, log radius. A ball of known radius: centre. A cylinder: two shifts across the first axis of its frame, log radius, two tilts. A rod
+with a round end: those of a cylinder, and where along the first axis the centre of the half ball at its end is."""
 CUT = 2.0
 """Whitened residuals beyond this count linearly."""
 GRAZING = 0.2
@@ -34,14 +35,14 @@ def fit_round(
     """Return parameters, their curvature, the whitened residual (k,), and its Huber function summed.
 
     Arguments:
-        kind: SPHERE, BALL or CYLINDER.
+        kind: SPHERE, BALL, CYLINDER or ROUND_END.
         points: measured [m], shape (k, 3).
         std: noise of each along its ray [m], shape (k,).
         ray: unit directions of the rays, shape (k, 3).
         start: parameters to begin with.
         steps: at most.
         radius: of a BALL [m].
-        frame, middle: axes and a point near the axis of a CYLINDER, shapes (3, 3) and (3,) [m].
+        frame, middle: axes and a point near the axis of a CYLINDER or ROUND_END, shapes (3, 3) and (3,) [m].
     """
     x, n, k = np.array(start, dtype=np.float64), len(points), len(start)
     residual, slopes, curve = np.empty(n), np.empty((n, k)), np.empty((k, k))
@@ -109,10 +110,13 @@ def _evaluate(
     """Write the whitened residual (n,) and its slopes (n, k); return Huber's function of it, summed."""
     k, total = len(x), 0.0
     axis, unit, base = np.zeros(3), np.empty(3), np.empty(3)
-    size, shortened = radius, 1.0
+    size, shortened, end = radius, 1.0, np.inf
+    rod = kind == CYLINDER or kind == ROUND_END
     if kind == SPHERE:
         size = np.exp(x[3])
-    if kind == CYLINDER:
+    if kind == ROUND_END:
+        end = x[5]
+    if rod:
         size = np.exp(x[2])
         shortened = 1.0 / np.sqrt(1.0 + x[3] * x[3] + x[4] * x[4])
         for c in range(3):
@@ -125,6 +129,8 @@ def _evaluate(
         for c in range(3):
             unit[c] = points[i, c] - base[c]
             along += unit[c] * axis[c]
+        ends = along > end
+        along = min(along, end)
         length = 0.0
         for c in range(3):
             unit[c] -= along * axis[c]
@@ -136,13 +142,18 @@ def _evaluate(
             facing += unit[c] * ray[i, c]
         scale = std[i] * max(abs(facing), GRAZING)
         residual[i] = (length - size) / scale
-        if kind == CYLINDER:
+        if rod:
             first, second = 0.0, 0.0
             for c in range(3):
                 first += unit[c] * frame[1, c]
                 second += unit[c] * frame[2, c]
             slopes[i, 0], slopes[i, 1], slopes[i, 2] = -first / scale, -second / scale, -size / scale
             slopes[i, 3], slopes[i, 4] = -along * first * shortened / scale, -along * second * shortened / scale
+            if kind == ROUND_END:
+                slopes[i, 5] = 0.0
+                if ends:
+                    for c in range(3):
+                        slopes[i, 5] -= unit[c] * axis[c] / scale
         else:
             for c in range(3):
                 slopes[i, c] = -unit[c] / scale

@@ -22,12 +22,12 @@ from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
-from femsense.sensing.no_penetration import COMPLETED, in_touch, is_with
+from femsense.sensing.no_penetration import COMPLETED, in_touch, is_rigid, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.proposals import SAME, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
-from femsense.sensing.status import checked
+from femsense.sensing.status import SQUEEZED, UNDETERMINED, checked, std_along, stretch_under_contacts
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
@@ -132,9 +132,12 @@ def measurements(rows: Rows) -> int:
 
 
 def _searched(model: Model, best: Fit) -> Fit:
-    """Return the best fit after proposals have stopped to lower J."""
+    """Return the best fit after proposals have stopped to lower J, or its contacts squeeze the body beyond its law: more of them would only stand in for
+    what law and mesh lack."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
+        if stretch_under_contacts(model, best) < SQUEEZED:
+            break
         better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:
             break
@@ -183,25 +186,44 @@ def _is_alike(first: Shape, second: Shape) -> bool:
 
 
 def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
-    """Return the best hypothesis fitted again with objects in touch that are none of its contacts, where there are any.
+    """Return the best hypothesis fitted again with all that touches and whose force the data do not determine, where there is any.
 
-    Their forces are not significant. Left out, they would bias those of their neighbours and make their intervals too narrow. An object whose surface
-    lies at the body's becomes a contact with a wide interval, another one a latent force.
+    Objects in touch that are no contacts have no significant force. Left out, they would bias those of their neighbours and make their intervals too narrow.
+    An object whose surface lies at the body's becomes a contact with a wide interval, another one a latent force. So does a visible contact whose force is
+    not significant: of two tips that squeeze a body the pixels tell the difference, and the smallest τ would call both forces zero.
     """
     touching = away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.scan, best.frame.objects, best.state))
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
-    if not at_surface and not latent:
-        return best
+    if at_surface or latent:
+        best = _fitted_wide(model, replace(best, frame=replace(best.frame, latent=tuple(latent))), at_surface)
+    return _fitted_wide(model, best, ()) if any(_unsized(model, best)) else best
+
+
+def _unsized(model: Model, best: Fit) -> list[bool]:
+    """Return which visible contacts have a force that is not significant under a prior that was sized by it."""
+    return [
+        is_rigid(model, contact) and not contact.undetermined and float(np.linalg.norm(force)) < UNDETERMINED * std_along(best, i)
+        for i, (contact, force) in enumerate(zip(best.contacts, best.forces))
+    ]
+
+
+def _fitted_wide(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
+    """Return a hypothesis with more contacts fitted again, these and contacts without a significant force under the wide prior.
+
+    The other visible contacts begin with it: their τ was sized while their counterparts had no force.
+    """
+    unsized = _unsized(model, best)
+    tau = [UNDETERMINED_TAU if is_rigid(model, contact) else own for contact, own in zip(best.contacts, best.tau)]
     again = fit(
         model,
-        replace(best.frame, latent=tuple(latent)),
-        [*best.contacts, *at_surface],
-        np.vstack([best.forces, np.zeros((len(at_surface), 3))]),
+        best.frame,
+        [*(replace(c, undetermined=c.undetermined or wide) for c, wide in zip(best.contacts, unsized)), *more],
+        np.vstack([best.forces, np.zeros((len(more), 3))]),
         best.state,
         eta=best.eta,
-        tau=np.append(best.tau, np.full(len(at_surface), UNDETERMINED_TAU)),
+        tau=np.append(tau, np.full(len(more), UNDETERMINED_TAU)),
         linearised=best.linearised,
     )
     return best if again is None else again

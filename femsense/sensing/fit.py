@@ -92,9 +92,9 @@ def fit(
     """
     m, contacts = len(contacts), tuple(contacts)
     forces = np.array(forces, dtype=np.float64).reshape(-1, 3)
-    contacts = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, forces))
-    free = start is frame.predicted and not forces.any()
-    state = start if not m or free else model.solve(frame, contacts, forces, start)
+    state: Equilibrium | None = start
+    if m and (forces.any() or start is not frame.predicted):
+        contacts, forces, state = _loaded(model, frame, contacts, forces, start)
     if state is None:
         return None
     q = model.nuisance.root.shape[1]
@@ -132,6 +132,19 @@ def fit(
             break
         kappa = kappa.narrowed(_width(here, eta, frame, catch))
     return _in_cones(model, frame, _finished(model, frame, here, J, linear, eta, converged), here)
+
+
+def _loaded(
+    model: Model, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium
+) -> tuple[tuple[Touch, ...], FloatArray, Equilibrium | None]:
+    """Return contacts, forces and their equilibrium; of a half, a quarter, … of the forces where Newton does not get to all of them from the start."""
+    for share in LENGTHS:
+        part = share * forces
+        loaded = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, part))
+        state = model.solve(frame, loaded, part, start)
+        if state is not None:
+            return loaded, part, state
+    return contacts, forces, None
 
 
 def _width(here: Point, eta: FloatArray, frame: Frame, catch: float) -> Width:

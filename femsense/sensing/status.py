@@ -99,7 +99,7 @@ def checked(model: Model, best: Fit) -> Verdict:
         if failed is not None:
             return failed
     for i, contact in enumerate(best.contacts):
-        force, std = float(np.linalg.norm(best.forces[i])), _std_along(best, i)
+        force, std = float(np.linalg.norm(best.forces[i])), std_along(best, i)
         if contact.source != "given" and force < UNDETERMINED * std:
             return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
     inferred = any(contact.source == "shape" for contact in best.contacts)
@@ -144,7 +144,7 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
     return None
 
 
-def _std_along(best: Fit, i: int) -> float:
+def std_along(best: Fit, i: int) -> float:
     """Return the standard deviation of a force along itself [N], or along the normal where it is smaller than a thousandth of that."""
     force, covariance = best.forces[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
     normal = best.axes[i][0]
