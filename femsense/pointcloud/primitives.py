@@ -169,6 +169,7 @@ def find_shapes(
     is_edge: Callable[[IntArray], bool] | None = None,
     halo: BoolArray | None = None,
     view: IntArray | None = None,
+    ends: bool = True,
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -182,6 +183,7 @@ def find_shapes(
         is_edge: whether points, by their indices, are what a camera shows of the edge of that surface: they are no object.
         halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
         view: camera of each point, shape (o,); one camera if not given.
+        ends: whether rods may end in a half ball that is not among the known objects of `fit`.
     """
     fit = fit or fit_shape
     view = np.zeros(len(points), dtype=np.int64) if view is None else view
@@ -199,7 +201,6 @@ def find_shapes(
         ):
             continue
         own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
-        own_group = group if halo is None else group[~halo[group]]
         shape = _completed(fit, points[close], std[close], origins[close], own)
         # the other end of a rod that passes behind, the table in pieces
         more = [g for g in left if shape.holds(points[g], std[g])]
@@ -208,7 +209,11 @@ def find_shapes(
             close = np.concatenate([close, *more])
             own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
             shape = _completed(fit, points[close], std[close], origins[close], own)
-        rod = _round_end(points[own_group], std[own_group], origins[own_group], near[own_group], ROD * local_m)
+        rod = None
+        if ends and shape.kind != "plate":
+            whole = np.concatenate([group, *more])
+            whole = whole if halo is None else whole[~halo[whole]]
+            rod = _round_end(points[whole], std[whole], origins[whole], near[whole], ROD * local_m)
         if rod is not None:
             shape = replace(rod, points=shape.points)
         elif _ends(shape, points[close], near[close]):

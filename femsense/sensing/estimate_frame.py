@@ -24,7 +24,7 @@ from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, in_touch, is_rigid, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
-from femsense.sensing.proposals import SAME, proposals
+from femsense.sensing.proposals import SAME, elsewhere, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
 from femsense.sensing.status import SQUEEZED, UNDETERMINED, checked, std_along, stretch_under_contacts
@@ -57,7 +57,8 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     status = camera_verdict(model, best, checked(model, best))
     stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     covariances = [covariance_of(model, best, i) for i in range(len(best.contacts))]
-    contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, best.place_covariance, best.state, previous)
+    places = best.place_covariance + elsewhere(model, best)
+    contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, places, best.state, previous)
     report = FrameReport(
         int(sensor.recording.frame_numbers[k]),
         float(sensor.recording.time_s[k]),
@@ -132,12 +133,9 @@ def measurements(rows: Rows) -> int:
 
 
 def _searched(model: Model, best: Fit) -> Fit:
-    """Return the best fit after proposals have stopped to lower J, or its contacts squeeze the body beyond its law: more of them would only stand in for
-    what law and mesh lack."""
+    """Return the best fit after proposals have stopped to lower J."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
-        if stretch_under_contacts(model, best) < SQUEEZED:
-            break
         better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:
             break
@@ -236,8 +234,12 @@ def _is_object(contact: Touch) -> bool:
 
 
 def _fits(model: Model, best: Fit) -> Iterator[Fit]:
-    """Yield fits of the most promising proposals, one after the other."""
-    for one in proposals(model, best)[:FITTED]:
+    """Yield fits of the most promising proposals, one after the other.
+
+    Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
+    """
+    most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
+    for one in [one for one in proposals(model, best) if len(one.contacts) <= most][:FITTED]:
         start = best.state if best.contacts and one.contacts else best.frame.predicted
         found = fit(model, best.frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
         if found is not None:

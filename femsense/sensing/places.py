@@ -89,6 +89,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
         is_edge=edges.consist_of,
         halo=edges.halo,
         view=view,
+        ends=not tools,
     )
 
 

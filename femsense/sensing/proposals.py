@@ -15,6 +15,7 @@ from femsense.core.arrays import BoolArray, FloatArray
 from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
 from femsense.inference.rows import Rows
+from femsense.pointcloud.rays import Surface
 from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, force_scale, whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_with
@@ -29,6 +30,8 @@ SAME = 0.08
 """Contacts within this share of the body's diagonal are one."""
 SHORT = 10.0
 """By how much the linearised gain of a contact at a seen object may fall short of the fitted one: it keeps the contact points."""
+FIRST = 0.1
+"""A line through the body begins so many edges below its surface."""
 SEARCHED, CLOSE = 2, 20.0
 """Candidates that are fitted, the best first, and by how much −2 log evidence of the last may be below the first."""
 
@@ -271,11 +274,8 @@ def _inferred(
         pulls: ask for hanging weights, whose forces keep to no cone.
         without: a contact of the fit that is removed; the gain is then relative to its own place.
     """
-    model, sensor = near.model, near.model.sensor
-    c = len(at.normals)
-    axes = axes_of(np.broadcast_to(model.upward, (c, 3)) if pulls else at.normals)
-    gains, forces = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
-    gains = gains - model.inferred_odds - (HANGING if pulls else IN_SIGHT * at.seen)
+    sensor = near.model.sensor
+    gains, forces = _gains(near, at, pulls=pulls, without=without)
     if not np.isfinite(gains).any():
         return -np.inf, []
     top = float(gains.max())
@@ -289,6 +289,71 @@ def _inferred(
         if all(np.linalg.norm(place - contact.place) > SAME * sensor.size for contact, _ in found):
             found.append((replace(make_touch(sensor, place, source="shape", std_m=std), pulls=pulls), forces[i]))
     return (total if without is None else top - _gain_at_own_place(near, without)), found
+
+
+def _gains(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None) -> tuple[FloatArray, FloatArray]:
+    """Return the decrease of J by one more contact at each candidate, shape (c,), and its force [N], shape (c, 3)."""
+    c = len(at.normals)
+    axes = axes_of(np.broadcast_to(near.model.upward, (c, 3)) if pulls else at.normals)
+    gains, forces = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
+    return gains - near.model.inferred_odds - (HANGING if pulls else IN_SIGHT * at.seen), forces
+
+
+def elsewhere(model: Model, best: Fit) -> FloatArray:
+    """Return what the posterior probability of all other places adds to the covariance of each contact point [m²], shape (m, 3, 3); 0 where the place is
+    seen or given.
+
+    A thin body hardly shows on which of its sides it is pushed or pulled: the Laplace approximation about the best place does not know of the other side.
+    The point on the other side has the Laplace volume of the place itself, each candidate its share of the surface.
+    """
+    added = np.zeros((len(best.contacts), 3, 3))
+    inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
+    if not inferred:
+        return added
+    near, nodes, positions = vicinity(model, best), model.sensor.candidates, best.state.positions
+    at, tangent = at_candidates(near), best.linearised.tangent
+    share = float(model.sensor.surface.area.sum()) / len(nodes)
+    ways = (False, True) if model.upward.any() else (False,)
+    for i in inferred:
+        place, own = best.contacts[i].patch.mean(positions), _gain_at_own_place(near, i) - best.odds[i]
+        volume = min(2.0 * np.pi * float(np.sqrt(np.prod(np.linalg.eigvalsh(best.place_covariance[i])[1:]))), share)
+        points, mass = positions[nodes] - place, np.zeros(len(nodes))
+        for pulls in ways:
+            mass += share * _likelihood(_gains(near, at, pulls=pulls, without=i)[0] - own)
+        mass[np.linalg.norm(points, axis=1) < np.sqrt(share)] = 0.0
+        if (other := _other_side(model, best, i)) is not None:
+            way = other.patch.mean(positions) - place
+            mass[np.linalg.norm(points - way, axis=1) < np.sqrt(share)] = 0.0
+            sites = near.sites(
+                np.moveaxis(tangent.respond(np.array([other.patch.spread(axis, len(positions)) for axis in np.eye(3)])), 0, 2)
+            )
+            there = [replace(other, pulls=pulls) for pulls in ways]
+            gains = [
+                evidence_at(near, sites, axes_at(model, [one], best.state), np.array([one.pulls]), without=i)[0][0]
+                for one in there
+            ]
+            odds = [odds_of(model, one, best.rows) for one in there]
+            points = np.vstack([points, way])
+            mass = np.append(mass, volume * _likelihood(np.array(gains) - odds - own).sum())
+        added[i] = (points * mass[:, None]).T @ points / (volume + mass.sum())
+    return added
+
+
+def _likelihood(gain: FloatArray) -> FloatArray:
+    """Return posterior odds of a decrease of J; of one that the search refused, 1."""
+    return np.asarray(np.exp(0.5 * np.minimum(gain, 0.0)))
+
+
+def _other_side(model: Model, best: Fit, i: int) -> Touch | None:
+    """Return an inferred contact where the line of the first axis of a force leaves the body on the other side."""
+    positions, contact = best.state.positions, best.contacts[i]
+    axis, place = best.axes[i][0], contact.patch.mean(positions)
+    body, within = Surface(positions, model.sensor.surface.triangles), FIRST * model.sensor.surface.edge
+    for way in (-axis, axis):
+        hits = body.cast((place + model.sensor.size * way)[None], (place + within * way)[None], reach=np.inf)
+        if len(hits.nodes) and hits.normal[0] @ way > 0.0:
+            return make_touch(model.sensor, hits.place(model.skin.rest)[0], source="shape", std_m=contact.std_m)
+    return None
 
 
 def _gain_at_own_place(near: Vicinity, i: int) -> float:

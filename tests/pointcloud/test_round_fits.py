@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from femsense.core.arrays import FloatArray
-from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
+from femsense.pointcloud.round_fits import BALL, CYLINDER, ROUND_END, SPHERE, fit_round
 
 CENTRE, RADIUS, STD = np.array([0.02, -0.01, 0.5]), 0.012, 2e-4
 OFF = np.array([0.0, 0.003, -0.004])
@@ -52,3 +52,28 @@ def test_a_cylinder_is_found_from_a_frame_that_is_tilted() -> None:
     assert np.exp(x[2]) == pytest.approx(RADIUS, rel=0.02)
     off = OFF + x[0] * frame[1] + x[1] * frame[2]
     assert np.linalg.norm(off - (off @ axis) * axis) < 3e-4
+
+
+def test_the_round_end_of_a_rod_is_found_from_its_side() -> None:
+    axis, end = np.array([0.96, 0.28, 0.0]), 0.008
+    points, std, ray = seen(axis)
+    along = (points - CENTRE) @ axis
+    rim = np.sqrt(np.maximum(RADIUS**2 - np.maximum(along - end, 0.0) ** 2, 0.0)) / RADIUS  # the half ball is narrower than the rod
+    on_axis = CENTRE + along[:, None] * axis
+    kept = along < end + 0.9 * RADIUS
+    points = (on_axis + rim[:, None] * (points - on_axis))[kept]
+    x, *_ = fit_round(
+        ROUND_END,
+        points,
+        std[kept],
+        points / np.linalg.norm(points, axis=1, keepdims=True),
+        np.array([0.0, 0.0, np.log(0.008), 0.0, 0.0, 0.01]),
+        steps=50,
+        frame=np.eye(3),
+        middle=CENTRE + OFF,
+    )
+    found = np.array([1.0, x[3], x[4]])
+    found /= np.linalg.norm(found)
+    assert found @ axis > 0.999
+    assert np.exp(x[2]) == pytest.approx(RADIUS, rel=0.03)
+    assert np.linalg.norm(CENTRE + OFF + [0.0, x[0], x[1]] + x[5] * found - (CENTRE + end * axis)) < 4e-4

@@ -48,6 +48,15 @@ def test_a_visible_contact_has_its_force_and_place_within_its_interval(tmp_path:
     assert np.linalg.norm(contact.position_m[:2] - PLACE[:2]) < 0.004
 
 
+def test_of_two_tips_that_squeeze_the_body_both_are_found_with_about_their_forces(tmp_path: Path):
+    places, forces = np.array([[0.08, 0.01, 0.005], [0.08, -0.01, 0.005]]), np.array([[0.0, -0.9, 0.0], [0.0, 0.9, 0.0]])
+    contacts = estimated(touched(tmp_path, forces, ball=True, place=places)).contacts
+    assert len(contacts) == 2  # alone, the pixels hardly tell them: they cancel
+    for contact, place in zip(sorted(contacts, key=lambda c: -float(c.position_m[1])), places):
+        assert contact.source == "cloud" and np.linalg.norm(contact.position_m - place) < 0.009  # the arm is bent there
+        assert 0.45 < contact.force_n < 1.8  # the dent below a tip depends on the mesh
+
+
 def test_a_contact_that_no_camera_sees_is_inferred(tmp_path: Path):
     run = estimated(touched(tmp_path, PUSH, ball=False))
     (contact,) = run.contacts

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from arm import T_ROBOT_CAMERA, arm, record
+from arm import T_ROBOT_CAMERA, WIDTH, arm, record
 
 from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
@@ -38,10 +38,11 @@ def touched(
     wall: bool = False,
     noise: float = NOISE,
 ) -> Recording:
-    """Return three free frames and one with a force on the upper face, on an arm of another mesh and law; a red ball pushes where it is shown.
+    """Return three free frames and one with forces, on an arm of another mesh and law; red balls push where they are shown.
 
     Arguments:
-        place: where it pushes, at rest [m].
+        force: or several, shape (3,) or (c, 3) [N].
+        place: where each pushes, at rest, shape (3,) or (c, 3) [m].
         nudge: how the camera has moved in that frame: (rotation about the robot's origin [rad], shift [m]), shape (6,).
         wall: whether two walls stand around the arm.
         noise: of the points along their rays [m].
@@ -49,17 +50,23 @@ def touched(
     recording, states = record(INPUTS, noise=1e-4, forces={3: (place, force)})
     true, rng, files = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(11), []
     triangles = surface_triangles(true.body.mesh)
-    node = int(np.argmin(np.linalg.norm(true.body.mesh.nodes - place, axis=1)))
+    nodes = [int(np.argmin(np.linalg.norm(true.body.mesh.nodes - one, axis=1))) for one in np.atleast_2d(place)]
     for k, x in enumerate(states):
         looks = np.einsum("tc,tc->t", triangle_normals(x, triangles), T_ROBOT_CAMERA[:3, 3] - x[triangles].mean(axis=1)) > 0
         corners = x[triangles[looks]]
         points = np.einsum("tsi,tic->tsc", rng.dirichlet(np.ones(3), size=(len(corners), 12)), corners).reshape(-1, 3)
         shades = np.tile([0.2, 0.4, 0.8], (len(points), 1))
-        if ball and k == 3:
+        for node, push in zip(nodes, np.atleast_2d(force)) if ball and k == 3 else ():
             out = rng.normal(size=(1500, 3))
             out /= np.linalg.norm(out, axis=1, keepdims=True)
-            more = x[node] + [0, 0, 0.006] + 0.006 * out
-            more = more[np.einsum("pc,pc->p", out, T_ROBOT_CAMERA[:3, 3] - more) > 0]
+            middle = x[node] - 0.006 * push / np.linalg.norm(push)
+            more = middle + 0.006 * out
+            seen = np.einsum("pc,pc->p", out, T_ROBOT_CAMERA[:3, 3] - more) > 0
+            if push[1] > 0.0:  # behind the arm: what stands out over the upper edge of the side that it pushes on
+                edge = x[node] + [0.0, 0.0, 0.5 * WIDTH - true.body.mesh.nodes[node, 2]]
+                sight = T_ROBOT_CAMERA[1:3, 3] - edge[1:]
+                seen &= (more - edge)[:, 2] * sight[0] > (more - edge)[:, 1] * sight[1]
+            more = more[seen]
             points, shades = np.vstack([points, more]), np.vstack([shades, np.tile([0.9, 0.1, 0.1], (len(more), 1))])
         if wall:
             points, shades = np.vstack([points, WALLS]), np.vstack([shades, np.full((len(WALLS), 3), 0.6)])
