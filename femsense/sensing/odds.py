@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.inference.rows import Rows
@@ -48,6 +49,7 @@ def in_sight(model: Model, rows: Rows, places: FloatArray) -> BoolArray:
     """Return which places at rest (c, 3) [m] the cameras see, shape (c,)."""
     robot = rows.pixel & (np.abs(rows.residual) < 5.0 * rows.std)
     seen = rows.rest[robot]
-    seen = seen[:: max(1, len(seen) // 2000)]
-    near = ((places[:, None] - seen[None]) ** 2).sum(axis=2) < model.sensor.surface.edge**2
-    return np.asarray(near.sum(axis=1) >= SEEN_BY)
+    if len(seen) < SEEN_BY:
+        return np.zeros(len(places), dtype=bool)
+    farthest = cKDTree(seen).query(places, k=[SEEN_BY], distance_upper_bound=model.sensor.surface.edge)[0][:, 0]
+    return np.asarray(np.isfinite(farthest))

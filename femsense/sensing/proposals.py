@@ -316,6 +316,8 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
     ways = (False, True) if model.upward.any() else (False,)
     for i in inferred:
         place, own = best.contacts[i].patch.mean(positions), _gain_at_own_place(near, i) - best.odds[i]
+        if not np.isfinite(own):  # to first order no force may act there at all
+            continue
         volume = min(2.0 * np.pi * float(np.sqrt(np.prod(np.linalg.eigvalsh(best.place_covariance[i])[1:]))), share)
         points, mass = positions[nodes] - place, np.zeros(len(nodes))
         for pulls in ways:

@@ -58,7 +58,9 @@ def test_the_round_end_of_a_rod_is_found_from_its_side() -> None:
     axis, end = np.array([0.96, 0.28, 0.0]), 0.008
     points, std, ray = seen(axis)
     along = (points - CENTRE) @ axis
-    rim = np.sqrt(np.maximum(RADIUS**2 - np.maximum(along - end, 0.0) ** 2, 0.0)) / RADIUS  # the half ball is narrower than the rod
+    rim = (
+        np.sqrt(np.maximum(RADIUS**2 - np.maximum(along - end, 0.0) ** 2, 0.0)) / RADIUS
+    )  # the half ball is narrower than the rod
     on_axis = CENTRE + along[:, None] * axis
     kept = along < end + 0.9 * RADIUS
     points = (on_axis + rim[:, None] * (points - on_axis))[kept]
