@@ -211,11 +211,12 @@ def find_shapes(
             close = np.concatenate([close, *more])
             own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
             shape = _completed(fit, points[close], std[close], origins[close], own)
-        rod = None
         if ends and shape.kind != "plate":
             whole = np.concatenate([group, *more])
             whole = whole if halo is None else whole[~halo[whole]]
             rod = _round_end(points[whole], std[whole], origins[whole], near[whole], ROD * local_m)
+        else:
+            rod = None
         if rod is not None:
             shape = replace(rod, points=shape.points)
         elif _ends(shape, points[close], near[close]):

@@ -51,5 +51,5 @@ def in_sight(model: Model, rows: Rows, places: FloatArray) -> BoolArray:
     seen = rows.rest[robot]
     if len(seen) < SEEN_BY:
         return np.zeros(len(places), dtype=bool)
-    farthest = cKDTree(seen).query(places, k=[SEEN_BY], distance_upper_bound=model.sensor.surface.edge)[0][:, 0]
-    return np.asarray(np.isfinite(farthest))
+    distance = np.asarray(cKDTree(seen).query(places, k=[SEEN_BY], distance_upper_bound=model.sensor.surface.edge)[0])
+    return np.asarray(np.isfinite(distance[:, 0]))

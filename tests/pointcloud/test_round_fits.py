@@ -56,7 +56,7 @@ def test_a_cylinder_is_found_from_a_frame_that_is_tilted() -> None:
 
 def test_the_round_end_of_a_rod_is_found_from_its_side() -> None:
     axis, end = np.array([0.96, 0.28, 0.0]), 0.008
-    points, std, ray = seen(axis)
+    points, std, _ = seen(axis)
     along = (points - CENTRE) @ axis
     rim = (
         np.sqrt(np.maximum(RADIUS**2 - np.maximum(along - end, 0.0) ** 2, 0.0)) / RADIUS
