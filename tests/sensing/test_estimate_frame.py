@@ -61,6 +61,7 @@ def test_a_contact_that_no_camera_sees_is_inferred(tmp_path: Path):
     run = estimated(touched(tmp_path, PUSH, ball=False))
     (contact,) = run.contacts
     assert (contact.frame, contact.source) == (3, "shape") and abs(contact.force_n - 0.15) < 3 * contact.std_n
+    assert contact.position_std_m[2] > 0.004 > contact.position_std_m[0]  # pushed from above, or pulled from below
 
 
 def test_without_a_contact_none_is_reported(tmp_path: Path):
