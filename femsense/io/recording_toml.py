@@ -108,7 +108,7 @@ class CameraTable(Schema):
     @model_validator(mode="after")
     def _lens_is_complete(self) -> CameraTable:
         missing = [key for key in LENS_KEYS if getattr(self, key) is None]
-        if missing and len(missing) < len(LENS_KEYS):
+        if missing and self.model_fields_set - {"T_robot_camera"}:
             raise ValueError(f"the camera lacks {', '.join(missing)}")
         return self
 
@@ -185,15 +185,7 @@ def views_of(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[
     if table.camera is None:
         return ("",), (None,), (table.T_robot_camera,)
     pose = table.T_robot_camera if table.T_robot_camera is not None else table.camera.T_robot_camera
-    camera = _camera("", table.camera)
-    if camera is None:
-        raise InputError(
-            "the camera lacks its lens",
-            where=at_key(path, "camera"),
-            found="no width, height, fx, fy, cx, cy",
-            expected=", ".join(LENS_KEYS),
-        )
-    return ("",), (camera,), (pose,)
+    return ("",), (_camera("", table.camera),), (pose,)
 
 
 def _camera(name: str, table: CameraTable) -> Camera | None:
