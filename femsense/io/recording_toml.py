@@ -185,7 +185,15 @@ def views_of(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[
     if table.camera is None:
         return ("",), (None,), (table.T_robot_camera,)
     pose = table.T_robot_camera if table.T_robot_camera is not None else table.camera.T_robot_camera
-    return ("",), (_camera("", table.camera),), (pose,)
+    camera = _camera("", table.camera)
+    if camera is None and pose is None:
+        raise InputError(
+            "the camera lacks its lens",
+            where=at_key(path, "camera"),
+            found="no width, height, fx, fy, cx, cy",
+            expected=", ".join(LENS_KEYS),
+        )
+    return ("",), (camera,), (pose,)
 
 
 def _camera(name: str, table: CameraTable) -> Camera | None:

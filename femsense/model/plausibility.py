@@ -70,7 +70,7 @@ class Ranges:
     """Nodes nearer than this, over the diagonal, are at one place."""
     rest_sizes: float = 2.0
     """Distance of the markers at rest from those of the frames, over the span of the latter: a body bends by less."""
-    camera_m: tuple[float, float] = (0.05, 20.0)
+    camera_m: float = 20.0
     """Distance of a camera from its robot."""
 
 
@@ -207,8 +207,8 @@ def doubts_of_cameras(recording: Recording) -> list[str]:
             problem = problem or _lens_doubt(c.width, c.height, numbers)
             found += [f"{where}, {key}: {problem}"] if problem else []
         away = 0.0 if pose is None else float(np.linalg.norm(pose[:3, 3]))
-        if away > RANGES.camera_m[1]:
-            unit = likely_meant(away, *RANGES.camera_m, Quantity.LENGTH)
+        if away > RANGES.camera_m:
+            unit = likely_meant(away, 0.05, 2.0, Quantity.LENGTH)
             found.append(f"{where}, {key}: T_robot_camera puts the camera {away:.4g} m away; is its translation in {unit}?")
     return found
 
