@@ -88,6 +88,8 @@ SPELLED = {
     "µm": "micrometres",
 }
 """Names of units in questions, where the short one would be misread."""
+ABSOLUTE = {"Pa": 1.0, "hPa": 100.0}
+"""Units in which barometers and FluidPressure count from a vacuum, and how many pascals they are."""
 
 
 # Recordings
@@ -172,8 +174,8 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
             of = f" of its max_pressure_pa of {most:.6g}" if np.isfinite(most) else ""
             units = likely_meant(largest, 2e3, min(most, high), Quantity.PRESSURE)
             found.append(f"{where}: chamber {name!r} reaches {largest:.4g} Pa{of}; is it in {units}? The column holds pascals")
-        elif _is_absolute(pressure):
-            found.append(_absolute(where, name, least))
+        elif unit := next((unit for unit, size in ABSOLUTE.items() if _is_absolute(size * pressure)), None):
+            found.append(_absolute(where, name, least, unit))
         elif least < -ATMOSPHERE_PA:
             found.append(f"{where}: chamber {name!r} falls to {least:.6g} Pa, below a vacuum; is its unit or sign right?")
         elif largest > high:
@@ -188,10 +190,11 @@ def _is_absolute(pressure: FloatArray) -> bool:
     return low < least < high or (least > RANGES.never_zero_pa and low < pressure[0] < high)
 
 
-def _absolute(where: str, name: str, least: float) -> str:
+def _absolute(where: str, name: str, least: float, unit: str) -> str:
+    other = "" if unit == "Pa" else f", and in {unit}"
     return (
-        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take what is above the "
-        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*Pa_abs does)"
+        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute{other}? Chambers take what is above "
+        f"the surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*{unit}_abs does)"
     )
 
 

@@ -73,6 +73,7 @@ def recording(
         ({"step": 5.8e-7}, "is it in days or hours?"),
         ({"step": 1e5}, "is it in microseconds?"),
         ({"pressure": (98e3, 60e3)}, "is it absolute?"),
+        ({"pressure": (1013.25, 1100.0)}, "is it absolute, and in hPa?"),
         ({"gravity": 1.0}, "is it in g?"),
         ({"gravity": 9810.0}, "is it in mm/s²?"),
         ({"gravity": 9.81, "last_gravity": 8.0}, "it keeps its length"),
