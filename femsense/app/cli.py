@@ -181,10 +181,20 @@ def _fail(text: str, status: int, as_json: bool, notes: list[str]) -> int:
     return status
 
 
+def _backslash_hint(error: FemsenseError) -> str:
+    """Return a hint for a missing file that was named with another system's backslashes; "" for all else."""
+    where = str(getattr(error, "where", None) or "")
+    if os.sep == "\\" or "\\" not in where or os.path.lexists(where):
+        return ""
+    meant = where.replace("\\", "/")
+    known = f"did you mean {meant!r}? " if os.path.lexists(meant) else ""
+    return f"\n  try:      {known}Between folders stands / here; a backslash is a part of a name"
+
+
 def _explained(error: Exception) -> tuple[str, int]:
     """Return a message and the exit status of an error."""
     if isinstance(error, FemsenseError):
-        return str(error), error.exit_status
+        return str(error) + _backslash_hint(error), error.exit_status
     if isinstance(error, TyperException):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "femsense"

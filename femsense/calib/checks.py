@@ -102,6 +102,8 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str
         if len(np.unique(one.marker)) < 4 or one.spread <= 0:
             continue
         plain = rigid_rms(one.modelled, one.measured)
+        if strict:
+            _check_shift(one, plain, which)
         if plain < SUSPICIOUS * one.spread:
             continue
         found = (
@@ -127,6 +129,21 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str
             )
         if strict and plain > HOPELESS * one.spread:
             raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names? {UNNAMED}")
+
+
+def _check_shift(pairs: Pairs, plain: float, which: str) -> None:
+    """Refuse markers that another pose would fit, while the fitted one leaves a multiple of their spread: other rows hold it elsewhere.
+
+    Raises:
+        DataError: with the distance.
+    """
+    left = float(np.sqrt(((pairs.measured - pairs.modelled) ** 2).sum(axis=1).mean()))
+    if left > pairs.spread and left > EXPLAINED * plain:
+        raise DataError(
+            f"the markers{which} of the frames lie {1e3 * left:.3g} mm from the robot at the fitted pose, and {1e3 * plain:.3g} mm from "
+            "it at one of their own: rest.csv, or a declared pose, puts the robot elsewhere than the frames. Are both in the frame of "
+            "the same camera, which did not move in between?"
+        )
 
 
 def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:

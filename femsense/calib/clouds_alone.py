@@ -66,14 +66,15 @@ def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibratio
         views: the cameras to place.
 
     Raises:
-        DataError: no free frame with a cloud, nothing that fits, or a body with a symmetry.
+        DataError: no free frame with a cloud, nothing that fits, a body with a symmetry, or clouds that do not determine a pose.
     """
     states = free_states(robot, recording, calibration, views)
     start = started_at(
         robot, calibration, {v: find_cloud_pose(seen_by(robot, recording, states, v)).T_robot_camera for v in views}
     )
     fitted = refine_poses(robot, recording, start, guessed=views)
-    return replace(fitted, status=_status(recording, start, fitted, views))
+    _check_determined(recording, start, fitted, views)
+    return replace(fitted, status="converged (cameras placed by clouds alone)")
 
 
 def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatArray]) -> Calibration:
@@ -147,17 +148,22 @@ def seen_by(robot: Robot, recording: Recording, states: dict[int, Equilibrium], 
     return seen
 
 
-def _status(recording: Recording, start: Calibration, fitted: Calibration, views: Sequence[int]) -> str:
-    """Return the status of the calibration, with the directions that the clouds leave open."""
-    texts = []
+def _check_determined(recording: Recording, start: Calibration, fitted: Calibration, views: Sequence[int]) -> None:
+    """Refuse a pose that the fit left about as uncertain as the search: its standard deviation is then that of the start, not of an error.
+
+    Raises:
+        DataError: with the camera and the direction.
+    """
     for v in views:
         own = slice(6 * v, 6 * v + 6)
         scale = 1.0 / np.sqrt(np.diag(start.joint_covariance)[own])
         values, vectors = np.linalg.eigh(scale[:, None] * fitted.joint_covariance[own, own] * scale)
         if values[-1] > UNDETERMINED**2:
-            texts.append(f"{recording.camera_names[v] or '(only one)'} {_direction(vectors[:, -1])}")
-    found = "converged (cameras placed by clouds alone)"
-    return found + (f", but the clouds hardly determine the pose of camera {'; '.join(texts)}" if texts else "")
+            raise DataError(
+                f"the clouds do not determine the pose of camera {recording.camera_names[v] or '(only one)'} "
+                f"{_direction(vectors[:, -1])}: what was found may be far off. Record contact-free frames in which other inputs bend the "
+                "robot in other directions, or three markers; or declare T_robot_camera"
+            )
 
 
 def _direction(vector: FloatArray) -> str:

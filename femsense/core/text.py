@@ -19,6 +19,16 @@ def plain_name(text: str) -> str:
     return re.sub(r"[^\S\t\r\n]+", " ", unicodedata.normalize("NFC", text)).strip().strip(_INVISIBLE + " \t\r\n")
 
 
+def look_alike(words: Iterable[str], known: Iterable[str]) -> dict[str, str]:
+    """Return the words that differ from a known one in nothing but case, blanks, dashes or compatibility forms → that one."""
+    forms = {_folded(name): name for name in known}
+    return {word: forms[_folded(word)] for word in words if _folded(word) in forms}
+
+
+def _folded(name: str) -> str:
+    return re.sub(r"[\W_]+", "-", unicodedata.normalize("NFKC", name).casefold()).strip("-")
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     """Return a hint that names the known words closest to a word; None where none is close."""
     likeness = {name: difflib.SequenceMatcher(None, word.lower(), name.lower()).ratio() for name in known}

@@ -108,7 +108,7 @@ class CameraTable(Schema):
     @model_validator(mode="after")
     def _lens_is_complete(self) -> CameraTable:
         missing = [key for key in LENS_KEYS if getattr(self, key) is None]
-        if missing and len(missing) < len(LENS_KEYS):
+        if missing and self.model_fields_set - {"T_robot_camera"}:
             raise ValueError(f"the camera lacks {', '.join(missing)}")
         return self
 
@@ -186,7 +186,7 @@ def views_of(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[
         return ("",), (None,), (table.T_robot_camera,)
     pose = table.T_robot_camera if table.T_robot_camera is not None else table.camera.T_robot_camera
     camera = _camera("", table.camera)
-    if camera is None:
+    if camera is None and pose is None:
         raise InputError(
             "the camera lacks its lens",
             where=at_key(path, "camera"),

@@ -33,7 +33,7 @@ from femsense.io.robot_tables import (
 )
 from femsense.io.tables import at_key, beside
 from femsense.model.body_doubts import doubts_of_body
-from femsense.model.plausibility import warn_of
+from femsense.model.plausibility import gravity_doubt, warn_of
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
@@ -72,7 +72,7 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
             expected="a positive Jacobian",
             hint='straight edges: element = "tet4", or a linear mesh',
         )
-    _check_units(table, path)
+    _check_gravity(table, path)
     warn_of((f"{path}: {doubt}" for doubt in doubts_of_body(body)), stacklevel=4)
     points = _marker_points(mesh, table.markers, path)
     color = table.appearance.color_rgb
@@ -295,24 +295,8 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
     )
 
 
-def _check_units(table: RobotTable, path: Path) -> None:
-    """Warn of what can be computed but is hardly meant. Raises InputError where gravity is that of no place."""
-    if table.material.young_modulus_pa < 1e3:
-        warnings.warn(
-            (
-                f"{at_key(path, 'material', 'young_modulus_pa')}: {table.material.young_modulus_pa:g} Pa is softer than any "
-                f"silicone; is it in kPa or MPa?"
-            ),
-            stacklevel=4,
-        )
-    if table.material.density_kg_m3 < 20.0:
-        warnings.warn(
-            (
-                f"{at_key(path, 'material', 'density_kg_m3')}: {table.material.density_kg_m3:g} kg/m³ is lighter than any "
-                f"foam; is it in g/cm³? Silicone has 1070 kg/m³"
-            ),
-            stacklevel=4,
-        )
+def _check_gravity(table: RobotTable, path: Path) -> None:
+    """Warn of gravity in another unit. Raises InputError where it is that of no place."""
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:
         raise InputError(
             "more than ten times gravity",
@@ -321,11 +305,9 @@ def _check_units(table: RobotTable, path: Path) -> None:
             expected="[0.0, 0.0, -9.81], in the robot frame",
             hint="is it in mm/s²?",
         )
-    if table.gravity and abs(np.linalg.norm(table.gravity.vector_m_s2) - 1.0) < 0.02:
-        warnings.warn(
-            f"{at_key(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is 1 long; is it in g? On earth it is 9.81 m/s²",
-            stacklevel=4,
-        )
+    doubt = gravity_doubt(float(np.linalg.norm(table.gravity.vector_m_s2))) if table.gravity else None
+    if doubt:
+        warnings.warn(f"{at_key(path, 'gravity', 'vector_m_s2')}: {doubt}", stacklevel=4)
 
 
 def _metres(point: FloatArray | Sequence[float]) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from itertools import product
+from datetime import UTC, date, datetime
+from itertools import pairwise, product
 
 BLANKS = " \u00a0\u202f\u2009'’"
 """Marks between thousands other than comma and point."""
@@ -31,6 +32,8 @@ DAY_FORMS = (
 CLOCK_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
 CLOCK = re.compile(r"(?:(\d{1,3}):)?(\d{1,2}):(\d{2}(?:[.,]\d+)?)\s*([AaPp]\.?[Mm]\.?)?")
 DAY = re.compile(r"\d{1,2}([./-])\d{1,2}\1\d{4}|\d{4}([./-])\d{1,2}\2\d{1,2}")
+SLASHED = re.compile(r"(?<![\d/])(\d{1,2})/(\d{1,2})/(\d{4})(?!\d)")
+"""A date whose day or month stands first."""
 TIMES_READ = (
     "seconds, 10:15:00.5, 10:15:00 PM, 2024-01-31T10:15:00, 31.01.2024 10:15:00, 1/31/2024 10:15:00, or days of a spreadsheet"
 )
@@ -46,10 +49,14 @@ class Notation:
     """Whether some numbers have marks between their thousands."""
     commas: bool = False
     """Whether decimal commas were seen."""
+    month_first: bool | None = None
+    """Of dates such as 03/04/2026, whether the month stands first; None where there are none."""
 
     def plain(self, cell: str) -> str:
         """Return a number with a decimal point and without marks between thousands; any other cell as it is."""
-        if "," not in cell and not self.grouped and cell.isascii():
+        if self.month_first:
+            cell = SLASHED.sub(r"\3/\1/\2", cell)
+        if not self.grouped and "," not in cell and cell.isascii():
             return cell
         text = cell.strip().replace("−", "-")
         if not text or text[0] not in "+-.,0123456789":
@@ -92,7 +99,27 @@ def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
             votes["," if "," in cell else "."] += 1
     if bool(votes["."]) != bool(votes[","]):
         default = "." if votes["."] else ","
+        other = re.compile(rf"[-+−]?[1-9]\d{{0,2}}(?:\{',' if default == '.' else '.'}\d{{3}})+")
+        grouped = grouped or any(other.fullmatch(cell) for cell in cells)
     return Notation(default, grouped, votes[","] > 0 or (default == "," and any("," in cell for cell in cells)))
+
+
+def month_stands_first(dates: Iterable[tuple[int, int, int]]) -> bool:
+    """Return whether dates (a, b, year), in order of their rows, are month, day, year and not day, month, year.
+
+    The day stands first, unless the calendar has no such date, or the dates then go back or leap farther.
+    """
+    given = list(dates)
+
+    def leap(days: Iterable[tuple[int, int, int]]) -> float:
+        try:
+            numbers = [date(year, month, day).toordinal() for day, month, year in days]
+        except ValueError:
+            return math.inf
+        steps = [b - a for a, b in pairwise(numbers)]
+        return math.inf if min(steps, default=0) < 0 else max(steps, default=0)
+
+    return leap((b, a, year) for a, b, year in given) < leap(given)
 
 
 def plain_number(cell: str) -> float | None:
@@ -116,7 +143,7 @@ def number_in(cell: str) -> float | None:
 def moment_in(cell: str) -> float | None:
     """Return the seconds of a date and time since 1970 (UTC where no zone is named), or of a time of day since midnight; else None.
 
-    Of 01/02/2024 the day stands first, unless that is no date; differences of times are the same either way within a month.
+    Of 01/02/2024 the day stands first, unless that is no date; tables decide it for all their rows (`month_stands_first`).
     """
     text = cell.strip()
     if DAY.fullmatch(text):

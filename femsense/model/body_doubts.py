@@ -30,9 +30,18 @@ def _doubts_of_limits(body: BodyModel) -> list[str]:
 
 
 def _doubts_of_material(body: BodyModel) -> list[str]:
-    modulus = float(np.max(body.material.young_modulus))
-    stiff = f"material.young_modulus_pa: {modulus:.4g} Pa is stiffer than any soft robot; is it in another unit than pascals?"
-    return [*([stiff] if modulus > RANGES.young_modulus_pa else []), *_doubts_of_ratio(body)]
+    """Return a modulus or a density that no soft robot has, and a Poisson ratio near 1/2."""
+    modulus, density, (soft, stiff) = np.asarray(body.material.young_modulus), body.material.density, RANGES.young_modulus_pa
+    found = []
+    if modulus.min() < soft:
+        found.append(f"material.young_modulus_pa: {modulus.min():.4g} Pa is softer than any silicone; is it in kPa or MPa?")
+    if modulus.max() > stiff:
+        text = "is stiffer than any soft robot; is it in another unit than pascals?"
+        found.append(f"material.young_modulus_pa: {modulus.max():.4g} Pa {text}")
+    if 0.0 < density < RANGES.density_kg_m3:
+        text = "kg/m³ is lighter than any foam; is it in g/cm³? Silicone has 1070 kg/m³"
+        found.append(f"material.density_kg_m3: {density:.4g} {text}")
+    return [*found, *_doubts_of_ratio(body)]
 
 
 def _doubts_of_ratio(body: BodyModel) -> list[str]:

@@ -37,7 +37,9 @@ class Ranges:
     pressure_share: float = 1e-3
     """… and as a share of its max_pressure_pa."""
     absolute_pa: tuple[float, float] = (80e3, 108e3)
-    """Lowest pressure of a chamber that was measured against a vacuum: from 2000 m above the sea to a high at the sea."""
+    """Pressure of the surroundings, measured against a vacuum: from 2000 m above the sea to a high at the sea."""
+    never_zero_pa: float = 5e3
+    """Chambers that begin at the pressure of the surroundings and never fall below this were measured against a vacuum."""
     tension_n: tuple[float, float] = (1e-3, 120.0)
     """Largest tension of a cable."""
     displacement_m: float = 0.5
@@ -46,8 +48,16 @@ class Ranges:
     """Largest known load."""
     marker_noise_m: float = 0.01
     """Repeatability of a marker."""
-    young_modulus_pa: float = 2e9
-    """Stiffest material of a soft robot."""
+    young_modulus_pa: tuple[float, float] = (3e3, 2e9)
+    """Softest gel and stiffest material of a soft robot."""
+    density_kg_m3: float = 20.0
+    """Lightest foam."""
+    gravity_m_s2: tuple[float, float] = (0.02, 0.05)
+    """Gravity in units of g has the length 1 up to this; gravity that only turns keeps its length up to this share."""
+    aspect: float = 1.4
+    """Ratio of the focal lengths: images of 16 : 9 that were squeezed to 4 : 3 have 1.33."""
+    off_centre: float = 0.25
+    """Distance of the principal point from the middle of the image, as a share of its size."""
     focal_share: tuple[float, float] = (0.05, 50.0)
     """Focal length over the width of the image."""
     distortion: float = 10.0
@@ -58,11 +68,28 @@ class Ranges:
     """A cable that turns farther than this at one point doubles back."""
     coincident: float = 1e-6
     """Nodes nearer than this, over the diagonal, are at one place."""
+    rest_sizes: float = 2.0
+    """Distance of the markers at rest from those of the frames, over the span of the latter: a body bends by less."""
     camera_m: float = 20.0
     """Distance of a camera from its robot."""
 
 
 RANGES = Ranges()
+SPELLED = {
+    "ms": "milliseconds",
+    "µs": "microseconds",
+    "ns": "nanoseconds",
+    "min": "minutes",
+    "h": "hours",
+    "d": "days",
+    "mm": "millimetres",
+    "cm": "centimetres",
+    "in": "inches",
+    "µm": "micrometres",
+}
+"""Names of units in questions, where the short one would be misread."""
+ABSOLUTE = {"Pa": 1.0, "hPa": 100.0}
+"""Units in which barometers and FluidPressure count from a vacuum, and how many pascals they are."""
 
 
 # Recordings
@@ -80,6 +107,8 @@ def doubts_of_recording(recording: Recording, robot: Robot | None = None) -> lis
         *doubts_of_pressures(recording, robot),
         *doubts_of_cameras(recording),
         *doubts_of_marker_places(recording),
+        *doubts_of_rest(recording),
+        *doubts_of_gravity(recording),
         *doubts_of_loads(recording),
         *(doubts_of_poses(robot, recording) if robot is not None else ()),
     ]
@@ -93,12 +122,11 @@ def doubts_of_times(recording: Recording) -> list[str]:
     if not len(steps):
         return []
     step, (low, high) = float(np.median(steps)), RANGES.step_s
-    if step > high:
-        return [f"{where}: one frame every {step:.4g} s by {column}; is it in milliseconds?"]
-    if step < low:
-        unit = "days" if 86400.0 * step < high else "hours"
-        return [f"{where}: one frame every {step:.3g} s by {column}, {1.0 / step:.3g} a second; is it in {unit}?"]
-    return []
+    if low <= step <= high:
+        return []
+    unit = likely_meant(step, low, high, Quantity.TIME)
+    often = "" if step > high else f", {1.0 / step:.3g} a second"
+    return [f"{where}: one frame every {step:.4g} s by {column}{often}; is it in {unit}?"]
 
 
 def doubts_of_displacements(recording: Recording) -> list[str]:
@@ -146,8 +174,8 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
             of = f" of its max_pressure_pa of {most:.6g}" if np.isfinite(most) else ""
             units = likely_meant(largest, 2e3, min(most, high), Quantity.PRESSURE)
             found.append(f"{where}: chamber {name!r} reaches {largest:.4g} Pa{of}; is it in {units}? The column holds pascals")
-        elif RANGES.absolute_pa[0] < least < RANGES.absolute_pa[1]:
-            found.append(_absolute(where, name, least))
+        elif unit := next((unit for unit, size in ABSOLUTE.items() if _is_absolute(size * pressure)), None):
+            found.append(_absolute(where, name, least, unit))
         elif least < -ATMOSPHERE_PA:
             found.append(f"{where}: chamber {name!r} falls to {least:.6g} Pa, below a vacuum; is its unit or sign right?")
         elif largest > high:
@@ -155,10 +183,18 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
     return found
 
 
-def _absolute(where: str, name: str, least: float) -> str:
+def _is_absolute(pressure: FloatArray) -> bool:
+    """Whether pressures [Pa], shape (f,), never fall below that of the surroundings, or begin there and never come near zero."""
+    low, high = RANGES.absolute_pa
+    least = float(pressure.min(initial=np.inf))
+    return low < least < high or (least > RANGES.never_zero_pa and low < pressure[0] < high)
+
+
+def _absolute(where: str, name: str, least: float, unit: str) -> str:
+    other = "" if unit == "Pa" else f", and in {unit}"
     return (
-        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take what is above the "
-        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*Pa_abs does)"
+        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute{other}? Chambers take what is above "
+        f"the surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*{unit}_abs does)"
     )
 
 
@@ -169,11 +205,14 @@ def doubts_of_cameras(recording: Recording) -> list[str]:
         key = f"cameras.{name}" if name else "camera"
         if camera is not None:
             c = camera
-            problem = lens_problem(c.width, c.height, (c.fx, c.fy, c.cx, c.cy), c.distortion, c.distortion_model)
+            numbers = (c.fx, c.fy, c.cx, c.cy)
+            problem = lens_problem(c.width, c.height, numbers, c.distortion, c.distortion_model)
+            problem = problem or _lens_doubt(c.width, c.height, numbers)
             found += [f"{where}, {key}: {problem}"] if problem else []
         away = 0.0 if pose is None else float(np.linalg.norm(pose[:3, 3]))
         if away > RANGES.camera_m:
-            found.append(f"{where}, {key}: T_robot_camera puts the camera {away:.4g} m away; is its translation in millimetres?")
+            unit = likely_meant(away, 0.05, 2.0, Quantity.LENGTH)
+            found.append(f"{where}, {key}: T_robot_camera puts the camera {away:.4g} m away; is its translation in {unit}?")
     return found
 
 
@@ -188,6 +227,56 @@ def doubts_of_marker_places(recording: Recording) -> list[str]:
     return [
         f"{where}: {100 * behind:.0f} % of the markers lie behind the camera (z ≤ 0): are they in the camera's frame, z forward?"
     ]
+
+
+def doubts_of_rest(recording: Recording) -> list[str]:
+    """Return whether rest.csv has its markers far from where the frames have them, or in another unit."""
+    r, rest = recording, recording.rest
+    if rest is None:
+        return []
+    where, found = place_of(r, "rest.csv", "rest"), []
+    noise = float(np.nan_to_num(rest.std).max(initial=0.0))
+    if noise > RANGES.marker_noise_m:
+        found.append(f"{where}, column std_m: markers that were measured to {noise:.3g} m; is it in millimetres?")
+    for view in np.unique(rest.view):
+        mine = [(name, place) for name, place, v in zip(rest.names, rest.positions, rest.view) if v == view]
+        seen = {name: r.marker_xyz[(r.marker_index == i) & (r.marker_view == view)] for i, name in enumerate(r.marker_names)}
+        pairs = [(place, np.median(seen[name], axis=0)) for name, place in mine if len(seen.get(name, ()))]
+        if len(pairs) < 3:
+            continue
+        resting, moving = np.array(pairs).transpose(1, 0, 2)
+        size = float(np.linalg.norm(np.ptp(moving, axis=0)))
+        away = float(np.median(np.linalg.norm(resting - moving, axis=1)))
+        if away > RANGES.rest_sizes * size:
+            found.append(
+                f"{where}: its markers lie {away:.3g} m from where the frames have them, and these span {size:.3g} m: is it in the same "
+                "camera frame, and in metres?"
+            )
+    return found
+
+
+def doubts_of_gravity(recording: Recording) -> list[str]:
+    """Return whether the gravity of the frames is that of no place: in another unit, or of a length that changes."""
+    if recording.gravity is None:
+        return []
+    where = place_of(recording, "frames.csv", "gravity")
+    lengths = np.linalg.norm(recording.gravity, axis=1)
+    low, high = float(lengths.min(initial=np.inf)), float(lengths.max(initial=0.0))
+    doubt = gravity_doubt(float(np.median(lengths)))
+    if doubt:
+        return [f"{where}: {doubt}"]
+    if high - low > RANGES.gravity_m_s2[1] * high:
+        return [f"{where}: gravity is {low:.4g} to {high:.4g} m/s² long: where the base turns, it keeps its length"]
+    return []
+
+
+def gravity_doubt(length: float) -> str | None:
+    """Return why gravity of a length [m/s²] is in another unit; None where it can be right."""
+    if abs(length - 1.0) < RANGES.gravity_m_s2[0]:
+        return f"gravity is {length:.4g} m/s² long; is it in g? On earth it is 9.81 m/s²"
+    if length > 100.0:
+        return f"gravity is {length:.4g} m/s² long; is it in mm/s²? On earth it is 9.81 m/s²"
+    return None
 
 
 def doubts_of_loads(recording: Recording) -> list[str]:
@@ -253,6 +342,21 @@ def lens_problem(
     return None
 
 
+def _lens_doubt(width: int, height: int, numbers: Sequence[float]) -> str | None:
+    """Return what is unusual of a lens that images of a size [px] can have: pixels far from square, a middle far from the image's."""
+    fx, fy, cx, cy = numbers
+    if max(fx / fy, fy / fx) > RANGES.aspect:
+        return (
+            f"fx = {fx:g} and fy = {fy:g}: the pixels of a camera are nearly square; is one of another image size, or mistyped?"
+        )
+    if max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5)) > RANGES.off_centre:
+        return (
+            f"the principal point {cx:g}, {cy:g} is far from the middle of images of {width} × {height}: are the numbers in another "
+            "order, or of the uncropped images?"
+        )
+    return None
+
+
 # Poses
 
 
@@ -292,16 +396,19 @@ def _camera_in_body(robot: Robot, recording: Recording, T: FloatArray | None) ->
 
 def other_poses(T: FloatArray) -> Iterable[tuple[str, FloatArray]]:
     """Yield the usual misreadings of a pose T_robot_camera: name, and the pose that was meant."""
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    small = T.copy()
-    small[:3, 3] *= 1e-3
+    flip, forward = np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)
+    forward[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
     turned = T.copy()
     turned[:3, :3] = T[:3, :3].T
-    for scale, pose in (("", T), (" with its translation in millimetres", small)):
+    for name, size in (("", 1.0), ("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
+        pose, scale = T.copy(), f" with its translation in {name}" if name else ""
+        pose[:3, 3] *= size
+        if name:
+            yield f"a translation in {name}", pose
         yield f"the inverse (T_camera_robot){scale}", invert_pose(pose)
         yield f"OpenGL's axes (y up, z backwards){scale}", pose @ flip
         yield f"the inverse of OpenGL's view matrix{scale}", invert_pose(pose) @ flip
-    yield "a translation in millimetres", small
+        yield f"ROS's axes (x forward, z up){scale}", pose @ forward
     yield "a transposed rotation", turned
 
 
@@ -321,5 +428,5 @@ def place_of(recording: Recording, file: str, argument: str) -> str:
 
 def likely_meant(value: float, low: float, high: float, quantity: Quantity, *others: str) -> str:
     """Return the units, joined by "or", in which a value would be plausible."""
-    names = [unit.name for unit in likely_units(value, low, high, quantity)[:2]]
+    names = [SPELLED.get(unit.name, unit.name) for unit in likely_units(value, low, high, quantity)[:2]]
     return " or ".join([*names, *others]) or "another unit"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
-from femsense.core.text import did_you_mean, plain_name
+from femsense.core.text import did_you_mean, look_alike, plain_name
 from femsense.fem.mesh import embed_points
 from femsense.model.marker_units import check_marker_distances
 from femsense.model.plausibility import doubts_of_recording, place_of, warn_of
@@ -105,13 +106,11 @@ def _without_strangers(robot: Robot, recording: Recording) -> Recording:
             expected=", ".join(robot.marker_names) or "the robot declares no [[markers]]",
             hint=did_you_mean(strangers[0], robot.marker_names),
         )
-    result = _without_rest_strangers(known, recording)
+    result = _without_rest_strangers(robot, recording)
     if not strangers:
         return result
-    warnings.warn(
-        f"{place_of(recording, 'markers.csv', 'markers')}: markers that the robot {robot.name!r} lacks are left out: {', '.join(strangers)}",
-        stacklevel=3,
-    )
+    where = place_of(recording, "markers.csv", "markers")
+    warnings.warn(f"{where}: {_left_out(strangers, robot)}", stacklevel=3)
     names = [name for name in recording.marker_names if name in known]
     kept = np.array([recording.marker_names[i] in known for i in recording.marker_index], dtype=bool)
     index = [names.index(recording.marker_names[i]) for i in recording.marker_index[kept]]
@@ -121,15 +120,19 @@ def _without_strangers(robot: Robot, recording: Recording) -> Recording:
     )
 
 
-def _without_rest_strangers(known: set[str], recording: Recording) -> Recording:
-    rest = recording.rest
+def _left_out(strangers: Sequence[str], robot: Robot) -> str:
+    """Return the markers that the robot lacks as text, with those that are its own in another spelling."""
+    text = f"markers that the robot {robot.name!r} lacks are left out: {', '.join(strangers)}"
+    near = look_alike(strangers, robot.marker_names)
+    return text + (f"; are they {', '.join(near.values())} in another spelling? Rename them" if near else "")
+
+
+def _without_rest_strangers(robot: Robot, recording: Recording) -> Recording:
+    rest, known = recording.rest, set(robot.marker_names)
     if rest is None or known.issuperset(rest.names):
         return recording
     lost = sorted(set(rest.names) - known)
-    warnings.warn(
-        f"{place_of(recording, 'rest.csv', 'markers at rest')}: markers that the robot lacks are left out: {', '.join(lost)}",
-        stacklevel=4,
-    )
+    warnings.warn(f"{place_of(recording, 'rest.csv', 'markers at rest')}: {_left_out(lost, robot)}", stacklevel=4)
     kept = np.array([name in known for name in rest.names], dtype=bool)
     names = tuple(name for name in rest.names if name in known)
     left = RestMarkers(names, freeze(rest.positions[kept]), freeze(rest.std[kept]), freeze(rest.view[kept], np.int64))

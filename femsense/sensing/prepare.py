@@ -13,7 +13,7 @@ from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, Scan, parted, read_scan
-from femsense.core.arrays import BoolArray, FloatArray, as_points
+from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.error_field import facing_of, spread_field
@@ -62,6 +62,7 @@ def make_sensor(
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     surface = body_surface(robot.body.mesh)
     check_on_body(robot.body.mesh, places, where="at")
+    recording = _without_sensed_frames(recording, places, size)
     if not recording.has_clouds and not len(places):
         raise InputError(
             "no clouds, and no place of contact is given",
@@ -153,6 +154,16 @@ def _with_placements(robot: Robot, calibration: Calibration) -> Robot:
         if name in robot.marker_names:
             points[robot.marker_names.index(name)] = placement
     return robot.with_marker_points(points)
+
+
+def _without_sensed_frames(recording: Recording, places: FloatArray, size: float) -> Recording:
+    """Return the recording whose frames with a known load near a given place do not count as contact-free: that load is to be sensed."""
+    sensed_here = near_places(recording.load_points, places, size)
+    if recording.free is None or not sensed_here.any():
+        return recording
+    free = recording.free.copy()
+    free[recording.load_frame[sensed_here]] = False
+    return replace(recording, free=freeze(free))
 
 
 def _driven(robot: Robot, recording: Recording, calibration: Calibration, places: FloatArray, size: float) -> DrivenRobot:

@@ -219,6 +219,14 @@ def test_errors_are_one_json_object_too(run: Any, tmp_path: Path) -> None:
     assert said.status == 2 and "Missing argument" in said.json["error"]
 
 
+def test_backslashes_of_another_system_are_explained(run: Any, tmp_path: Path) -> None:
+    (tmp_path / "rec").mkdir()
+    said = run("inspect", f"{tmp_path}\\rec", "--json")
+    assert said.status == 2 and f"did you mean '{tmp_path}/rec'? Between folders stands /" in said.json["error"]
+    assert "Between folders stands /" in run("calibrate", "four-leg", r"D:\data\push", "--json").json["error"]
+    assert "Between folders" not in run("inspect", tmp_path / "none", "--json").json["error"]
+
+
 def test_warnings_are_one_line_each_and_stand_in_the_json(run: Any, tmp_path: Path, recording: Path) -> None:
     soft = write_block_robot(tmp_path / "soft", cells=(3, 1, 1), cables=None, material__young_modulus_pa=900.0, gravity=None)
     said = run("calibrate", soft, recording, "-o", tmp_path / "c.json", "--json")

@@ -19,7 +19,7 @@ from femsense.core.pose import make_pose, transform_points
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.recording import Recording, make_recording, with_marker_table
-from femsense.model.recording_parts import Drives, Timeline
+from femsense.model.recording_parts import Drives, RestMarkers, Timeline
 from femsense.model.robot import Robot
 
 TRIALS = DATA / "trials"
@@ -219,3 +219,11 @@ def test_labels_swapped_in_all_frames_are_named_where_the_body_moves() -> None:
 def test_gravity_in_another_unit_is_mentioned(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="is it in g"):
         load_robot(write_block_robot(tmp_path, gravity={"vector_m_s2": [0.0, 0.0, -1.0]}))
+
+
+def test_markers_at_rest_that_hold_the_pose_elsewhere_are_refused(robot: Robot) -> None:
+    xyz = seen(robot)
+    places, count = freeze(xyz[0] + np.array([1.0, 0.0, 0.0])), len(robot.marker_names)
+    rest = RestMarkers(robot.marker_names, places, freeze(np.full(count, 1e-5)), freeze(np.zeros(count), np.int64))
+    with pytest.warns(UserWarning, match="same camera frame"), pytest.raises(DataError, match="puts the robot elsewhere"):
+        calibrate(robot, replace(recorded(robot, xyz), rest=rest))

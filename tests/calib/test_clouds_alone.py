@@ -16,10 +16,11 @@ from femsense.calib.calibrate import calibrate
 from femsense.calib.cloud_pose_search import difference
 from femsense.calib.clouds_alone import views_without_markers
 from femsense.calib.visible_side import bare_from
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import surface_triangles
+from femsense.model.camera import Camera, CameraNoise
 from femsense.model.recording import Recording
 from femsense.pointcloud.rays import Surface
 
@@ -156,3 +157,12 @@ def test_walls_that_the_body_hides_are_not_expected_in_the_cloud() -> None:
     surface = Surface(np.array(shape.vertices), np.array(shape.faces))
     places = np.array([[0.0, 0.0, 0.02], [0.0, 0.0, -0.015], [0.0, 0.0, -0.02]])  # the top, the floor of the cavity, the bottom
     np.testing.assert_array_equal(bare_from(surface, places, np.array([0.0, 0.1, 0.995])), [True, False, False])
+
+
+def test_a_pose_that_the_clouds_leave_undetermined_is_refused(tmp_path: Path) -> None:
+    recording, states = record(INPUTS)
+    bare, _ = with_clouds(tmp_path, recording, states, EYES[:1], clutter=False, colored=True)
+    noise = CameraNoise("stereo", at_1m=0.5)
+    coarse = replace(bare, cameras=(Camera("", 160, 120, 150.0, 150.0, 79.5, 59.5, freeze(np.zeros(5)), 0.001, noise=noise),))
+    with pytest.raises(DataError, match="do not determine the pose of camera a"):
+        calibrate(arm(), coarse)

@@ -135,3 +135,11 @@ def test_an_unknown_dictionary_is_refused_where_the_robot_is_read(tmp_path: Path
     with pytest.raises(InputError, match="unknown dictionary") as error:
         load_robot(folder)
     assert "4X4_50" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["TIP", "Tip ", "ｔip"])
+def test_markers_in_another_spelling_are_named(name: str, tmp_path: Path) -> None:
+    markers = RECORDING_FILES["markers.csv"].replace("tip", name)
+    recording = load_recording(write_small_recording(tmp_path / "r", markers_csv=markers))
+    with pytest.warns(UserWarning, match="left out: .*; are they tip in another spelling"):
+        check_against(load_robot(write_block_robot(tmp_path / "robot")), recording)

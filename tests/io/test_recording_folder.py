@@ -867,3 +867,11 @@ def test_the_real_depth_frame() -> None:
     cloud = read_frame_cloud(r, 0)
     assert cloud is not None and len(cloud) == 290289 and cloud.colors is None
     assert 0.2 < cloud.points[:, 2].min() < cloud.points[:, 2].max() < 0.7
+
+
+def test_a_camera_may_have_a_pose_and_no_lens(tmp_path: Path) -> None:
+    pose = "T_robot_camera = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    r = load_recording(write_small_recording(tmp_path / "a", recording_toml=f"{TOML}[camera]\n{pose}"))
+    assert r.cameras == (None,) and r.T_robot_camera[0] is not None and r.T_robot_camera[0][0, 3] == 0.1
+    with pytest.raises(InputError, match="the camera lacks width"):
+        load_recording(write_small_recording(tmp_path / "b", recording_toml=f"{TOML}[camera]\n{pose}depth_unit_m = 0.001\n"))

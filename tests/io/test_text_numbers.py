@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from femsense.io.text_numbers import moment_in, notation_of, number_in
+from femsense.io.text_numbers import moment_in, month_stands_first, notation_of, number_in
 
 DAY = datetime(2026, 11, 27, tzinfo=UTC).timestamp()
 MORNING, EVENING = 10 * 3600.0 + 15 * 60.0, 22 * 3600.0 + 15 * 60.0
@@ -25,6 +25,9 @@ MORNING, EVENING = 10 * 3600.0 + 15 * 60.0, 22 * 3600.0 + 15 * 60.0
         (["1,234"], ",", ["1.234"]),
         (["−3,5e-3"], ",", ["-3.5e-3"]),
         (["north", "0,5"], ",", ["north", "0.5"]),
+        (["0,5", "12.345"], ".", ["0.5", "12345"]),
+        (["0,5", "0.25", "12.345"], ",", ["0.5", "0.25", "12.345"]),
+        (["12.345", "1.250"], ",", ["12.345", "1.250"]),
     ],
 )
 def test_marks_within_numbers(cells: list[str], default: str, plain: list[str]) -> None:
@@ -57,3 +60,19 @@ def test_dates_and_times_of_day(cell: str, seconds: float) -> None:
 @pytest.mark.parametrize("cell", ["a:b", "99:99", "13:00:00 PM", "31.31.2026 10:00:00", "1.2.3"])
 def test_what_is_no_time(cell: str) -> None:
     assert moment_in(cell) is None
+
+
+@pytest.mark.parametrize(
+    ("dates", "month"),
+    [
+        ([(3, 4, 2026), (3, 5, 2026)], True),
+        ([(3, 12, 2026), (3, 13, 2026)], True),
+        ([(3, 4, 2026), (4, 4, 2026)], False),
+        ([(30, 4, 2026), (1, 5, 2026)], False),
+        ([(3, 4, 2026), (3, 4, 2026)], False),
+        ([(12, 31, 2025), (1, 1, 2026)], True),
+        ([], False),
+    ],
+)
+def test_the_order_of_day_and_month_is_that_of_all_rows(dates: list[tuple[int, int, int]], month: bool) -> None:
+    assert month_stands_first(dates) is month

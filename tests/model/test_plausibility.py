@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import block_mesh, write_block_robot
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, freeze
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.mesh import TetMesh, to_quadratic
 from femsense.io.robot_toml import load_robot
 from femsense.model.body_doubts import doubts_of_body
+from femsense.model.camera import Camera
 from femsense.model.plausibility import doubts_of_cloud_places, doubts_of_recording, lens_problem
 from femsense.model.recording import Recording, make_recording
-from femsense.model.recording_parts import Drives, MarkerRows, Timeline, Views
+from femsense.model.recording_parts import Drives, MarkerRows, RestMarkers, Timeline, Views
 from femsense.model.robot import Robot
 
 FRAMES = 5
@@ -32,6 +34,9 @@ def recording(
     places: FloatArray | None = None,
     names: tuple[str, ...] = (),
     pose: FloatArray | None = None,
+    gravity: float | None = None,
+    last_gravity: float | None = None,
+    lens: Camera | None = None,
 ) -> Recording:
     """Return frames whose one input grows to a value, with the same markers [m] in each."""
     ramp = np.linspace(0.0, 1.0, FRAMES)[:, None]
@@ -51,15 +56,28 @@ def recording(
     count = len(seen)
     frame, index = np.repeat(np.arange(FRAMES), count), np.tile(np.arange(count), FRAMES)
     rows = MarkerRows(names, frame, index, np.tile(seen, (FRAMES, 1)), np.zeros(len(frame), dtype=np.int64))
-    views = Views(("",), (None,), (pose,), ((None,),) * FRAMES, ((None,),) * FRAMES)
-    return make_recording(Timeline(step * np.arange(FRAMES), np.arange(FRAMES)), drives=drives, markers=rows, views=views)
+    views = Views(("",), (lens,), (pose,), ((None,),) * FRAMES, ((None,),) * FRAMES)
+    weight = None
+    if gravity is not None:
+        weight = np.tile([0.0, 0.0, -gravity], (FRAMES, 1))
+        weight[-1, 2] = -(last_gravity or gravity)
+    return make_recording(
+        Timeline(step * np.arange(FRAMES), np.arange(FRAMES), gravity=weight), drives=drives, markers=rows, views=views
+    )
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
         ({"step": 50.0}, "is it in milliseconds?"),
-        ({"step": 5.8e-7}, "is it in days?"),
+        ({"step": 5.8e-7}, "is it in days or hours?"),
+        ({"step": 1e5}, "is it in microseconds?"),
+        ({"pressure": (98e3, 60e3)}, "is it absolute?"),
+        ({"pressure": (1013.25, 1100.0)}, "is it absolute, and in hPa?"),
+        ({"gravity": 1.0}, "is it in g?"),
+        ({"gravity": 9810.0}, "is it in mm/s²?"),
+        ({"gravity": 9.81, "last_gravity": 8.0}, "it keeps its length"),
+        ({"pose": make_pose(np.eye(3), [0.0, 0.0, 40.0])}, "in centimetres or inches?"),
         ({"pressure": (0.0, 1.2)}, "reaches 1.2 Pa; is it in bar"),
         ({"pressure": (0.0, 120.0)}, "is it in kPa"),
         ({"pressure": (101e3, 121e3)}, "is it absolute?"),
@@ -87,6 +105,9 @@ def test_what_is_hardly_meant_is_doubted_with_its_cause(given: dict, said: str) 
         {"pressure": (0.0, 2e3)},
         {"pressure": (0.0, 3e5)},
         {"pressure": (0.0, -8e4)},
+        {"pressure": (95e3, 0.0)},
+        {"gravity": 9.81},
+        {"gravity": 1.62},
         {"pressure": (0.0, 0.0)},
         {"tension": 0.02},
         {"tension": 60.0},
@@ -112,6 +133,33 @@ def test_what_robots_do_is_not_doubted(given: dict) -> None:
 def test_lenses_against_the_size_of_images(numbers: tuple[float, ...], distortion: list[float], said: str | None) -> None:
     problem = lens_problem(160, 120, numbers, distortion)
     assert (problem is None) if said is None else (problem is not None and said in problem)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ((525.0, 131.0, 79.5, 59.5), "nearly square"),
+        ((131.0, 131.0, 40.0, 59.5), None),
+        ((131.0, 131.0, 59.5, 110.0), "far from the middle"),
+        ((131.0, 175.0, 79.5, 59.5), None),
+    ],
+)
+def test_unusual_lenses_are_doubted(numbers: tuple[float, ...], said: str | None) -> None:
+    fx, fy, cx, cy = numbers
+    doubts = doubts_of_recording(recording(lens=Camera("", 160, 120, fx, fy, cx, cy, freeze(np.zeros(5)), 0.001)))
+    assert (doubts == []) if said is None else (len(doubts) == 1 and said in doubts[0])
+
+
+@pytest.mark.parametrize(
+    ("shift", "std", "said"), [(0.0, 1e-4, None), (0.5, 1e-4, "same camera frame"), (0.0, 0.2, "column std_m")]
+)
+def test_markers_at_rest_beside_those_of_the_frames(shift: float, std: float, said: str | None) -> None:
+    places = np.array([[0.0, 0.0, 0.4], [0.1, 0.0, 0.4], [0.1, 0.05, 0.4], [0.0, 0.05, 0.42]])
+    rest = RestMarkers(
+        ("a", "b", "c", "d"), freeze(places + np.array([shift, 0.0, 0.0])), freeze(np.full(4, std)), freeze(np.zeros(4), np.int64)
+    )
+    doubts = doubts_of_recording(replace(recording(places=places, names=("a", "b", "c", "d")), rest=rest))
+    assert (doubts == []) if said is None else (len(doubts) == 1 and said in doubts[0])
 
 
 @pytest.mark.parametrize(("shift", "said"), [(-0.5, "behind the camera"), (0.03, "nearer than depth cameras see"), (0.4, None)])
@@ -210,6 +258,8 @@ def test_a_cable_that_doubles_back_is_doubted() -> None:
 def test_limits_and_moduli_in_another_unit_are_doubted() -> None:
     stiff = make_body(block_mesh(), young_modulus=150e9, poisson_ratio=0.45, density=1e3, clamped=[0, 1, 2])
     assert "stiffer than any soft robot" in doubts_of_body(stiff)[0]
+    soft = make_body(block_mesh(), young_modulus=1200.0, poisson_ratio=0.45, density=1.07, clamped=[0, 1, 2])
+    assert [text.partition(":")[0] for text in doubts_of_body(soft)] == ["material.young_modulus_pa", "material.density_kg_m3"]
     mesh = block_mesh()
     cable = tie_cable(mesh, "top", [[0.05, 0.015, 0.03]], [-0.01, 0.015, 0.03], max_tension=5000.0)
     pulled = make_body(mesh, young_modulus=1e5, poisson_ratio=0.45, density=1e3, clamped=[0, 1, 2], cables=(cable,))

@@ -259,3 +259,11 @@ def test_a_cloud_frame_whose_markers_are_elsewhere_is_not_ok(seen):
     run = estimate(arm(), replace(seen, marker_xyz=moved), calibrate(arm(), seen))
     assert "the markers lie" in run.frames[1].status and "mm off the body" in run.frames[1].status
     assert [frame.status for frame in run.frames[2:]] == ["ok", "ok"]
+
+
+def test_a_known_load_at_the_place_is_sensed_in_a_frame_that_is_declared_contact_free(touched):
+    recording, _ = touched
+    load = {"load_frame": np.array([3]), "load_points": TIP[None], "load_forces": 2 * FORCE[None]}
+    declared = replace(recording, free=np.array([True, True, False, True]), **load)
+    run = estimate(arm(), declared, calibrate(arm(), recording), at=TIP)
+    assert abs(run.known_loads[0].error_percent) < 15 and run.frames[3].status == "ok"

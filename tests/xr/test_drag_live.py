@@ -32,7 +32,7 @@ from femsense.xr.view import live_page_files
 
 pytest.importorskip("websockets")
 
-DRAG = """
+BEGIN = """
 const page = await opened.newPage({ viewport: { width: 900, height: 600 } });
 const say = (what) => console.log(JSON.stringify(what));
 const told = () => new Promise((done) => process.stdin.once('data', done));
@@ -49,9 +49,13 @@ await page.goto(given[0]);
 await page.waitForFunction((robot) => femsense.shown.robots.get(robot)?.shown, robot, { timeout: 60000 });
 await page.keyboard.press(' ');                                // the run no longer plays here
 await page.click('#drag');
-await page.click('#arm');
 await page.waitForTimeout(500);
 const [x, y] = await ball();
+"""
+DRAG = (
+    BEGIN
+    + """
+await page.click('#arm');
 await page.mouse.move(x, y);
 await page.mouse.down();
 await page.mouse.move(x - 3, y - 12, { steps: 4 });
@@ -67,6 +71,32 @@ await page.waitForTimeout(1000);
 say({ armed: await on('#arm') });
 await opened.close();
 """
+)
+STOP = (
+    BEGIN
+    + """
+const other = await opened.newPage({ viewport: { width: 390, height: 844 } });      // neither drags nor is armed
+await other.goto(given[0]);
+await other.waitForSelector('#stop', { state: 'visible' });
+await other.evaluate(() => femsense.shown.stage.renderer.setAnimationLoop(null));      // the machine draws for one page only
+const stops = [() => other.click('#stop'), () => other.keyboard.press('Escape'), () => page.keyboard.press('Escape')];
+for (const stop of stops) {
+  await page.click('#arm');
+  await page.mouse.move(x, y);
+  await page.mouse.down();
+  await page.mouse.move(x - 3, y - 12, { steps: 4 });
+  say({ armed: await on('#arm') });
+  await told();
+  await stop();
+  await page.waitForFunction(() => document.querySelector('#arm').getAttribute('aria-pressed') === 'false', null, { timeout: 20000 });
+  await page.mouse.move(x - 6, y - 20, { steps: 4 });        // the button is still down
+  say({ armed: await on('#arm') });
+  await told();
+  await page.mouse.up();
+}
+await opened.close();
+"""
+)
 
 
 def moving_run(folder: Path) -> Path:
@@ -152,3 +182,28 @@ def test_the_robot_follows_a_pointer_never_jumps_and_stays_when_the_connection_i
     assert missed < 2e-3 and went > 3e-3 and "measured" in seen["reach"]
     most = options.gate.range_per_s * np.array([one.high - one.low for one in server.gate.inputs]) / options.gate.command_hz
     assert len(commands) > 20 and (np.abs(np.diff(commands, axis=0)) <= most + 1e-9).all()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_bystander_s_button_and_anybody_s_escape_key_stop_the_robot(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    run = moving_run(tmp_path)
+    with stream_runs([run], StreamOptions(port=0, page=built_page, commands=True)) as live:
+        server = let_drag(live, run, DragOptions(gate=GateOptions(allowed=True)))
+        commands = commanded(live.hub)
+        browser = start_browser(request.config, STOP, live.url, server.name)
+        try:
+            for _ in range(3):
+                count = len(commands)
+                assert said(browser) == {"armed": "true"}
+                assert within(20.0, lambda count=count: len(commands) > count)
+                go_on(browser)
+                assert said(browser) == {"armed": "false"}
+                assert within(5.0, lambda: not server.gate.moving)
+                count = len(commands)
+                time.sleep(0.5)
+                assert len(commands) == count  # the held button moves nothing any more
+                go_on(browser)
+        finally:
+            browser.kill()

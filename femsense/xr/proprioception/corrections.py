@@ -7,7 +7,9 @@
     afresh:    y' = C z + d           a linear map of the labelled frames alone
 
 Each is fitted to some blocks of labelled frames and tested on the others. A more complex one is chosen only if its improvement on
-the test blocks is significant at the 5 % level.
+the test blocks is significant at the 5 % level. The linear maps, with and without the model, differ in their penalties only: among them the
+smallest mean distance decides. (The mean square is that of the few frames in which a map extrapolates: over 15 pairs of days of a real arm
+the maps that it selected had errors up to 1.47 times as large as the best one, and those of the mean distance 1.21 times.)
 """
 
 from __future__ import annotations
@@ -44,8 +46,10 @@ REFINED = 3
 AFRESH = "afresh"
 LINES = tuple(f"base, line {x}" for x in (0.01, 0.1, 1.0))
 MAPS_AFRESH = tuple(f"{AFRESH} {x}" for x in (1.0, 0.1, 0.01, 1e-4))
-CORRECTIONS = ("none", "channel", "base", "channel, base", "zeros", "base, zeros", *LINES, *MAPS_AFRESH)
+SIMPLE = ("none", "channel", "base", "channel, base", "zeros", "base, zeros")
 """From simple to less simple."""
+LINEAR = (*LINES, *MAPS_AFRESH)
+CORRECTIONS = (*SIMPLE, *LINEAR)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,25 +97,29 @@ class Frames:
 def explain(frames: Frames) -> tuple[str, dict[str, float]]:
     """Return the correction that explains labelled frames, and the error of each on frames it was not fitted to [m]."""
     errors = {name: frames.errors(name) for name in CORRECTIONS}
-    chosen = CORRECTIONS[0]
-    for name in CORRECTIONS[1:]:
-        like = name.startswith(AFRESH) and chosen.startswith(AFRESH)  # among maps learnt afresh, the smallest error decides
-        if marker_rms(errors[name]) < marker_rms(errors[chosen]) if like else is_better(errors[name], errors[chosen]):
+    chosen = SIMPLE[0]
+    for name in (*SIMPLE[1:], min(LINEAR, key=lambda name: float(_distances(errors[name]).mean()))):
+        if is_better(errors[name], errors[chosen]):
             chosen = name
     return chosen, {name: marker_rms(found) for name, found in errors.items()}
 
 
 def is_better(errors: FloatArray, than: FloatArray, *, seed: int = 0) -> bool:
-    """Whether errors are smaller than others of the same frames, shape (n, 3 m), by a tenth, and not by chance.
+    """Whether errors are smaller than others of the same frames, shape (n, 3 m), by a tenth of the mean distance, and not by chance.
 
     Parts in time are drawn again and again (Künsch 1989), the same of both; in 95 of 100 drawings they have to be smaller.
     """
-    if marker_rms(errors) >= BETTER * marker_rms(than):
+    if _distances(errors).mean() >= BETTER * _distances(than).mean():
         return False
-    gained = (than**2 - errors**2).sum(axis=1)
+    gained = (_distances(than) - _distances(errors)).sum(axis=1)
     parts = np.array([part.sum() for part in np.array_split(gained, min(RESAMPLED, len(gained)))])
     drawn = np.random.default_rng(seed).integers(len(parts), size=(RESAMPLES, len(parts)))
     return bool(np.quantile(parts[drawn].sum(axis=1), 0.05) > 0.0)
+
+
+def _distances(errors: FloatArray) -> FloatArray:
+    """Return the distance of each marker [m], shape (n, m), of errors, shape (n, 3 m)."""
+    return np.asarray(np.linalg.norm(errors.reshape(len(errors), -1, 3), axis=2))
 
 
 def corrected(frames: Frames, name: str) -> Network:

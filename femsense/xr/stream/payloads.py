@@ -157,6 +157,8 @@ class TwinFrame:
     """Number in the recording; -1: none."""
     run_s: float = float("nan")
     """From the beginning of a run that is played over and over."""
+    interval_m: Mapping[str, float] = field(default_factory=dict)
+    """Marker of a learnt model → radius of the 95 % interval of its position [m]."""
     cloud: npt.NDArray[np.float32] | None = None
     """Measured points and their distance from the surface [m], shape (n, 4)."""
     field: npt.NDArray[np.uint8] | None = None
@@ -264,7 +266,7 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
 
 
 def force_bytes(seq: int, frame: TwinFrame, frame_id: str = "robot") -> bytes:
-    """Return contacts and forces of a moment, in the frame of reference `frame_id`, with standard deviations."""
+    """Return contacts and forces of a moment, in the frame of reference `frame_id`, with standard deviations, and intervals of markers."""
     document: dict[str, Any] = {
         "header": header(seq, frame.time_s, frame_id),
         "frame": frame.frame,
@@ -274,6 +276,8 @@ def force_bytes(seq: int, frame: TwinFrame, frame_id: str = "robot") -> bytes:
     }
     if frame.contacts is not None:
         document["contacts"] = [_contact_table(contact) for contact in frame.contacts]
+    if frame.interval_m:
+        document["markers"] = [{"name": name, "interval_m": radius} for name, radius in frame.interval_m.items()]
     return _json(_known(document))
 
 

@@ -116,7 +116,8 @@ def frames_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterato
             bones = bone_rows(pose.bones.T_robot_bone @ straight)  # bones that have the robot's axes at rest
         said = "; ".join(item.text for item in pose.outside[:2])
         inputs = tuple(float(v) for v in row)
-        yield TwinFrame(time_s, bones, contacts=None, inputs=inputs, status=said or "ok", read_at=read_at)
+        known = {} if pose.interval is None else dict(zip(model.marker_names, pose.interval.tolist()))
+        yield TwinFrame(time_s, bones, contacts=None, inputs=inputs, status=said or "ok", read_at=read_at, interval_m=known)
 
 
 def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray], str]]:

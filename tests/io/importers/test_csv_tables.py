@@ -187,3 +187,15 @@ def test_dates_and_times_in_two_columns(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("Date,Time,tip_x_m,tip_y_m,tip_z_m\n" + rows)
     recording, _ = imported(tmp_path / "take.csv", tmp_path)
     np.testing.assert_allclose(recording.time_s, TIMES, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("days", "order"), [(("03/04/2026", "03/05/2026"), "month/day"), (("03/04/2026", "04/04/2026"), "day/month")]
+)
+def test_dates_with_slashes_have_one_order_in_all_rows(days: tuple[str, str], order: str, tmp_path: Path) -> None:
+    clock = [f"{days[0]} 23:59:58", f"{days[0]} 23:59:59", f"{days[1]} 00:00:00", f"{days[1]} 00:00:01"]
+    rows = "".join(f"{time},0.1,0.2,0.{k}\n" for k, time in enumerate(clock))
+    (tmp_path / "take.csv").write_text(f"time,tip_x_m,tip_y_m,tip_z_m\n{rows}")
+    recording, _ = imported(tmp_path / "take.csv", tmp_path)
+    np.testing.assert_allclose(np.diff(recording.time_s), 1.0)
+    assert any(f"read as {order}/year" in note for note in open_source(tmp_path / "take.csv").notes)

@@ -57,11 +57,17 @@ PLAIN = {
     "two cameras.json": json.dumps(
         {"color": {"K": [525, 0, 80, 0, 525, 60, 0, 0, 1]}, "depth": {"K": [FX, 0, CX, 0, FY, CY, 0, 0, 1]}}
     ),
+    "matlab object.txt": f"% 2026-11-27\nFocalLength: [{FX} {FY}]\nPrincipalPoint: [{CX} {CY}]\nSkew: 0\n",
+    "opencv.xml": f'<?xml version="1.0"?>\n<!-- 9 x 6 --><opencv_storage>\n<image_Width>160</image_Width>\n<camera_matrix type_id="opencv-'
+    f'matrix">\n<rows>3</rows><cols>3</cols><dt>d</dt><data>{FX} 0. {CX} 0. {FY} {CY} 0. 0. 1.</data></camera_matrix></opencv_storage>',
     "bop.json": json.dumps({"cam_K": [FX, 0, CX, 0, FY, CY, 0, 0, 1], "depth_scale": 0.1}),
 }
 DISTORTED = {
     "behind a matrix.txt": rows(K, (3, 3)) + f"\n{BENT}\n",
     "behind four.txt": f"{FX} {FY} {CX} {CY} {BENT}",
+    "matlab object bent.txt": f"RadialDistortion: [0.1 -0.2 0.03]\nTangentialDistortion: [0.001 0.002]\nFocalLength: [{FX} {FY}]\n"
+    f"PrincipalPoint: [{CX} {CY}]\n",
+    "beside a matrix.yaml": f"K: [{FX}, 0, {CX}, 0, {FY}, {CY}, 0, 0, 1]\nk1: 0.1\nk2: -0.2\np1: 0.001\np2: 0.002\nk3: 0.03\n",
     "orb.yaml": f"%YAML:1.0\nCamera.fx: {FX}\nCamera.fy: {FY}\nCamera.cx: {CX}\nCamera.cy: {CY}\nCamera.k1: 0.1\nCamera.k2: -0.2\n"
     "Camera.p1: 0.001\nCamera.p2: 0.002\nCamera.k3: 0.03\nCamera.fps: 30.0\n",
     "opencv.yaml": f"%YAML:1.0\n---\nimage_width: 160\nimage_height: 120\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
@@ -114,12 +120,29 @@ def test_of_two_cameras_of_kalibr_the_first_is_read_and_that_is_noted(tmp_path: 
         ("width: 640\nheight: 480\nfx: 525\nfy: 525\ncx: 319.5\ncy: 239.5\n", "another size than the images"),
         (f"fx: {FX}\nfy: {FY}\ncx: {CX}\ncy: {CY}\nk1: 0.2\ndistortion_model: fov\n", "unknown distortion model"),
         ("hello 3 world", "no lens in this file"),
+        (f"{FX} 12 {CX}\n0 {FY} {CY}\n0 0 1\n", "a lens with skew"),
+        (f"ImageSize: [120 160]\nFocalLength: [{FX} {FY}]\nPrincipalPoint: [{CX} {CY}]\n", "are these rows, columns?"),
     ],
 )
 def test_what_is_no_lens_of_the_images_is_refused(text: str, match: str, tmp_path: Path) -> None:
     (tmp_path / "camera.txt").write_text(text)
     with pytest.raises(InputError, match=match):
         read_lens(tmp_path / "camera.txt", WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{FX} 0.1 {CX}\n0 {FY} {CY}\n0 0 1\n", "a skew of 0.1 is left out"),
+        (f"fx: {FX}\nfy: {FY}\ncx: {CX}\ncy: {CY}\ndistortion: 0.1 -0.2\n", "distortion: not read"),
+        (f"fx: {FX}\nfy: {FY}\ncx: {CX}\ncy: {CY}\nlens_coefficients: 0.1 -0.2 0 0\n", "lens_coefficients: not read"),
+    ],
+)
+def test_numbers_of_a_lens_that_are_left_out_are_noted(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "camera.txt").write_text(text)
+    lens, notes = read_lens(tmp_path / "camera.txt", WIDTH, HEIGHT)
+    assert (lens.fx, lens.cy) == (FX, CY) and not lens.distortion.any()
+    assert any(said in note for note in notes)
 
 
 def redwood(folder: Path, lens: str, depth: int = 500, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Path:

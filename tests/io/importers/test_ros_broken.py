@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,3 +96,13 @@ def test_a_million_points(tmp_path: Path) -> None:
         bag.write("/points", START_NS, bag.cloud(points, None, START_NS))
     imported(tmp_path / "take", tmp_path)
     np.testing.assert_array_equal(read_cloud(tmp_path / "recording/clouds/000000.ply").points, points.astype(float))
+
+
+def test_points_beyond_the_width_of_a_cloud_are_said(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0.3, 0.4, (50, 3)).astype("<f4")
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(2):
+            message = bag.cloud(points, None, START_NS + k * 10**8)
+            bag.write("/points", START_NS + k * 10**8, replace(message, width=30, row_step=30 * message.point_step))
+    with pytest.warns(UserWarning, match=r"240 bytes of a cloud beyond its width and height are not read"):
+        imported(tmp_path / "take", tmp_path)

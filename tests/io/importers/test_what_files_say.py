@@ -86,26 +86,26 @@ def qualisys(frames: int = 5, *, announced: int = 5, titles: bool = True, kind: 
     head = f"NO_OF_FRAMES\t{announced}\nNO_OF_CAMERAS\t6\nNO_OF_MARKERS\t2\nFREQUENCY\t100\nDESCRIPTION\t--\n"
     head += f"TIME_STAMP\t2026-11-27, 10:15:00\t1.5\nDATA_INCLUDED\t{kind}\nMARKER_NAMES\ttip\tleft\n"
     head += "Frame\tTime\ttip X\ttip Y\ttip Z\tleft X\tleft Y\tleft Z\n" if titles else ""
-    rows = [f"{100 + k}\t200\t300\t10\t20\t{30 + k}" for k in range(frames)]
+    rows = [f"{100 + 5 * (k % 2)}\t200\t300\t10\t20\t{30 + k}" for k in range(frames)]  # x is no counter
     rows = [f"{k + 1}\t{0.01 * k:.5f}\t{row}" for k, row in enumerate(rows)] if titles else rows
     return head + "\n".join(rows) + "\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "kind"),
+    ("name", "text", "kind", "x"),
     [
-        ("take.trc", trc(), "trc"),
-        ("take.txt", trc(blank=""), "trc"),
-        ("take.tsv", qualisys(), "qualisys"),
-        ("bare.tsv", qualisys(titles=False), "qualisys"),
+        ("take.trc", trc(), "trc", 0.104),
+        ("take.txt", trc(blank=""), "trc", 0.104),
+        ("take.tsv", qualisys(), "qualisys", 0.1),
+        ("bare.tsv", qualisys(titles=False), "qualisys", 0.1),
     ],
 )
-def test_trc_and_qualisys(name: str, text: str, kind: str, tmp_path: Path) -> None:
+def test_trc_and_qualisys(name: str, text: str, kind: str, x: float, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
     assert guess_format(tmp_path / name) == kind and contents(tmp_path / name)["markers"] == ["tip", "left"]
     recording, _ = imported(tmp_path / name, tmp_path)
     assert recording.marker_names == ("tip", "left")
-    np.testing.assert_allclose(marker_grid(recording)[4], [[0.104, 0.2, 0.3], [0.01, 0.02, 0.034]], atol=1e-9)
+    np.testing.assert_allclose(marker_grid(recording)[4], [[x, 0.2, 0.3], [0.01, 0.02, 0.034]], atol=1e-9)
     np.testing.assert_allclose(recording.time_s, 0.01 * np.arange(5), atol=1e-9)
 
 

@@ -65,6 +65,8 @@ def plain(value: Any) -> bool:
 def test_documents_say_what_is_known_and_leave_out_what_is_not() -> None:
     force = json.loads(payloads.force_bytes(9, moment(3.5, contact=True)))
     assert "contacts" not in json.loads(payloads.force_bytes(9, replace(moment(3.5), contacts=None)))
+    learnt = json.loads(payloads.force_bytes(9, replace(moment(3.5), contacts=None, interval_m={"tip": 0.002})))
+    assert learnt["markers"] == [{"name": "tip", "interval_m": 0.002}] and "markers" not in force
     assert payloads.header(0, 2.9999999999, "robot")["stamp"] == {"secs": 3, "nsecs": 0}
     assert force["header"] == {"seq": 9, "stamp": {"secs": 3, "nsecs": 500_000_000}, "frame_id": "robot"}
     (contact,) = force["contacts"]

@@ -45,6 +45,9 @@ TEXT_NAMES = (
     "calibration.csv",
     "intrinsics.csv",
     "camera.csv",
+    "calibration.xml",
+    "camera.xml",
+    "intrinsics.xml",
 )
 FILES = JSON_NAMES + TEXT_NAMES
 """Files of a lens in a folder of images; the first that is there is read."""
@@ -64,10 +67,26 @@ NAMES = {
     "k4": ("k4",),
     "k5": ("k5",),
     "k6": ("k6",),
+    "skew": ("skew",),
 }
 """Names of the numbers of a lens, in small letters."""
-PAIRS = {"focal_length": ("fx", "fy"), "focal": ("fx", "fy"), "principal_point": ("cx", "cy"), "center": ("cx", "cy")}
-"""Names of two numbers."""
+PAIRS = {
+    "focal_length": ("fx", "fy"),
+    "focallength": ("fx", "fy"),
+    "focal": ("fx", "fy"),
+    "principal_point": ("cx", "cy"),
+    "principalpoint": ("cx", "cy"),
+    "center": ("cx", "cy"),
+    "radial_distortion": ("k1", "k2", "k3"),
+    "radialdistortion": ("k1", "k2", "k3"),
+    "tangential_distortion": ("p1", "p2"),
+    "tangentialdistortion": ("p1", "p2"),
+}
+"""Names of two or three numbers."""
+BY_BEND = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of distortion in OpenCV's order."""
+BENDS = re.compile(r"dist(?!ance)|radial|tangential|coeff", re.IGNORECASE)
+"""Names of numbers that bend rays."""
 BY_MODEL = {"pinhole": 4, "simple_pinhole": 3, "opencv": 8, "radtan": 8}
 """Models of COLMAP and DSO whose numbers are read in their order, and how many they have."""
 MATRICES = ("k", "cam_k", "intrinsic_matrix", "camera_matrix", "intrinsics", "intrinsic", "m1", "k_depth")
@@ -79,10 +98,14 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.
 WORD = re.compile(r"[A-Za-z_][\w./-]*")
 MODEL = re.compile(r"(?i)\b((?:distortion_|camera[_.])?(?:model|type))[\"']?\s*[:=]\s*[\"']?([A-Za-z][\w ]*)")
 COMMENT = re.compile(r"(?:#|//|%|^\s*;).*$|!!\S+|\bdt:\s*\w+")
+XML_HEAD = re.compile(r"<\?.*?\?>|<!--.*?-->", re.DOTALL)
+TAG = re.compile(r"<(/?)([\w.-]+)[^>]*>")
 AGAIN = " again"
 """Behind a name that stood before."""
 SHARE = 4.0
 """A focal length below this is a share of the image's size: of lenses with less than 14° no depth camera is known [1]."""
+SKEW = 0.5
+"""Largest shift by skew that is left out [px]: the resolution of an image."""
 CENTRED, SQUARE = 0.2, 0.15
 """The usual lens has its principal point this near to the middle (share of the size), and pixels this square."""
 
@@ -120,11 +143,13 @@ def read_lens(path: Path, width: int, height: int) -> tuple[Camera, list[str]]:
             where=path,
             found=f"{said[0]} × {said[1]}",
             expected=f"{width} × {height}",
-            hint="scale fx, fy, cx, cy by the ratio of the sizes",
+            hint="the size is width, height: are these rows, columns?"
+            if said == (height, width)
+            else "scale fx, fy, cx, cy by the ratio of the sizes",
         )
     numbers, notes = _in_pixels(numbers, width, height)
-    order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    named = [numbers.get(key, 0.0) for key in order] if any(key in numbers for key in order) else []
+    notes += _check_skew(numbers, height, path)
+    named = [numbers.get(key, 0.0) for key in BY_BEND] if any(key in numbers for key in BY_BEND) else []
     distortion = found.distortion or named
     name = _model_name(text) if any(distortion) else ""
     if name not in MODELS:
@@ -132,6 +157,21 @@ def read_lens(path: Path, width: int, height: int) -> tuple[Camera, list[str]]:
         raise InputError("an unknown distortion model", where=path, found=name, expected=known)
     focal, middle = (numbers["fx"], numbers["fy"]), (numbers["cx"], numbers["cy"])
     return check_lens(camera_of_numbers(width, height, focal, middle, distortion, MODELS[name]), path), [*found.notes, *notes]
+
+
+def _check_skew(numbers: Mapping[str, float], height: int, path: Path) -> list[str]:
+    """Return that a small skew is left out. Raises InputError for one that shifts a pixel at the edge of the images by more than SKEW."""
+    skew = numbers.get("skew", 0.0)
+    shift = abs(skew) * 0.5 * height / numbers["fy"] if numbers["fy"] else 0.0
+    if shift > SKEW:
+        raise InputError(
+            "a lens with skew",
+            where=path,
+            found=f"{skew:g} beside fx, which shifts pixels by up to {shift:.3g}",
+            expected="0: pixels are rectangles",
+            hint="is the matrix in another order? Else rectify the images",
+        )
+    return [f"a skew of {skew:g} is left out: it shifts no pixel by more than {shift:.2g}"] if skew else []
 
 
 def _model_name(text: str) -> str:
@@ -227,24 +267,28 @@ def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
     """Return what names say: of a matrix, or of fx, cx and the like; None where they name no lens."""
     single = {KNOWN[name]: values[0] for name, values in flat.items() if name in KNOWN and len(values) == 1}
     sizes = next((flat[name] for name in SIZES if len(flat.get(name, ())) == 2), None)
-    size = dict(zip(("width", "height"), sizes)) if sizes else {}
-    size |= {key: single[key] for key in ("width", "height") if key in single}
+    beside = dict(zip(("width", "height"), sizes)) if sizes else {}
+    beside |= {key: single[key] for key in ("width", "height") if key in single}
     distortion = next((flat[name] for name in DISTORTIONS if len(flat.get(name, ())) >= 4), [])
     for name, keys in PAIRS.items():
-        single |= dict(zip(keys, flat[name])) if len(flat.get(name, ())) == 2 else {}
+        single |= dict(zip(keys, flat[name])) if 2 <= len(flat.get(name, ())) <= len(keys) else {}
     if "f" in single:
         single = {"fx": single["f"], "fy": single["f"]} | single
+    beside |= {key: value for key, value in single.items() if key in BY_BEND}
+    unread = [name for name, values in flat.items() if BENDS.search(name) and any(values)]
+    known = distortion or any(key in single for key in BY_BEND)
+    notes = (f"{', '.join(unread)}: not read, and the lens has no distortion without",) if unread and not known else ()
     if {"fx", "cx", "cy"} <= set(single):
-        return _Found({"fy": single["fx"]} | single | size, distortion)
+        return _Found({"fy": single["fx"]} | single | beside, distortion, notes)
     for name in (*MATRICES, *PROJECTIONS):
         numbers = _matrix(np.array(flat.get(name, ())))
         if numbers is None and len(flat.get(name, ())) in (4, 5, 8, 9):  # as Kalibr and OpenVINS write them
             numbers = dict(zip(("fx", "fy", "cx", "cy"), flat[name]))
         if numbers is not None:
-            return _Found(numbers | size, () if name in PROJECTIONS else distortion)
+            return _Found(numbers | beside, () if name in PROJECTIONS else distortion, () if name in PROJECTIONS else notes)
     matrices = [numbers for values in flat.values() if (numbers := _matrix(np.array(values))) is not None]
     same = matrices and all(one == matrices[0] for one in matrices)
-    return _Found(matrices[0] | size, distortion) if same else None
+    return _Found(matrices[0] | beside, distortion, notes) if same else None
 
 
 def _matrix(values: FloatArray) -> dict[str, float] | None:
@@ -258,7 +302,8 @@ def _matrix(values: FloatArray) -> dict[str, float] | None:
         below = K[1, 0] == K[2, 0] == K[2, 1] == 0.0
         rotation = max(abs(K[0, 0]), abs(K[1, 1])) <= 1.0 and not (0.2 < K[0, 2] < 0.8 and 0.2 < K[1, 2] < 0.8)
         if below and K[2, 2] == 1.0 and K[0, 0] != 0.0 and K[1, 1] != 0.0 and not rotation:
-            return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+            skew = {"skew": float(K[0, 1])} if K[0, 1] != 0.0 else {}
+            return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])} | skew
     return None
 
 
@@ -266,7 +311,12 @@ def _matrix(values: FloatArray) -> dict[str, float] | None:
 
 
 def _in_text(text: str, width: int, height: int) -> _Found | None:
-    lines = [COMMENT.sub("", line).strip() for line in text.splitlines()]
+    plain = (
+        TAG.sub(lambda tag: "\n" if tag[1] else f"\n{tag[2]}: ", XML_HEAD.sub("", text))
+        if text.lstrip().startswith("<")
+        else text
+    )
+    lines = [COMMENT.sub("", line).strip() for line in plain.splitlines()]
     lines = [line for line in lines if line]
     if notation_of(word for line in lines for word in line.split()).decimal == ",":
         lines = [re.sub(r"(?<=\d),(?=\d)", ".", line) for line in lines]

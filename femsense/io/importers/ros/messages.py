@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,10 @@ def cloud_of(message: Any, where: str | Path | None) -> PointCloud:
     stride = int(message.row_step) or size * int(message.width)
     if len(data) < stride * int(message.height) or stride < size * int(message.width) or not size:
         raise InputError("a broken cloud", where=where, found=f"{len(data)} bytes", expected=f"{count} points of {size} bytes")
+    more = len(data) - stride * int(message.height)
+    if more >= size:
+        text = f"{more} bytes of a cloud beyond its width and height are not read: are {count} points right?"
+        warnings.warn(f"{where}: {text}" if where else text, stacklevel=2)
     rows = data[: stride * int(message.height)].reshape(int(message.height), stride)[:, : size * int(message.width)]
     kind = np.dtype(
         {"names": list(formats), "formats": list(formats.values()), "offsets": [fields[n][0] for n in formats], "itemsize": size}

@@ -9,7 +9,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import plain_name
 from femsense.core.units import Quantity, Unit, unit_named
-from femsense.io.text_numbers import TIMES_READ, Notation, notation_of, number_in
+from femsense.io.text_numbers import SLASHED, TIMES_READ, Notation, month_stands_first, notation_of, number_in
 
 ENDINGS = (".csv", ".txt", ".tsv", ".trc")
 TIMES = (
@@ -108,14 +108,22 @@ class Layout:
 def layout_of(path: Path) -> Layout:
     """Return what stands between the cells of a table, and how its numbers are written."""
     with open_text(path) as stream:
-        return _layout(stream.read(8192))
+        return _layout(stream.read(8192), path)
 
 
-def _layout(head: str) -> Layout:
+def _layout(head: str, path: Path) -> Layout:
     lines = [line for line in head.splitlines()[:LOOKED_AT] if line.strip() and not _is_comment(line)]
     mark = next((m for m in MARKS if 2 * sum(m in line for line in lines) >= len(lines)), ",") if lines else ","
     cells = (cell for row in csv.reader(lines, delimiter=mark) for cell in row)
-    return Layout(mark, notation_of(cells, default="." if mark == "," else ","))
+    notation = notation_of(cells, default="." if mark == "," else ",")
+    return Layout(mark, replace(notation, month_first=_month_first(path)) if SLASHED.search(head) else notation)
+
+
+def _month_first(path: Path) -> bool:
+    """Return whether the month stands first in the dates with slashes of a whole table."""
+    with open_text(path) as stream:
+        found = (SLASHED.search(line) for line in stream)
+        return month_stands_first([(int(date[1]), int(date[2]), int(date[3])) for date in found if date])
 
 
 def rows_of(path: Path) -> Iterator[list[str]]:
@@ -125,7 +133,7 @@ def rows_of(path: Path) -> Iterator[list[str]]:
     Lines of comment before the table come as empty rows, but for one that names its columns (as NumPy writes them).
     """
     with open_text(path) as stream:
-        layout = _layout(stream.read(8192))
+        layout = _layout(stream.read(8192), path)
         stream.seek(0)
         begun, said = False, list[str]()
         for row in csv.reader(stream, delimiter=layout.mark):

@@ -59,6 +59,8 @@ class Export:
     unit: str | None
     time: int | None
     """Column of time [s]; None: the frame number over the rate."""
+    counter: int | None
+    """Column of the frame number; None: the rows are counted."""
     rate: float | None
     """[1/s]."""
     first: int
@@ -130,6 +132,7 @@ def read_export(path: Path) -> Export:
 
 def _rows(path: Path, export: Export, rate: float) -> Iterator[Row]:
     begun, columns = False, [j for _, axes in export.markers for j in axes]
+    count = 0
     for row in islice(rows_of(path), export.first, None):
         if not any(cell.strip() for cell in row):
             if export.program is Program.VICON and begun:
@@ -139,7 +142,9 @@ def _rows(path: Path, export: Export, rate: float) -> Iterator[Row]:
             warnings.warn(f"{path}: the last line was cut off and is left out", stacklevel=2)
             return
         begun = True
-        time = _cell(row, export.time) if export.time is not None else _cell(row, 0) / rate
+        number = float(count) if export.counter is None else _cell(row, export.counter)
+        time = number / rate if export.time is None else _cell(row, export.time)
+        count += 1
         yield Row(time, np.array([_cell(row, j) for j in columns]).reshape(-1, 3), {})
 
 
@@ -170,7 +175,7 @@ def _optitrack(head: list[list[str]], path: Path) -> Export:
     rate = pairs.get("Export Frame Rate") or pairs.get("Capture Frame Rate")
     announced = _whole(pairs.get("Total Exported Frames") or pairs.get("Total Frames in Take") or "")
     unit = pairs.get("Length Units")
-    return Export(Program.OPTITRACK, _distinct(found, kinds), unit, 1, _rate(rate or ""), axes_row + 1, announced)
+    return Export(Program.OPTITRACK, _distinct(found, kinds), unit, 1, 0, _rate(rate or ""), axes_row + 1, announced)
 
 
 def _trc(head: list[list[str]], path: Path) -> Export:
@@ -184,7 +189,7 @@ def _trc(head: list[list[str]], path: Path) -> Export:
     found = tuple((Track(name, name), (j, j + 1, j + 2)) for j, name in names)
     rate, frames, count = _rate(said.get("DataRate", "")), _whole(said.get("NumFrames", "")), _whole(said.get("NumMarkers", ""))
     first = next((i for i, row in enumerate(head) if i > 3 and row and plain_number(row[0]) is not None), 5)
-    return Export(Program.TRC, found, said.get("Units"), 1, rate, first, frames, count)
+    return Export(Program.TRC, found, said.get("Units"), 1, 0, rate, first, frames, count)
 
 
 def _qualisys(head: list[list[str]], path: Path) -> Export:
@@ -209,7 +214,17 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
     found = tuple((Track(name, name), (shift + 3 * k, shift + 3 * k + 1, shift + 3 * k + 2)) for k, name in enumerate(names))
     value = {key: _whole(row[0]) if row else None for key, row in said.items()}
     rate = _rate(said.get("FREQUENCY", [""])[0])
-    return Export(Program.QUALISYS, found, "mm", time, rate, first, value.get("NO_OF_FRAMES"), value.get("NO_OF_MARKERS"))
+    return Export(
+        Program.QUALISYS,
+        found,
+        "mm",
+        time,
+        0 if shift else None,
+        rate,
+        first,
+        value.get("NO_OF_FRAMES"),
+        value.get("NO_OF_MARKERS"),
+    )
 
 
 def _whole(cell: str) -> int | None:
@@ -234,7 +249,7 @@ def _vicon(path: Path) -> Export:
     starts = [j for j in range(2, len(axes) - 2) if axes[j : j + 3] == ["X", "Y", "Z"]]
     found = zip(tracks_of([_at(names, j) for j in starts]), [(j, j + 1, j + 2) for j in starts])
     unit = next((cell.strip() for cell in units if cell.strip()), None)
-    return Export(Program.VICON, tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
+    return Export(Program.VICON, tuple(found), unit, None, 0, _rate(section[1][0]), (start or 0) + 5)
 
 
 def _distinct(found: list[tuple[Track, Axes]], kinds: list[str]) -> tuple[tuple[Track, Axes], ...]:

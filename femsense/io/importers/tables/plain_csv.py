@@ -118,7 +118,9 @@ def notation_notes(path: Path) -> list[str]:
     """Return what was assumed of how a table writes its numbers."""
     notation = layout_of(path).notation
     decimal = ["numbers are read with decimal commas"] if notation.commas else []
-    return decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
+    order = "month/day/year" if notation.month_first else "day/month/year"
+    dates = [] if notation.month_first is None else [f"dates with slashes are read as {order}"]
+    return dates + decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
 
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:

@@ -141,8 +141,9 @@ export class Dragging {
   /** Records the holder of the lease. */
   leased(lease: Lease): void {
     if (lease === this.lease) return;
+    const stoppedNow = lease.stopped && lease.number !== this.lease?.number; // it is repeated until somebody holds a lease again
     this.lease = lease;
-    if (lease.stopped && (this.armed || this.held !== null)) {
+    if (stoppedNow && (this.armed || this.held !== null)) {
       this.letGo();
       this.tell("Stopped. Arm the robot again to go on.", "stopped", "");
     } else if (this.held !== null && lease.client && lease.client !== this.client) {
