@@ -209,9 +209,7 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
         return None
     record = final / RECORD
     if not record.is_file():
-        raise InputError(
-            "something stands there already", where=final, found="no import of femsense", expected="a new place for the recording"
-        )
+        raise InputError("the folder exists and is not an import", where=final, expected="a new folder for the recording")
     kept = json.loads(record.read_text(encoding="utf-8"))
     if again:
         check_unchanged(final)
@@ -219,8 +217,8 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
     if kept.get("identity") == json.loads(json.dumps(identity)):
         return dict(kept["found"])
     raise InputError(
-        "another import stands there already",
+        "the folder holds an import of another source or with other options",
         where=final,
         found=str(kept.get("identity", {}).get("source", ["?"])[0]),
-        expected="a new place, or --again to replace it",
+        expected="a new folder, or --again to replace it",
     )

@@ -75,7 +75,9 @@ def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]
             where=file,
             found=error.strerror,
             expected=expected,
-            hint="if a command was to make it, the summary.csv of that says why it has not" if missing else None,
+            hint="run the command that writes it first; of many recordings, its summary.csv states why this one has none"
+            if missing
+            else None,
         ) from None
     except ValueError as error:
         raise InputError("not valid JSON", where=file, found=error, expected=expected) from None

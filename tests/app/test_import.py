@@ -121,7 +121,7 @@ def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys
     (tmp_path / "mine/notes.txt").write_text("precious")
     for extra in ([], ["--again"]):
         status, document = answer(capsys, "import", table, "-o", tmp_path / "mine", "--unit", "mm", "--inputs", "tension", *extra)
-        assert status == 2 and "stands there already" in document["error"]
+        assert status == 2 and "exists and is not an import" in document["error"]
     assert (tmp_path / "mine/notes.txt").read_text() == "precious"
     status, _ = answer(capsys, "import", table, "-o", table, "--unit", "mm", "--inputs", "tension")
     assert status == 2 and table.read_text() == ROWS

@@ -99,7 +99,7 @@ def test_from_scripts_to_forces_with_one_table_and_a_second_run_that_does_nothin
     said = run(
         "estimate", robot, recordings, "-c", lab / "cal", "--at", "0.1,0.015,0.015", "-o", lab / "again", *IN_PROCESS, "--json"
     )
-    assert said.status == 1 and "summary.csv of that says why" in said.json["jobs"][1]["reason"]
+    assert said.status == 1 and "summary.csv states why" in said.json["jobs"][1]["reason"]
 
 
 def test_processes_make_the_same_bytes(run: Any, lab: Path) -> None:

@@ -508,7 +508,7 @@ def test_a_recording_that_fits_is_not_warned_of(tmp_path: Path, robot: Any) -> N
     ("header", "texts"),
     [
         ("cable_top", ["lacks side", "found:    cable_top\n", "expected: cable_top, cable_side"]),
-        ("cable_top,cable_side,cable_low", ["has low that the robot has not"]),
+        ("cable_top,cable_side,cable_low", ["has low, which the robot lacks", "--map low=cable_NAME"]),
         ("cable_top,cable_sides", ["lacks side and has sides", "did you mean 'side'?"]),
     ],
 )

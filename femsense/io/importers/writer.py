@@ -167,7 +167,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
 def _give_name(part: Path, final: Path, replace: bool) -> None:
     """Rename the finished folder. Raises InputError where something stands there that is not to be replaced."""
     if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
-        raise InputError("something stands there already", where=final, expected="a new place for the recording")
+        raise InputError("the folder exists and is not an import", where=final, expected="a new folder for the recording")
     if not final.exists():
         part.rename(final)
         return

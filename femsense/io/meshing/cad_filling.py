@@ -117,8 +117,8 @@ def fill_cad(
     if options.size_mm is not None:
         return fewest
     note = (
-        f"{len(fewest.mesh.tets)} tetrahedra rather than {wanted}: walls and detail ask for them, and what follows takes longer; "
-        f"--max-tets {wanted} has it filled farther from the faces, which can take minutes"
+        f"{len(fewest.mesh.tets)} tetrahedra instead of {wanted}, because of thin walls or fine detail; all later computations take longer "
+        f"in proportion. --max-tets {wanted} allows a coarser mesh, less close to the faces; that can take minutes"
     )
     return replace(fewest, done=(*fewest.done, note))
 

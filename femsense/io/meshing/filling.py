@@ -116,7 +116,7 @@ def fill(
     surface = replace(surface, points=freeze(surface.points / PER_METRE[unit]))
     crossing = len(np.unique(crossing_triangles(surface.points, surface.triangles)))
     if crossing:
-        note = f"{crossing} triangles cross others: what lies inside any of them was filled"
+        note = f"{crossing} triangles intersect others; the union of their interiors was filled"
         surface = replace(surface, done=(*surface.done, note))
     walls = int((sides(surface.triangles)[2] > 2).sum())
     if walls:
@@ -175,7 +175,7 @@ def _best(fits: Filled | None, fewest: Filled | None, options: MeshOptions, wher
     assert fewest is not None
     count, wanted = len(fewest.mesh.tets), options.most_tets or MOST_TETS
     if options.most_tets is None and count <= ENOUGH_TETS:
-        note = f"{count} tetrahedra rather than {wanted}: thin walls or fine detail ask for them, and what follows takes longer"
+        note = f"{count} tetrahedra instead of {wanted}, because of thin walls or fine detail; all later computations take longer in proportion"
         asked = options.size_mm is not None
         return fewest if asked else replace(fewest, done=(*fewest.done, note))
     hint = f"--max-tets {count}, or a larger --tolerance"

@@ -197,9 +197,9 @@ def mesh_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
     lines = [
         quality_text(report["quality"]),
-        f"  {'from the surface':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
+        f"  {'surface error':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
     ]
-    for title, texts in (("done to the surface", report["done"]), ("advice", report["advice"])):
+    for title, texts in (("notes", report["done"]), ("advice", report["advice"])):
         if texts:
             lines += ["", f"{title}:", *(f"  - {text}" for text in texts)]
     return "\n".join(lines)
@@ -331,7 +331,7 @@ def _chambers_text(mesh: TetMesh) -> str:
         f'# [[chambers]]\n# name = "chamber-{i + 1}"\n# seed_m = {_triple(seed)}\n# max_pressure_pa = 40e3\n'
         for i, seed in enumerate(seeds)
     ]
-    return "\n# YOURS: the cavities that were kept; with these lines one is a chamber under pressure.\n" + "".join(tables)
+    return "\n# YOURS: inner cavities. Uncommented, each table makes one a chamber under pressure.\n" + "".join(tables)
 
 
 def _triple(point: FloatArray | list[float]) -> str:

@@ -3,7 +3,7 @@
 The order is: weld, drop what repeats, turn neighbours the same way, close holes, find which shells lie inside which,
 choose the body. A shell inside another one is a cavity (a chamber), whichever way its triangles face.
 Shells that cross each other become one body:
-the filling takes what lies inside any of them.
+the filling takes the union of their interiors.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def test_shells_that_cross_are_filled_as_one(tmp_path: Path) -> None:
     both = trimesh.util.concatenate([trimesh.creation.box((100, 30, 30)), post])
     filled = fill(np.array(both.vertices), np.array(both.faces), MM)
     assert element_volumes(filled.mesh).sum() == pytest.approx(90e-6 + 20 * 20 * 35e-9, rel=0.02)
-    assert any("triangles cross others" in note for note in filled.done)
+    assert any("triangles intersect others" in note for note in filled.done)
 
 
 # The folder
@@ -245,7 +245,7 @@ def test_thin_walls_get_the_tetrahedra_that_they_ask_for_unless_somebody_says_ho
     walls = Walls((12, 8, 8), (11, 8, 8))  # 4608, then 4224: longer edges bring hardly fewer
     filled = fill(points, triangles, MeshOptions(unit="mm"), mesher=walls)
     assert len(filled.mesh.tets) == 6 * 11 * 8 * 8 and walls.calls == 2
-    assert any("4224 tetrahedra rather than 2000" in note for note in filled.done)
+    assert any("4224 tetrahedra instead of 2000" in note for note in filled.done)
     with pytest.raises(InputError, match="more tetrahedra than wanted") as error:
         fill(points, triangles, MeshOptions(unit="mm", most_tets=2000), mesher=Walls((12, 8, 8)))
     assert "--max-tets 4608" in str(error.value)
