@@ -55,12 +55,8 @@ def fit_joint(
         problem.weigh(jet, huber, len(theta))
     moved, inputs = problem.place(theta)
     fit = replace(fit, covariance=problem.beside_declared(jet, fit.covariance))
-    return (
-        fit,
-        moved,
-        inputs,
-        jet,
-    )  # an input at its bound is no better determined than others: their common error moves all of them
+    # an input at its bound is no better determined than others: their common error moves all of them
+    return fit, moved, inputs, jet
 
 
 def moved_by_law(

@@ -1,13 +1,9 @@
 """Gain and offset of a single cable's input, fitted together with the poses and a common gain of all cables.
 
-
 Each cable in turn, to first order about the calibration. Model errors, above all of the modulus, scale all cables equally, so the common
-
 gain is fitted too. With two cables, one that is too weak looks like the other one too strong: each cable that explains much is corrected
-
-and refitted, and the smallest residual decides. Standard errors alone would report model error as a wrong input (0.985 ± 0.003 for a
-
-gain of 1 on the arm of the tests).
+and refitted, and the smallest residual decides. Standard errors alone would report model error as a wrong input (0.985 ± 0.003 for a gain
+of 1 on the arm of the tests).
 """
 
 from __future__ import annotations

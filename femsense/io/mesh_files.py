@@ -31,13 +31,13 @@ SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron",
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
 
-    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder).
+    A closed surface is tetrahedralised on first use; the result is stored next to it (or in the cache folder).
     Nodes that no tetrahedron uses are dropped with a warning.
-    A mesh whose elements are all inverted has another order of nodes and is turned.
+    If all elements are inverted, the file uses another node order, which is converted.
 
     Arguments:
         path: the file.
-        where: what a message names; by default the file.
+        where: for messages; by default the file.
 
     Raises:
         InputError: no such file, not readable, no tetrahedra, other solid elements, an open surface.
@@ -126,8 +126,7 @@ def _with_points(path: Path, where: str) -> io.BytesIO | None:
 
 
 def _no_triangles(path: Path, where: str) -> InputError:
-    """Return what to say of a file without triangles: points alone are a cloud;
-    else it is something else than its ending says."""
+    """Return the message for a file without triangles: points alone are a cloud; otherwise the suffix does not fit the content."""
     with path.open("rb") as stream:
         head = stream.read(1_000_000)
     announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
@@ -224,7 +223,7 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
 
 
 def tet_values(path: Path, name: str, where: str) -> npt.NDArray[np.generic]:
-    """Return what a mesh file says of each tetrahedron of `read_tets`, shape (m, p): p values where it says several.
+    """Return the cell data of each tetrahedron of `read_tets`, shape (m, p), with p components.
 
     Raises:
         InputError: no tetrahedra, or no such cell data.
@@ -264,7 +263,7 @@ def _from_zero(tets: IntArray, count: int, where: str) -> IntArray:
 
 
 def _check_faces(mesh: TetMesh, where: str) -> None:
-    """Refuse elements that overlap: a face belongs to one tetrahedron, or lies between two. Raises InputError."""
+    """Refuse overlapping elements: a face belongs to one or two tetrahedra. Raises InputError."""
     faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
     count = np.unique(faces, axis=0, return_counts=True)[1]
     if len(count) and (count > 2).any():

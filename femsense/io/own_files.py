@@ -1,4 +1,4 @@
-"""Files of femsense, known by what they begin with and hold: only these give way to a new result of the same kind."""
+"""Files written by femsense, identified by their first bytes and content: only these are replaced by a new result of the same kind."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 from femsense.core.errors import InputError
 
 ENDS = 1 << 20
-"""So many bytes of both ends of a file are searched for what it holds."""
+"""Number of bytes at both ends of a file that are searched for the identifying text."""
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """What tells a file that femsense wrote from any other."""
+    """The identifying properties of a file that femsense wrote."""
 
     name: str
     """As messages call it."""
     begins: bytes
     """Its first bytes."""
     holds: bytes = b""
-    """What stands near its beginning or its end besides."""
+    """Further text near its beginning or end."""
 
     def fits(self, file: Path) -> bool:
         """Return whether a file is of this kind. Raises OSError where it cannot be read."""
@@ -76,12 +76,12 @@ DEMO = {
 
 
 def check_replaceable(file: Path, kind: FileKind | None, inputs: Iterable[str | Path] = ()) -> None:
-    """Refuse a place where another file stands than a kind of femsense, or one that is read; an empty file gives way.
+    """Refuse a path that exists as another kind of file, or is an input; an empty file is replaced.
 
-    `kind` None asks for no kind.
+    `kind` None accepts any kind.
 
     Raises:
-        InputError: with what stands there.
+        InputError: states the existing file.
     """
     if not file.exists():
         return

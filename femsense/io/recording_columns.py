@@ -1,4 +1,4 @@
-"""The columns of a recording's CSV files: what is read, and what the page of files says."""
+"""The columns of a recording's CSV files, for reading and for the page on files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class Column:
 
     name: str
     holds: str
-    """What it says, with its unit."""
+    """Its quantity and unit."""
     required: bool = True
 
 

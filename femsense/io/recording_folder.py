@@ -54,7 +54,7 @@ def load_recording(path: str | Path) -> Recording:
     """Load a recording folder (or its recording.toml). Clouds and images are found, not read.
 
     Raises:
-        InputError: with file, place, what was found and what was expected.
+        InputError: with file, place, found and expected value.
     """
     folder = _recording_folder(Path(path).expanduser())
     toml = folder / "recording.toml"
@@ -102,7 +102,7 @@ def _recording_folder(path: Path) -> Path:
 
 
 def _check_depth(clouds: Any, cameras: Sequence[Camera | None], views: Sequence[str], table: RecordingTable, toml: Path) -> None:
-    """Check what depth images need of recording.toml, on the first whole image of each view."""
+    """Check the entries of recording.toml that depth images need, on the first whole image of each view."""
     for v, name in enumerate(views):
         images = [files[v] for files in clouds if files[v] is not None and files[v].suffix.lower() == ".png"]
         if not images:

@@ -30,7 +30,7 @@ TOO_LONG = 5.0
 
 
 def read_frames(path: Path, actuation: str, actuation_zero: str) -> tuple[Timeline, Drives]:
-    """Return what stands in frames.csv; the actuation is recording.toml's. Raises InputError."""
+    """Return the content of frames.csv; `actuation` is that of recording.toml. Raises InputError."""
     if not path.is_file():
         raise InputError(
             "frames.csv is missing",

@@ -1,4 +1,4 @@
-"""recording.toml ↔ its tables: cameras, noise, tools; what is wrong with them."""
+"""recording.toml ↔ its tables: cameras, noise, tools, with their checks."""
 
 from __future__ import annotations
 

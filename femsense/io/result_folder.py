@@ -19,10 +19,10 @@ from femsense.io.own_files import FileKind, check_files
 
 @contextmanager
 def results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
-    """Yield an empty folder; what the block writes there moves into `folder` at its end, `marker` last.
+    """Yield an empty folder; the files that the block writes there are moved into `folder` at the end, `marker` last.
 
-    A new folder appears in one step. In one that is there, the old marker goes first, so that a folder with a marker is always
-    complete; its other files stay.
+    A new folder appears in one step. In an existing folder the old marker is removed first, so that a folder with a marker is always
+    complete; other files are kept.
     """
     root = Path(folder).expanduser().absolute()
     if not root.exists():
@@ -65,7 +65,7 @@ def read_document(file: Path, expected: str) -> dict[str, Any]:
 
 
 def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]:
-    """Return a JSON object; `expected` says what the file should be. Raises InputError."""
+    """Return a JSON object; `expected` describes the file in messages. Raises InputError."""
     try:
         document = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -107,7 +107,7 @@ def numbers_of(document: Mapping[str, Any], key: str, file: Path) -> dict[str, f
 
 
 def number_of(value: Any) -> float:
-    """Return a number of JSON, where null stands for one that is not finite."""
+    """Return a number of JSON; null means not finite."""
     return float("nan") if value is None else float(value)
 
 

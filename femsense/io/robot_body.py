@@ -41,7 +41,7 @@ SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
 FAR_CABLE = 0.25
 """A cable point farther outside than this times the mesh's diagonal is an error."""
 FAR_MARKER = 1.0
-"""The same for a marker, which may stand on a stalk."""
+"""The same for a marker, which may be on a stalk."""
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
 INSIDE = 2
@@ -296,7 +296,7 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
 
 
 def _check_units(table: RobotTable, path: Path) -> None:
-    """Warn of what can be computed but is hardly meant. Raises InputError where gravity is that of no place."""
+    """Warn of implausible values. Raises InputError for an impossible gravity."""
     if table.material.young_modulus_pa < 1e3:
         warnings.warn(
             (

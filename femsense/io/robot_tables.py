@@ -1,4 +1,4 @@
-"""The tables of robot.toml, and what is wrong with them before the mesh is read."""
+"""The tables of robot.toml, and their checks before the mesh is read."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class MaterialTable(Schema):
     @model_validator(mode="before")
     @classmethod
     def _named(cls, table: Any) -> Any:
-        """Take what a named silicone says for the keys that the table leaves out."""
+        """Fill the missing keys of the table with the values of a named silicone."""
         if not isinstance(table, dict) or not isinstance(table.get("name"), str):
             return table
         try:

@@ -1,4 +1,4 @@
-"""robot.toml ↔ Robot: the declared robot, checked with errors that say what is wrong where."""
+"""robot.toml ↔ Robot: the declared robot, with checks whose errors name file and key."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
         the robot; its mesh in metres in the robot frame.
 
     Raises:
-        InputError: with file, key, what was found and what was expected.
+        InputError: with file, key, found and expected value.
     """
     path = find_robot(path_or_name)
     document = read_toml(path)
@@ -122,18 +122,18 @@ def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Ro
 def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write robot.toml and a copy of the mesh file, so that the folder loads back to the same robot.
 
-    A robot that was loaded is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
+    A loaded robot is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
 
     Arguments:
         robot: the robot.
-        folder: made where it is missing; its other files stay.
+        folder: created if missing; its other files are kept.
         effects: the `[[effects]]` to write; by default those that the robot declares.
 
     Returns:
         the path of robot.toml.
 
     Raises:
-        InputError: where the robot was made in Python and holds what robot.toml cannot say without effects.
+        InputError: the robot was made in Python and has properties that robot.toml can only express by effects.
     """
     target = Path(folder)
     document = robot_document(robot, effects=effects)

@@ -34,7 +34,7 @@ class Clock(StrEnum):
 
 
 class Inputs(StrEnum):
-    """What the cables' values are."""
+    """The quantity of the cable inputs."""
 
     tension = "tension"
     displacement = "displacement"
@@ -100,7 +100,7 @@ def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Options:
-    """Options of a source; the defaults leave all to the file."""
+    """Options of a source; by default everything is taken from the file."""
 
     format: Annotated[str | None, Flag("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None
     topics: Annotated[Sequence[str], Flag("--topic", "NAME", "What to take, where there is a choice.", read=tuple)] = ()
@@ -131,4 +131,4 @@ class Options:
     ] = ()
     """From and to [s]."""
     log_names: Sequence[str] = ()
-    """Columns of a log of actuation beside it, for messages."""
+    """Columns of a separate actuation log, for messages."""

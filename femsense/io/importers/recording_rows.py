@@ -31,7 +31,7 @@ class Wanted:
     """Options of the user about the inputs."""
 
     actuation: str | None = None
-    """"tension" or "displacement", where the source does not say."""
+    """"tension" or "displacement", if the source does not declare it."""
     zero: str | None = None
     """"absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero."""
     log: ActuationLog | None = None
@@ -83,7 +83,7 @@ def _input_columns(journal: Journal) -> list[str]:
 def _known_inputs(
     source: Source, part: Path, journal: Journal, columns: list[str], applied: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """Return the inputs of all frames, shape (frames, columns); those where one is not known are left out, with a warning.
+    """Return the inputs of all frames, shape (frames, columns); frames with an unknown input are removed with a warning.
 
     Raises:
         InputError: none are left.

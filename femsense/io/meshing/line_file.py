@@ -127,7 +127,7 @@ class LineTable(Schema):
 
 
 def read_line(path: Path) -> LineTable:
-    """Return the checked tables of a description. Raises InputError with file, key, what was found and what was expected."""
+    """Return the checked tables of a description. Raises InputError with file, key, found and expected value."""
     return validated(LineTable, read_toml(path), path)
 
 

@@ -1,4 +1,4 @@
-"""What a user asks of a mesh, in Python and on the command line."""
+"""Options of a mesh, in Python and on the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Element(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeshOptions:
-    """What a user asks of a mesh."""
+    """Options of a mesh."""
 
     unit: Annotated[str | None, Flag("--unit", "m|cm|mm", "Unit of the surface file; required but for STEP, which says it.")] = (
         None
@@ -28,7 +28,7 @@ class MeshOptions:
     most_tets: Annotated[
         int | None, Flag("--max-tets", "N", "Not more tetrahedra than this (2000; more for thin walls).", min=6)
     ] = None
-    """Where nobody says, MOST_TETS, or up to ENOUGH_TETS where the body needs them."""
+    """None: MOST_TETS, or up to ENOUGH_TETS if the body needs them."""
     tolerance_mm: Annotated[float | None, Flag("--tolerance", "MM", "How far the mesh may leave the surface.")] = None
     """By default a share of the edge length."""
     element: Annotated[Element, Flag("--element", None, "For a new robot.toml.")] = Element.tet10

@@ -1,4 +1,4 @@
-"""How good a mesh of tetrahedra is: angles, shapes, sizes, elements through the walls, and where the worst ones are."""
+"""Quality of a tetrahedral mesh: angles, shapes, sizes, elements per wall, and the position of the worst elements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.surface_queries import wall_thickness
 
 WORST = 5
-"""So many of the worst elements are named."""
+"""Number of the worst elements that are listed."""
 
 
 def mean_ratio(mesh: TetMesh) -> FloatArray:

@@ -224,7 +224,7 @@ def _folder_lens(folder: Path, width: int, height: int) -> tuple[Camera, list[st
 
 
 def _unit_of_depth(folder: Path, options: Options, usual: float) -> tuple[float, bool]:
-    """Return metres in one unit of the depth images, and whether a person or a file says it.
+    """Return metres per unit of the depth images, and whether the options or a file declare it.
 
     `depth_scale` counts units in a metre as Open3D writes it, or millimetres in one unit (BOP), which is at most 1.
     """

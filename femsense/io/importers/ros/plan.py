@@ -55,7 +55,7 @@ class Plan:
     clock: Stamps
     actuation: str | None
     columns: dict[str, dict[str, Taken]]
-    """Topic → name of a value → what it becomes."""
+    """Topic → name of a value → its target."""
     load_points: dict[str, list[float]]
     T_camera_markers: dict[str, FloatArray]
     metadata: dict[str, str]
@@ -67,11 +67,11 @@ class Plan:
     scale: float | None
     """Metres in one unit of clouds, markers and depth in floating point; None where no option gives it: metres."""
     names: dict[str, tuple[Becomes, ...]]
-    """Name that `--map` may take → what it may become."""
+    """Name that `--map` accepts → its allowed targets."""
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: Stamps) -> Plan:
-    """Return what is read from a bag, and how: streams, columns, clock."""
+    """Return the reading plan of a bag: streams, columns, clock."""
     notes = list(choice.notes)
     names = _mappable(bag, choice, options)
     pressures = [s.topic.name for s in choice.inputs if _is_pressure(s)]
@@ -173,7 +173,7 @@ def _is_pressure(stream: Stream) -> bool:
 
 
 def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict[str, Taken]:
-    """Return name in the message → what it becomes; `own` is the name of a pressure where several topics hold one."""
+    """Return name in the message → target; `own` is the name of a pressure if several topics contain one."""
     topic = stream.topic.name
     given = _largest_values(bag, stream)
     names = list(dict.fromkeys(name for name, _ in given))

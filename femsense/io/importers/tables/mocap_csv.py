@@ -213,7 +213,7 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
 
 
 def _whole(cell: str) -> int | None:
-    """Return a count that a header says; None where it says none."""
+    """Return a count from a header; None without one."""
     value = _cell([cell], 0)
     return int(value) if np.isfinite(value) and value >= 0 else None
 
@@ -254,7 +254,7 @@ def _step(path: Path, export: Export) -> float | None:
 
 
 def _rate(cell: str) -> float | None:
-    """Return frames a second; None where the header does not say it."""
+    """Return the frame rate [1/s]; None if the header does not contain it."""
     value = _cell([cell], 0)
     return value if np.isfinite(value) and value > 0 else None
 

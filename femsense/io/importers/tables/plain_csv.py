@@ -115,7 +115,7 @@ def list_plain_csv(path: Path) -> dict[str, Any]:
 
 
 def notation_notes(path: Path) -> list[str]:
-    """Return what was assumed of how a table writes its numbers."""
+    """Return the assumptions about the notation of a table's numbers."""
     notation = layout_of(path).notation
     decimal = ["numbers are read with decimal commas"] if notation.commas else []
     return decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
@@ -150,7 +150,7 @@ def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> S
 
 
 def _times(path: Path, names: list[str], headed: bool, options: Options) -> tuple[FloatArray, list[str]]:
-    """Return the time of each row [s], and what was assumed of it."""
+    """Return the time of each row [s], and the assumptions made."""
     clock = mapped_time(names, options.columns)
     if clock is None and not headed:
         clock = (1, None)
@@ -180,12 +180,12 @@ def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, 
 
 
 def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) -> tuple[list[Column], str | None]:
-    """Return the inputs, mapped or named cable_… and chamber_…, and what cables hold.
+    """Return the inputs, mapped or named cable_… and chamber_…, and the quantity of the cables.
 
-    A unit behind a name gives the factor, and says whether cables hold tensions or displacements.
+    A unit after a name determines the factor and the quantity.
 
     Raises:
-        InputError: a unit that is none of the input's, or cables in newtons beside others in metres.
+        InputError: a unit of another quantity, or cables in newtons together with cables in metres.
     """
     found, kinds = mapped_inputs(names, mapping)
     for j, name in enumerate(names):
@@ -210,7 +210,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
-    """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
+    """Return the unit of length in the names of position columns; None without one. Raises InputError if there are several."""
     units = [unit for unit in (_place_unit(names[j]) for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH]
     said = sorted({unit.name for unit in units})
     if len(said) > 1 or 0 < len(units) < len(columns):
@@ -224,7 +224,7 @@ def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> 
 
 
 def _place_unit(name: str) -> Unit | None:
-    """Return the unit of a column of places, which stands behind its name or before the axis (tip_mm_x)."""
+    """Return the unit of a position column, after its name or before the axis (tip_mm_x)."""
     place, unit = _as_place(name), column_unit(name)[1]
     return unit if unit is not None or place is None else place[2]
 
