@@ -66,7 +66,7 @@ class ToolTable(Schema):
     radius_m: Length | None = Field(None, description="a ball: its radius in metres, > 0")
     cylinder: CylinderTable | None = Field(None, description="cylinder = { radius_m = 0.004, length_m = 0.15 }")
     mesh: Annotated[str, Field(min_length=1)] | None = Field(
-        None, description="a closed surface beside recording.toml, with unit"
+        None, description="a closed surface next to recording.toml, with unit"
     )
     unit: LengthUnit | None = Field(None, description='unit = "m", "cm" or "mm": of the coordinates in the mesh file')
 

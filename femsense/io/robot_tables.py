@@ -25,7 +25,7 @@ POINT = "three numbers in metres [x, y, z]"
 
 
 class MeshTable(Schema):
-    file: Annotated[str, Field(min_length=1, description="the mesh file beside robot.toml")]
+    file: Annotated[str, Field(min_length=1, description="the mesh file next to robot.toml")]
     unit: LengthUnit = Field(description='unit = "m", "cm" or "mm": the unit of the coordinates in the mesh file')
     element: Literal["tet4", "tet10"] = Field(description='element = "tet4" or "tet10"')
     T_robot_mesh: Matrix | None = Field(None, description="4 rows of 4 numbers: a rotation and a translation in metres")
@@ -106,7 +106,7 @@ class AppearanceTable(Schema):
 
 
 class CorrectionTable(Schema):
-    file: Annotated[str, Field(min_length=1, description="the file of the correction beside robot.toml")]
+    file: Annotated[str, Field(min_length=1, description="the file of the correction next to robot.toml")]
 
 
 class RobotTable(Schema):

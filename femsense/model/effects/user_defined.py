@@ -106,7 +106,7 @@ def _is_same(robot: Robot, other: Robot) -> bool:
 
 
 def find_own_file(entry: Mapping[str, Any], robot: Robot) -> Path:
-    """Return the file of an entry of `[[effects]]`: as it stands, or beside robot.toml."""
+    """Return the file of an entry of `[[effects]]`: as it stands, or next to robot.toml."""
     file = Path(str(entry["file"])).expanduser()
     return file if file.is_absolute() or robot.folder is None else robot.folder / file
 
