@@ -25,8 +25,8 @@ from femsense.model.effects import EFFECT_NAMES
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "formats" / "files.md"
 HEAD = """# Files: robot and recording
 
-All lengths are in metres, unless a key `unit` declares another unit; names of keys and columns end with their unit. Camera frames are OpenCV's: x right, y down, z forward,
-right-handed. `T_a_b` takes points of frame b to frame a: 4 rows of 4 numbers. An unknown key or column is an error.
+All lengths are in metres, unless a key `unit` declares another unit; names of keys and columns end with their unit. Camera frames are those of OpenCV:
+x right, y down, z forward, right-handed. `T_a_b` takes points of frame b to frame a: 4 rows of 4 numbers. An unknown key or column is an error.
 """
 ROBOT = """## A robot: a folder with `robot.toml` and a mesh
 

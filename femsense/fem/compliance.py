@@ -107,6 +107,13 @@ def compliance(
 
     Raises:
         InputError: points and directions do not fit; FemsenseError: nothing holds the body.
+
+    Example:
+        >>> body = fs.load_robot("finger").body
+        >>> tip = np.array([[0.092, 0.0, 0.007]])
+        >>> W = fs.compliance(body, fs.solve_equilibrium(body), points=tip, directions=np.array([[0.0, 0.0, 1.0]]))
+        >>> W.shape  # the tip along z, then the cable
+        (2, 2)
     """
     P, D = as_points(points, "points"), as_points(directions, "directions")
     if P.shape != D.shape:

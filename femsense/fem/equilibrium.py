@@ -164,6 +164,12 @@ def solve_equilibrium(
 
     Raises:
         InputError: unknown cable or chamber, one named twice, wrong shapes or values.
+
+    Example:
+        >>> body = fs.load_robot("finger").body
+        >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})
+        >>> pulled.converged, round(1e3 * pulled.shortening["flexor"], 1)  # mm
+        (True, 4.5)
     """
     given = {"tension": tension, "shortening": shortening, "pressure": pressure, "volume": volume}
     how = options or SolveOptions()

@@ -51,10 +51,15 @@ OWN_FILES = re.compile(
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Load a recording folder (or its recording.toml). Clouds and images are found, not read.
+    """Load a recording folder, or its recording.toml. Clouds and images are read later, frame by frame.
 
     Raises:
         InputError: with file, place, found and expected value.
+
+    Example:
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> recording.frame_count, recording.cable_names
+        (44, ('north', 'west', 'south', 'east'))
     """
     folder = _recording_folder(Path(path).expanduser())
     toml = folder / "recording.toml"

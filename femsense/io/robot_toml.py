@@ -32,14 +32,19 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
     """Load a robot.
 
     Arguments:
-        path_or_name: a folder with robot.toml, that file, or a NAME of the project's `meshes/`.
-        effects: apply the `[[effects]]` that the file lists; False gives the plain model.
+        path_or_name: a folder with robot.toml, that file, or the name of a robot of the package (`robot_names`).
+        effects: apply the `[[effects]]` of the file; False gives the plain model.
 
     Returns:
-        the robot; its mesh in metres in the robot frame.
+        the robot, with its mesh in metres in the robot frame.
 
     Raises:
         InputError: with file, key, found and expected value.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> robot.name, robot.body.cable_names
+        ('finger', ('flexor',))
     """
     path = find_robot(path_or_name)
     document = read_toml(path)

@@ -177,6 +177,11 @@ def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
     Arguments:
         recording: the recording.
         which: a mask, shape (F,), or indices 0 … F − 1.
+
+    Example:
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> fs.select_frames(recording, range(36, 40)).frame_count
+        4
     """
     mask = np.asarray(which)
     kept = np.flatnonzero(mask) if mask.dtype == np.bool_ else np.unique(mask.astype(np.int64))

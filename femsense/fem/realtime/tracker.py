@@ -74,7 +74,7 @@ class Tracked:
 
 
 class Tracker:
-    """A body without friction and held cables whose tensions and nodal forces change by little from frame to frame."""
+    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame; without friction and without held cables."""
 
     def __init__(
         self,
