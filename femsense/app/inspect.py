@@ -111,7 +111,7 @@ def _resolution(robot: Robot, recording: Recording) -> Report:
     from femsense.calib.calibrate import calibrate
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # calibrate says them itself
+        warnings.simplefilter("ignore")  # calibrate prints them itself
         try:
             calibration = calibrate(robot, recording)
         except FemsenseError as error:

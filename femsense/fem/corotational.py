@@ -126,7 +126,7 @@ def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignor
 def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
     """Add T's product to the blocks of the pairs a ≤ b; K is room for it."""
     width = T.itemsize
-    for pair in range(55):  # while the product is made
+    for pair in range(55):  # work memory of the product
         fetch_ahead(blocks.ctypes.data + 9 * width * slots[pair], 9 * width)
     K[:] = 0.0
     for first, count in ((0, 6), (6, 4)):

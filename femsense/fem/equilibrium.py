@@ -196,7 +196,7 @@ def solve_equilibrium(
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
         state, status, reached = _step_loads(body, nothing, loads, rest, state, how.max_iterations)
-    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has moved since Newton looked
+    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has changed since the last residual of Newton
         state.residual = _residual(body, loads, state)
     if status != CONVERGED:
         status = status if body.is_held() else "singular"
@@ -327,7 +327,7 @@ def _initial_state(
         motor = start.tension[body.cable_names[i]]
         if motor > 0 and body.cables[i].friction > 0 and along is None:
             shares[i] = tensions / motor
-    far = np.inf if start.status == "unstable" else 0.0  # where nothing moves, stability is looked at all the same
+    far = np.inf if start.status == "unstable" else 0.0  # stability is checked even if nothing moves
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
     return State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
 

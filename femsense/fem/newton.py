@@ -86,7 +86,9 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
     secants = Secants()
     for iteration in range(max_iterations):
         follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
-        if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
+        if follows and (
+            iteration or state.borrowed
+        ):  # from a nearby state in one step: its bend angles are nearly the final ones
             update_friction(body, loads, state)
         rows = drive_rows(body, state)
         H = kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
@@ -186,7 +188,7 @@ def factor_here(
         state.shifted = exact is None or not _held_definite(exact, H, C, stretch, lever)
         whole = whole if state.shifted else exact
     state.indefinite_steps += state.shifted
-    # the plate only ever softens, so that the factor without it leads downhill
+    # the plate only softens the stiffness, so the factor without it still gives a descent direction
     return plain if state.shifted and whole is not None and whole.negative > 0 else whole
 
 

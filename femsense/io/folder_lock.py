@@ -13,7 +13,7 @@ from femsense.io.files import PART_PREFIX, followed
 
 try:
     import fcntl
-except ImportError:  # Windows has none: there two commands are not kept apart
+except ImportError:  # Windows has none: two commands are not prevented there
     fcntl = None  # type: ignore[assignment]
 
 
@@ -70,7 +70,7 @@ def _locked(final: Path) -> int | None:
             os.ftruncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
             return handle
-        os.close(handle)  # who held it has just removed it
+        os.close(handle)  # the previous holder has just removed it
     return None
 
 

@@ -23,7 +23,7 @@ def collected(problems: Problems, notes: list[str]) -> Iterator[None]:
             yield
         except FemsenseError as error:
             problems.append(error)
-        except Exception as error:  # whatever a broken file makes of a reader
+        except Exception as error:  # a broken file can raise anything in a reader
             problems.append(f"cannot be read: {type(error).__name__}: {error}")
     notes += [str(item.message) for item in caught if issubclass(item.category, UserWarning)]
 

@@ -65,7 +65,7 @@ def _warn_of_gaps(robot: Robot, file: Path) -> None:
         )
     if not robot.marker_names:
         texts.append(
-            "no [[markers]]: the camera pose must come from clouds of contact-free frames (femsense docs calibration), "
+            "no [[markers]]: the camera pose must come from clouds of contact-free frames (femsense docs calibrate), "
             "and frames without a cloud give no forces"
         )
     for text in texts:

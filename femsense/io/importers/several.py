@@ -91,7 +91,7 @@ def _rising(frames: Iterator[Frame]) -> Iterator[Frame]:
 def _times(source: Source) -> FloatArray:
     """Return the times of a source's frames [s]; no picture is decoded."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # told when the frames are written
+        warnings.simplefilter("ignore")  # reported when the frames are written
         return np.fromiter((frame.time for frame in _rising(source.frames())), dtype=np.float64)
 
 

@@ -255,7 +255,7 @@ def deviation_of(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
     of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
     out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())
-    if crosses:  # what lies inside another shell has no counterpart
+    if crosses:  # triangles inside another shell have no counterpart
         return out
     return max(out, float(distance_to(mesh.nodes[skin], numbers.reshape(-1, 3), surface.points).max()))
 

@@ -135,7 +135,7 @@ def subdivisions(
     if not channels:
         return ()
     with tempfile.TemporaryDirectory(prefix="femsense-") as trial, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the finished robot says them
+        warnings.simplefilter("ignore")  # reported with the finished robot
         write_mesh(mesh, Path(trial, MESH_FILE))
         write_toml(Path(trial, "robot.toml"), document)
         body = load_robot(trial).body

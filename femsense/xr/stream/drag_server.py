@@ -122,7 +122,7 @@ class DragServer:
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
         self.lease = Lease(self.options.gate.hold_s)
-        self._told: dict[str, float] = {}  # the robot's own word of its inputs
+        self._told: dict[str, float] = {}  # inputs reported by the robot
         self._told_at = float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
@@ -234,7 +234,7 @@ class DragServer:
             if self._wish is None or self._follower.resting:
                 self._fresh.wait()
             elif self._follower.ended:
-                self._fresh.wait(self.options.rest_s)  # then it is sought from rest
+                self._fresh.wait(self.options.rest_s)  # the search then starts from rest
             self._fresh.clear()
             with self._lock:
                 wish = self._wish

@@ -359,7 +359,7 @@ def _ordered(values: list[float], width: int, height: int) -> _Found | None:
     if len(values) == 5 and values[4] == 0.0:
         values = values[:4]
     if len(values) not in (4, 5, 6, 8, 9, 12) or (shares and len(values) == 5):
-        return None  # the fifth of LSD-SLAM's numbers bends rays in a way of its own
+        return None  # the fifth number of LSD-SLAM is a distortion model of its own
     orders = {"fx fy cx cy": (0, 1, 2, 3), "fx cx fy cy": (0, 2, 1, 3), "cx cy fx fy": (2, 3, 0, 1)}
     usual = [name for name, order in orders.items() if _is_usual([values[i] for i in order], width, height)]
     name = usual[0] if len(usual) == 1 else "fx fy cx cy"

@@ -213,7 +213,7 @@ def _largest_values(bag: Bag, stream: Stream) -> dict[tuple[str, str], float]:
         try:
             values = named_values(bag.decode(message), stream.topic.type)
         except InputError:
-            continue  # told when the frames are read
+            continue  # reported when the frames are read
         for key, value in values.items():
             largest[key] = max(largest.get(key, 0.0), abs(value))
     return largest
@@ -263,7 +263,7 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> Stamps:
             try:
                 decoded = bag.decode(message)
             except InputError:
-                continue  # told when the frames are read
+                continue  # reported when the frames are read
             if header_of(decoded) is None:
                 continue
             time, _ = stamp_of(decoded)

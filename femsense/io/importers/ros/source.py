@@ -183,7 +183,7 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
     """Return all values of a topic of inputs or loads; a warning counts broken messages."""
     rows, broken = array("d"), list[str]()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where a bag breaks off is told when the frames are read
+        warnings.simplefilter("ignore")  # the truncation of a bag is reported when the frames are read
         for message in bag.messages([topic]):
             try:
                 decoded = bag.decode(message)
