@@ -189,7 +189,7 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     rows = ray_rows(scan, surface, poses, noises, reach=reach)
     on = np.zeros(len(scan.view), dtype=bool)
     on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
-    missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those beside a silhouette
+    missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those next to a silhouette
     points = scan.points(poses)
     on[missed] = surface.gap(points[missed]) < 0.5 * OFF * scan.ray_std(noises)[missed]
     own = np.flatnonzero(on)

@@ -118,7 +118,7 @@ class DragServer:
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None
-        self._grabbed = False  # a point, since the last answer
+        self._grabbed = False  # whether a point was grabbed since the last answer
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
         self.lease = Lease(self.options.gate.hold_s)
@@ -128,7 +128,7 @@ class DragServer:
         self._handle = ""
         self._settled_since: float | None = None
         self._measured_at: dict[str, float] = {}  # marker → when it was measured last
-        self._unmeasured, self._unmeasured_at = "", float("-inf")  # why it is not
+        self._unmeasured, self._unmeasured_at = "", float("-inf")  # reason why the robot is not measured, and its time
         self._answer: tuple[FloatArray, dict[str, Any]] | None = None
         self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
         self._seq = self._commands = self._leases = 0
