@@ -71,7 +71,7 @@ def estimate_into(
     given = None if calibration is None else read_calibration(calibration)
     inputs = run_inputs(body, frames, given, at=at, options=options)
     if not again and finished(folder, inputs):
-        say(f"{folder} holds this result already (--again computes it anew)")
+        say(f"{folder} contains this result already (--again repeats it)")
         return read_run(folder, robot=body)
     if given is None:
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
@@ -142,7 +142,7 @@ def improve_into(
     inputs |= {"references": [recording_input(twin) for twin in how.references]} if how.references else {}
     _require_different([*inputs["recordings"], *inputs["validation"], *inputs.get("references", [])])
     if not again and finished(folder, inputs):
-        say(f"{folder} holds this result already (--again computes it anew)")
+        say(f"{folder} contains this result already (--again repeats it)")
         return read_loop(folder)
     with only_writer(folder):
         with beside(load_pages):

@@ -203,7 +203,7 @@ def _numba_cache() -> Finding:
     places = [Path(chosen)] if chosen else [package / "__pycache__", package, Path.home() / ".cache"]
     if any(place.is_dir() and _writable(place) for place in places):
         return good("can be written")
-    return note("no folder can be written: each start compiles anew", "set NUMBA_CACHE_DIR to a folder of your own")
+    return note("no writable folder: kernels are compiled at each start", "set NUMBA_CACHE_DIR to a folder of your own")
 
 
 def _kernels() -> Finding:

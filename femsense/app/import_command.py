@@ -61,7 +61,7 @@ def import_into(
     identity = _identity(paths, options, driven)
     known = _standing(final, identity, again)
     if known is not None:
-        say(f"{final} holds this import already (--again makes it anew)")
+        say(f"{final} contains this import already (--again repeats it)")
         return known
     log = None if driven.actuation is None else read_actuation_log(driven.actuation, options)
     source = open_sources(paths, options if driven.actuation is None else _without_log(options, driven.actuation, paths))
@@ -118,8 +118,8 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
         late = [f"{first:g}:{last:g}" for first, last in options.free if first > found["duration_s"] or last < 0]
         return tuple(f"--free {span}: no frame lies there; the frames last {found['duration_s']:.4g} s" for span in late)
     return (
-        f"nothing says when nothing touches the robot: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
-        "frames.csv; calibrate and improve use these frames, and estimate learns from them how well camera and model agree",
+        f"no contact-free frames are declared: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
+        "frames.csv; calibrate and improve use these frames, and estimate measures noise and model error in them",
     )
 
 
@@ -188,7 +188,7 @@ def _check_apart(paths: Sequence[str | Path], final: Path) -> None:
         inside = place.is_relative_to(final.resolve())
         if inside and (place.is_dir() or OWN_FILES.fullmatch(place.relative_to(final.resolve()).as_posix())):
             raise InputError(
-                "the recording would replace what it is made from", where=place, found=f"-o {final}", expected="a new place"
+                "the recording would replace its own source", where=place, found=f"-o {final}", expected="a new place"
             )
 
 

@@ -105,8 +105,8 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str
         if plain < SUSPICIOUS * one.spread:
             continue
         found = (
-            f"the markers{which} do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
-            f"mm is left"
+            f"the markers{which} do not fit the robot: the residual is {100 * plain / one.spread:.0f} % of their spread of "
+            f"{1e3 * one.spread:.3g} mm"
         )
         most_fit = float(np.median(np.linalg.norm(one.measured - one.modelled, axis=1))) < SUSPICIOUS * one.spread
         scale, _ = similarity(one.modelled, one.measured)
@@ -279,7 +279,7 @@ def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None
     texts = []
     for k in np.unique(scene.frame[renamed | far]):
         parts = []
-        for rows, what in ((renamed, "labels are swapped, put right"), (far, "outliers, left out")):
+        for rows, what in ((renamed, "labels were swapped, and are corrected"), (far, "outliers, left out")):
             names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
             parts += [f"{names} ({what})"] if names else []
         texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")

@@ -109,9 +109,8 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
         apart = turn > TURNED or shift > SHIFTED * size
         if apart and other.error_m < ALIKE * best.error_m:
             raise DataError(
-                f"two poses fit the clouds alike: {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm are left, "
-                f"turned by {np.degrees(turn):.0f}° and "
-                f"{1e3 * shift:.0f} mm apart. Has the robot a symmetry? Record markers, pull cables in free frames, or "
+                f"two poses fit the clouds equally well: the residuals are {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm, "
+                f"and they differ by {np.degrees(turn):.0f}° and {1e3 * shift:.0f} mm. Is the robot symmetric? Record markers, pull cables in free frames, or "
                 f"write T_robot_camera in recording.toml"
             )
     return best

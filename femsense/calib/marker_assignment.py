@@ -237,7 +237,7 @@ def _check_handed(
     left = _fitted(robot, turned, others, first).error_m
     if left * EXPLAINED < named.error_m:
         raise DataError(
-            f"the markers without names do not fit the robot: {1e3 * named.error_m:.3g} mm are left of their spread of "
+            f"the markers without names do not fit the robot: the residual is {1e3 * named.error_m:.3g} mm for a spread of "
             f"{1e3 * spread:.3g} mm, mirrored {1e3 * left:.3g} mm. {LEFT_HANDED}"
         )
 
@@ -267,10 +267,9 @@ def _require_one(
             ):
                 name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} "
-                    f"and {1e3 * other_fit.error_m:.3g} mm are left, "
-                    f"and they place the markers {1e3 * away:.3g} mm apart. Name the markers, place one more where it "
-                    f"breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
+                    f"the markers of camera {name} have no names, and two poses fit them equally well: the residuals are "
+                    f"{1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm, and they place the markers "
+                    f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
                 )
 
 

@@ -105,10 +105,10 @@ def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
         raise InputError(
-            "files stand there that would be deleted",
+            "other files in the folder would be deleted",
             where=folder,
             found=", ".join(foreign[:3]) + more,
-            expected=f"a new folder, or {what} and nothing beside",
+            expected=f"a new folder, or {what} and nothing else",
             hint="another -o",
         )
 
@@ -153,7 +153,7 @@ def _opened(final: Path) -> BinaryIO:
         except OSError as error:
             if error.errno != errno.ENXIO:
                 raise
-            warnings.warn(f"{final} is a pipe that nobody reads: waiting for a reader", stacklevel=2)
+            warnings.warn(f"{final} is a pipe without a reader: waiting for one", stacklevel=2)
         else:
             os.set_blocking(handle, True)
             return os.fdopen(handle, "wb")

@@ -35,10 +35,9 @@ def is_a_place(path: object, xyz: FloatArray, names: Sequence[str], frame: IntAr
     if never:
         text = ", ".join(name or "(without a name)" for name in never)
         raise DataError(
-            f"{path}: {what} in every row of {text}: these markers were lost all the time. Take their rows out, or name "
-            f"the columns anew"
+            f"{path}: {what} in every row of {text}: these markers were always lost. Remove their rows, or rename the columns"
         )
-    warnings.warn(f"{path}: {what} is how a lost marker is written; left out: {_rows(cells[lost], frame[lost])}", stacklevel=4)
+    warnings.warn(f"{path}: {what} is a lost marker, left out: {_rows(cells[lost], frame[lost])}", stacklevel=4)
     return np.asarray(~lost)
 
 

@@ -96,7 +96,7 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
             where=where,
             found=reason(error),
             expected="triangles (ply, stl, obj, off)",
-            hint="is the file whole, and what its ending says?",
+            hint="is the file complete, and does its suffix fit the content?",
         ) from None
     if not len(triangles):
         raise _no_triangles(path, where)
@@ -132,7 +132,7 @@ def _no_triangles(path: Path, where: str) -> InputError:
     announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
     if path.suffix.lower() == ".stl" and size >= 84 and not head.lstrip().startswith(b"solid") and announced:
         return InputError(
-            "the file does not hold what it announces",
+            "the content disagrees with its header",
             where=where,
             found=f"{announced} triangles announced, room for {(size - 84) // 50}",
             expected="a whole binary STL file",
@@ -153,7 +153,7 @@ def _no_triangles(path: Path, where: str) -> InputError:
         where=where,
         found="no points either",
         expected="triangles",
-        hint="is this file what its ending says?",
+        hint="does the suffix fit the content?",
     )
 
 
@@ -209,7 +209,7 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
     if len(kept) < len(tets):
         warnings.warn(
             (
-                f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical "
+                f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra occur twice (once for each physical "
                 f"group?): each is used once"
             ),
             stacklevel=4,
@@ -305,7 +305,7 @@ def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple
             where=where,
             found=f"{int((count == 1).sum())} edges with one triangle, {int((count > 2).sum())} with more than two",
             expected="every edge between two triangles",
-            hint="femsense mesh SURFACE -o ROBOT closes holes and mends what it can",
+            hint="femsense mesh SURFACE -o ROBOT closes holes and repairs the surface",
         )
     made = repaired(points, triangles, where=where)
     return np.array(made.points), np.array(made.triangles)

@@ -86,12 +86,12 @@ def check_replaceable(file: Path, kind: FileKind | None, inputs: Iterable[str | 
     if not file.exists():
         return
     if any(Path(path).exists() and file.samefile(path) for path in inputs):
-        raise InputError("the result would replace what it is made from", where=file, expected="a new name", hint="another -o")
+        raise InputError("the result would replace its own input", where=file, expected="a new name", hint="another -o")
     if kind is None:
         return
     expected = f"a new name, or {kind.name}"
     if not file.is_file():
-        raise InputError("no file stands there", where=file, expected=expected, hint="another -o")
+        raise InputError("no file exists there", where=file, expected=expected, hint="another -o")
     try:
         fits = not file.stat().st_size or kind.fits(file)
     except OSError as error:

@@ -41,7 +41,7 @@ COLUMNS: dict[str, tuple[Column, ...]] = {
     ),
     "markers.csv": (
         Column("frame", "number of a frame of frames.csv"),
-        Column("marker", "name of the marker; empty in all rows of a frame where nobody knows which is which"),
+        Column("marker", "name of the marker; empty in all rows of a frame with unnamed markers"),
         *PLACE,
         CAMERA,
     ),

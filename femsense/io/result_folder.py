@@ -43,14 +43,14 @@ def check_folder(root: Path, not_beside: Sequence[str], kinds: Mapping[str, File
     foreign = next((name for name in not_beside if (root / name).is_file()), None)
     if foreign is not None:
         raise InputError(
-            "the results would mix with what stands there",
+            "the results would mix with the existing files",
             where=root,
             found=foreign,
             expected="a folder of their own",
             hint="another -o",
         )
     if root.exists() and not root.is_dir():
-        raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
+        raise InputError("a file exists where the folder should be written", where=root, expected="a folder", hint="another -o")
     check_target(root, folder=True)
     check_files(root, kinds)
 

@@ -32,7 +32,7 @@ class MeshTable(Schema):
 
 
 class MaterialTable(Schema):
-    name: str | None = Field(None, description="a silicone of femsense.materials; what the other keys say goes before it")
+    name: str | None = Field(None, description="a silicone of femsense.io.materials; other keys override its values")
     young_modulus_pa: float = Field(gt=0, description="Young's modulus in pascal, > 0, such as 150e3 for soft silicone")
     poisson_ratio: float = Field(gt=-1, lt=0.5, description="Poisson's ratio, −1 < ν < 0.5, such as 0.45 or 0.49 for silicone")
     density_kg_m3: float = Field(gt=0, description="density in kg/m³, > 0, such as 1070 for silicone")

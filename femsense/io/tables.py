@@ -63,7 +63,7 @@ def doubles(values: Sequence[object], what: str, path: Path, kind: str, key: str
     for i, value in enumerate(values):
         if value is not None and value in values[:i]:
             yield InputError(
-                f"a {what} stands twice",
+                f"a {what} occurs twice",
                 where=at_key(path, kind, i, key),
                 found=repr(value),
                 expected=f"each {what} once",
@@ -399,7 +399,7 @@ def _check_header(
                 "unknown column", where=where, found=short(column), expected=", ".join(names), hint=did_you_mean(column, known)
             )
         if column in columns[:i]:
-            raise InputError("a column stands twice", where=where, found=column, expected="each column once")
+            raise InputError("a column occurs twice", where=where, found=column, expected="each column once")
     missing = [column for column in required if column not in columns]
     if missing:
         raise InputError("columns are missing", where=where, found=", ".join(columns), expected=", ".join(missing))

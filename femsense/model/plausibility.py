@@ -157,8 +157,8 @@ def doubts_of_pressures(recording: Recording, robot: Robot | None = None) -> lis
 
 def _absolute(where: str, name: str, least: float) -> str:
     return (
-        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take what is above the "
-        f"surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*Pa_abs does)"
+        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute? Chambers take gauge "
+        f"pressures: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*Pa_abs does)"
     )
 
 

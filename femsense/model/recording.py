@@ -369,7 +369,7 @@ def _check_parts(recording: Recording) -> None:
         times = f"{r.time_s[k : k + 2].tolist()} s from position {k} on"
         raise InputError("time does not increase", where="time_s", found=times, expected="finite, in order of time")
     if len(np.unique(r.frame_numbers)) != F:
-        raise InputError("a frame stands twice", where="frame_numbers", expected="each frame once")
+        raise InputError("a frame occurs twice", where="frame_numbers", expected="each frame once")
     lengths = {
         "sweep": (F if r.sweep is None else len(r.sweep), F),
         "cloud_files": (len(r.cloud_files), F),

@@ -185,7 +185,7 @@ def _millimetres(point: Any) -> str:
 
 def _std(value: float | None, scale: float, unit: str) -> str:
     if value is None:
-        return " (the data say nothing of it)"
+        return " (not determined by the data)"
     return f" ± {scale * value:.2g} {unit}" if value > 0 else ""
 
 

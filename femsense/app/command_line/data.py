@@ -42,7 +42,7 @@ def mesh(
     ],
     output: Annotated[Path, option("-o --output", "ROBOT", "The robot's folder; its robot.toml is kept where there is one.")],
     options: MeshOptions,
-    again: Annotated[bool, option("--again", help="Fill even where ROBOT holds this mesh already.")] = False,
+    again: Annotated[bool, option("--again", help="Fill even where ROBOT contains this mesh already.")] = False,
 ) -> Answer:
     """Fill a surface with tetrahedra; start a robot."""
     with progress_bar("mesh") as progress:
@@ -64,11 +64,11 @@ def mesh(
 def simulate(
     context: typer.Context,
     robot: RobotPath,
-    scripts: Annotated[list[Path], argument("SCRIPT…", "What the virtual rig does (TOML); several are many jobs.")],
+    scripts: Annotated[list[Path], argument("SCRIPT…", "Script of the virtual rig (TOML); several paths are several jobs.")],
     output: Annotated[
         Path | None, option("-o --output", "RECORDING", "The recording to write; with --plan a folder for the map of forces.")
     ] = None,
-    plan: Annotated[bool, option("--plan", help="Say what this experiment could show; record nothing.")] = False,
+    plan: Annotated[bool, option("--plan", help="Predict what this experiment can show, without recording.")] = False,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""

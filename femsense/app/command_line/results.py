@@ -65,7 +65,9 @@ def export(
 @command()
 def view(
     run: Annotated[Path | None, argument("RUN", "A folder that femsense estimate wrote.")] = None,
-    stream: Annotated[str | None, option("--stream", "URL", "Show what streams there instead: http:// or mqtt://.")] = None,
+    stream: Annotated[
+        str | None, option("--stream", "URL", "Show the stream at this address instead: http:// or mqtt://.")
+    ] = None,
     live: Annotated[Path | None, option("--live", "SESSION", "Show the session that is recorded there now.")] = None,
     port: Annotated[int, option("--port", help="0 takes a free one.", min=0, max=65535)] = 0,
     browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,

@@ -71,11 +71,11 @@ def estimate(
     ] = SensingMethod.rays,
     friction: Annotated[float, option("--friction", "MU", "The cone about the normal in which contact forces lie.")] = 1.0,
     push: Annotated[
-        bool, option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
+        bool, option("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
     ] = False,
     smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
-    again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Compute even where RUN contains this result already.")] = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into
@@ -87,7 +87,7 @@ def estimate(
 
     (recording,) = recordings
     if push and not at:
-        raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
+        raise typer.BadParameter("--push applies to the points of --at, and none is given; contacts that are found push anyway")
     options = filled(SensingOptions, locals(), method=method.value)
     if smooth_s > 0:
         say(f"forces are averaged over {smooth_s:g} s and lag by as much")
@@ -136,7 +136,7 @@ def live(
 def reach(
     robot: RobotPath,
     target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],
-    control: Annotated[str, option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
+    control: Annotated[str, option("--control", help="Quantity of the cable commands: tension or displacement.")] = "tension",
     force: Annotated[list[str] | None, option("--force", "X,Y,Z=FX,FY,FZ …", "Known contact forces.")] = None,
     calibration: Annotated[Path | None, option("-c --calibration", "FILE", "Commands count from its initial inputs.")] = None,
     output: Annotated[Path | None, option("-o --output", "FILE", "A JSON file to write.")] = None,

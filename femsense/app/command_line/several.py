@@ -31,9 +31,9 @@ Jobs = Annotated[
     str | None,
     option("--jobs", "TABLE|GLOB", "Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
 ]
-Workers = Annotated[int | None, option("--workers", "N", "Many jobs: so many processes; by default one a core.", min=0)]
+Workers = Annotated[int | None, option("--workers", "N", "Several jobs: number of processes; default: one per core.", min=0)]
 Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see femsense docs many.")]
-Memory = Annotated[float | None, option("--memory", "GB", "Many jobs: what a worker may take at most.")]
+Memory = Annotated[float | None, option("--memory", "GB", "Several jobs: memory limit of a worker.")]
 MANY = {"jobs": Jobs, "workers": Workers, "dask": Dask, "memory": Memory}
 """Options of commands that take many jobs."""
 
@@ -57,7 +57,7 @@ def several(context: typer.Context, of: Several) -> Answer | None:
     if not asked:
         return None
     if given["jobs"] is not None and units:
-        raise typer.BadParameter(f"--jobs says what the jobs are about, and {units[0]} stands on the command line too")
+        raise typer.BadParameter(f"--jobs declares the jobs, and {units[0]} stands on the command line too")
     if given["jobs"] is None and not units:
         raise missing(context, about)
     if "output" in given and (given["output"] is None or _source(context, "output") != "COMMANDLINE"):

@@ -217,7 +217,7 @@ class Iterative:
             part, share = self._conjugate(left, wanted, MOST)
             total += self.iterations
             if part is None:
-                raise FemsenseError("the stiffness is not positive definite: FEMSENSE_SOLVER=direct says more")
+                raise FemsenseError("the stiffness is not positive definite: FEMSENSE_SOLVER=direct gives details")
             x += part
             if share <= wanted:
                 self.iterations = total

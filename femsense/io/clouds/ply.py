@@ -136,7 +136,7 @@ def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
                 continue
             case _:
                 raise InputError(
-                    "a line of the PLY header that says nothing", where=file, found=line, expected="format, element, property"
+                    "an unknown line in the PLY header", where=file, found=line, expected="format, element, property"
                 )
     if storage not in _ORDERS:
         raise InputError("unknown storage", where=file, found=f"format {storage}", expected=", ".join(_ORDERS))

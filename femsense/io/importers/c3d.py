@@ -85,7 +85,7 @@ def open_c3d(path: Path, options: Options) -> Source:
     notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
     notes += header.disagreements
     left_out = [name for name in header.labels if name in header.outputs]
-    notes += [f"results of a model, which are no places, are left out: {', '.join(left_out)}"] if left_out else []
+    notes += [f"model outputs, which are not positions, are left out: {', '.join(left_out)}"] if left_out else []
     tracks = tracks_of(header.labels)
     return capture_source(
         path,

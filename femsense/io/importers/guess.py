@@ -55,10 +55,10 @@ def _opened(path: str | Path, said: Options) -> Source:
         raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
     one = _format(source, said)
     if said.base is not None and not one.transforms:
-        raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
+        raise InputError("coordinate frames exist in bags only", where=f"--base {said.base}", found=source)
     if said.depth_unit is not None and not one.whole_depths:
         raise InputError(
-            "a unit of depth images is said of what has none, or one of its own",
+            "--depth-unit for a source without depth images, or with a unit of its own",
             where=f"--depth-unit {said.depth_unit:g}",
             found=one.name,
             expected=", ".join(name for name, other in FORMATS.items() if other.whole_depths),
@@ -126,9 +126,7 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
     check_targets(said.columns)
     names = [name or other for (name, _), other in zip(given, guessed)]
     if len(set(names)) < len(names):
-        raise InputError(
-            "a name of a camera stands twice", where="SOURCE", found=", ".join(names), expected="NAME=PATH with names"
-        )
+        raise InputError("a camera name occurs twice", where="SOURCE", found=", ".join(names), expected="NAME=PATH with names")
     files = [path for _, path in given]
     try:
         source = joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
@@ -160,7 +158,7 @@ def _one_of(path: Path, options: Options) -> Source:
     source = _opened(path, options)
     if source.views:
         raise InputError(
-            "a capture with several cameras beside others", where=path, found=", ".join(source.views), expected="one"
+            "a capture with several cameras together with others", where=path, found=", ".join(source.views), expected="one"
         )
     return source
 

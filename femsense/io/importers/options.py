@@ -51,9 +51,9 @@ class Zero(StrEnum):
 class InputOptions:
     """Options of the inputs of a recording."""
 
-    inputs: Annotated[Inputs | None, Flag("--inputs", help="What the cables' values are.")] = None
+    inputs: Annotated[Inputs | None, Flag("--inputs", help="Quantity of the cable inputs.")] = None
     """None: as declared by the source."""
-    zero: Annotated[Zero | None, Flag("--zero", help="What they count from.")] = None
+    zero: Annotated[Zero | None, Flag("--zero", help="Their zero.")] = None
     actuation: Annotated[Path | None, Flag("--actuation", "FILE", "A CSV file with the inputs over time.")] = None
     offset: Annotated[float | None, Flag("--offset", "S", "The frames' time minus that file's; else from motion.")] = None
     """None: found from the motion."""
@@ -103,7 +103,9 @@ class Options:
     """Options of a source; by default everything is taken from the file."""
 
     format: Annotated[str | None, Flag("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None
-    topics: Annotated[Sequence[str], Flag("--topic", "NAME", "What to take, where there is a choice.", read=tuple)] = ()
+    topics: Annotated[
+        Sequence[str], Flag("--topic", "NAME", "Topics of a bag, or markers of a motion capture, to import.", read=tuple)
+    ] = ()
     """Topics, streams, tracks or names."""
     columns: Annotated[
         Mapping[str, str],
@@ -124,7 +126,7 @@ class Options:
     ] = field(default_factory=dict)
     """Camera → seconds, where clocks differ."""
     depth_unit: Annotated[float | None, Flag("--depth-unit", "M", "Metres in one unit of depth images, if it is another.")] = None
-    every: Annotated[int, Flag("--every", "N", "Take one of so many frames.", min=1)] = 1
+    every: Annotated[int, Flag("--every", "N", "Import every N-th frame.", min=1)] = 1
     free: Annotated[
         Sequence[tuple[float, float]],
         Flag("--free", "FROM:TO", "Seconds after the first frame; nothing touches the robot.", read=free_named),

@@ -148,7 +148,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
     lost = counts["out_of_order"]
     if lost:
         first = f"the first is number {counts['first_back']} in the file"
-        hint = "stamps that were rounded stand still; a clock that was set back begins anew: export the times with all digits"
+        hint = "repeated time stamps were rounded, or a clock was set back: export the times with all digits"
         if lost > kept:
             raise InputError(
                 "the time does not go on",
@@ -157,7 +157,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
                 expected="frames in order of time",
                 hint=hint,
             )
-        text = f"{lost} of {lost + kept} frames are dropped, since the time stands still or goes back, {first}"
+        text = f"{lost} of {lost + kept} frames are dropped, since the time repeats or goes back, {first}"
         warnings.warn(f"{source.path}: {text}; {hint}", stacklevel=4)
     if source.count is not None and abs(lost + kept - source.count) > max(1, source.count // 100):
         warnings.warn(f"{source.path}: {source.count} frames are announced, {lost + kept} were read", stacklevel=4)

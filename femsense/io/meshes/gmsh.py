@@ -92,7 +92,7 @@ Part = TypeVar("Part", FloatArray, bytes)
 
 def _whole(part: Part, size: int) -> Part:
     if len(part) < size:
-        raise ValueError("the file ends before what it announces")
+        raise ValueError("the file ends before the announced number of entries")
     return part
 
 
@@ -241,7 +241,7 @@ def _content(numbers: IntArray, points: FloatArray, blocks: Sequence[Block], whe
     known = np.sort(numbers)
     if (np.diff(known) == 0).any():
         raise InputError(
-            "a node stands twice", where=where, found=f"node {int(known[:-1][np.diff(known) == 0][0])}", expected="each node once"
+            "a node occurs twice", where=where, found=f"node {int(known[:-1][np.diff(known) == 0][0])}", expected="each node once"
         )
     cells: dict[str, list[IntArray]] = {}
     tags: dict[str, list[IntArray]] = {}

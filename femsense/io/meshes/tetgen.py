@@ -66,6 +66,6 @@ def _table(file: Path) -> tuple[list[float], FloatArray]:
         ) from None
     if len(table) != head[0]:
         raise InputError(
-            "the file does not hold what it announces", where=file, found=f"{len(table)} rows", expected=f"{head[0]:.0f} rows"
+            "the content disagrees with its header", where=file, found=f"{len(table)} rows", expected=f"{head[0]:.0f} rows"
         )
     return head, table

@@ -120,9 +120,7 @@ def fill(
         surface = replace(surface, done=(*surface.done, note))
     walls = int((sides(surface.triangles)[2] > 2).sum())
     if walls:
-        note = (
-            f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
-        )
+        note = f"{walls} edges have more than two triangles (inner walls, or bodies that touch there); their interior was filled"
         surface = replace(surface, done=(*surface.done, note))
     return _of_wanted_size(surface, options, where, crosses=crossing + walls > 0, tell=tell, mesher=mesher)
 
@@ -283,4 +281,4 @@ def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
     nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
     kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))
     check_mesh(kept, where)
-    return kept, (f"{len(volume) - 1} loose crumbs were left out",)
+    return kept, (f"{len(volume) - 1} disconnected pieces of negligible volume were removed",)

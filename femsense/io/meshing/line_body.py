@@ -221,7 +221,7 @@ def corner_angles(line: LineBody) -> FloatArray:
         return np.arange(8) * TURN / 8
     if any(section.squareness for section in line.sections):
         raise InputError(
-            "chambers beside the axis need a round section",
+            "chambers off the axis need a round section",
             where="chambers",
             found="width_mm and height_mm",
             expected="radius_mm, or area_mm2 with second_moment_mm4",

@@ -20,9 +20,7 @@ class Element(StrEnum):
 class MeshOptions:
     """Options of a mesh."""
 
-    unit: Annotated[str | None, Flag("--unit", "m|cm|mm", "Unit of the surface file; required but for STEP, which says it.")] = (
-        None
-    )
+    unit: Annotated[str | None, Flag("--unit", "m|cm|mm", "Unit of the surface file; required except for STEP.")] = None
     size_mm: Annotated[float | None, Flag("--size", "MM", "Wanted edge length.")] = None
     """By default from `most_tets`."""
     most_tets: Annotated[

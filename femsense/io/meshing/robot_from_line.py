@@ -58,7 +58,7 @@ def line_into(
     inputs = {"line": path.name, "sha256": file_hash(path), "most_tets": most_tets, "along_mm": along_mm}
     known = _known(target)
     if known and not again and known["inputs"] == inputs and known["femsense"] == femsense.__version__:
-        say(f"{target} holds this robot already (--again makes it anew)")
+        say(f"{target} contains this robot already (--again repeats it)")
         return known
     table = read_line(path)
     line = line_of(table, path)
@@ -105,7 +105,7 @@ def _known(target: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     raise InputError(
-        "something else than a robot from such a description stands there",
+        "the folder contains something else than a robot from such a description",
         where=target,
         expected="a new folder",
         hint="another -o: robot.toml would be replaced",

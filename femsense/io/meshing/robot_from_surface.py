@@ -75,7 +75,7 @@ def mesh_into(
     check_unit(points, options.unit, source)
     inputs = {"surface": source.name, "sha256": file_hash(source), "options": asdict(options)}
     if not again and (known := _finished(target, inputs)):
-        say(f"{target} holds this mesh already (--again fills the surface anew)")
+        say(f"{target} contains this mesh already (--again repeats the meshing)")
         return known
     filled = fill_cad(source, points, triangles, options, progress=progress) if source.suffix.lower() in CAD_READ else None
     filled = filled or fill(points, triangles, options, where=str(source), progress=progress, mesher=mesher)
@@ -135,7 +135,7 @@ def check_unit(points: FloatArray, unit: str | None, path: Path) -> None:
     hint = f"--unit {best} makes it {1e3 * size / PER_METRE[best]:.4g} mm long" if best else "scale the surface"
     if unit is None:
         raise InputError(
-            "the unit of a surface file stands nowhere in it",
+            "a surface file does not contain its unit",
             where=path,
             found=f"extents of {text}",
             expected="--unit m, --unit cm or --unit mm",
@@ -213,7 +213,7 @@ def _check_target(target: Path) -> None:
         raise InputError("stands in the way", where=target, found="a file", expected="a folder", hint="another -o")
     if target.is_dir() and any(target.iterdir()) and not (target / "robot.toml").is_file():
         raise InputError(
-            "something else than a robot stands there",
+            "the folder contains something else than a robot",
             where=target,
             expected="a new folder, or one with robot.toml",
             hint="another -o",

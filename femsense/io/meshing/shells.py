@@ -46,7 +46,7 @@ def find_shells(points: FloatArray, triangles: IntArray, where: str, most: int) 
             where=where,
             found=f"{count} pieces of {len(triangles) / count:.1f} triangles on average",
             expected=f"a closed surface, or at most {most} shells",
-            hint="merge equal points and remove what is inside, in a mesh editor",
+            hint="merge equal points and remove inner parts in a mesh editor",
         )
     if count == 1:
         return Shells(of, volume, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
@@ -113,7 +113,7 @@ def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list
     dust = size < DUST * size.max()
     if not dust.any():
         return triangles
-    done.append(f"{int(dust.sum())} shells that enclose next to nothing were left out")
+    done.append(f"{int(dust.sum())} shells of negligible volume were removed")
     return np.asarray(triangles[~dust[of]])
 
 

@@ -251,7 +251,7 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
             expected="a closed surface",
             hint="mend it in a mesh editor",
         )
-    done.append(f"{len(np.unique(labels[hangs]))} sheets of {int(hangs.sum())} triangles that hang on the body were left out")
+    done.append(f"{len(np.unique(labels[hangs]))} sheets of {int(hangs.sum())} triangles attached to the body were removed")
     return triangles[~hangs]
 
 

@@ -55,7 +55,7 @@ def sweep(layers: Sequence[Layer], angles: FloatArray, keep: Kept) -> tuple[TetM
     ]
     used, numbers = np.unique(np.vstack(tets), return_inverse=True)
     if not len(used):
-        raise InputError("no cell is left", where="chambers", expected="cavities that leave something of the body")
+        raise InputError("no cell remains", where="chambers", expected="cavities that leave something of the body")
     mesh = oriented(TetMesh(grids.reshape(-1, 3)[used], numbers.reshape(-1, 4)))
     return mesh, used // each
 

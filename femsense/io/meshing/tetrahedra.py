@@ -174,7 +174,7 @@ def _run_ftetwild(
             found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
             expected="tetrahedra",
             hint=(
-                "surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or "
+                "nearly coincident surfaces and walls thinner than the tolerance take long: repair them, or "
                 "femsense mesh with another --tolerance or a larger --size"
             ),
         ) from None

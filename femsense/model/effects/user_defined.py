@@ -88,7 +88,7 @@ def try_own_effect(effect: Effect, robot: Robot) -> None:
                 expected="no forces, the same robot, the same points",
                 found=", ".join(f"{p.key} = {null[p.key]}" for p in parameters if p.part in (None, 0))
                 + ", which changes the robot",
-                hint='say where it vanishes: "null" (femsense docs own)',
+                hint='declare the value without effect: "null" (femsense docs own)',
             )
 
 

@@ -71,7 +71,7 @@ DENSITY = Effect(
 )
 TIP_MASS = Effect(
     "tip_mass",
-    "a mass that nobody declared: its weight turns with gravity",
+    "an undeclared mass, with a weight along gravity",
     _mass_parameters,
     _apply_mass,
     _mass_places,

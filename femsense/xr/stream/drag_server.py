@@ -49,7 +49,7 @@ from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
 """Of an input for which the robot declares no limit."""
-BEGINS = "; nobody says which inputs the robot has: the first command begins at those that are shown"
+BEGINS = "; the inputs of the robot are unknown: the first command starts from the displayed ones"
 FAR = 2.0
 """A wish farther from the body than this many times its size is no wish."""
 
@@ -302,7 +302,7 @@ class DragServer:
             return ""
         if now - self._unmeasured_at <= fresh:
             return f"; not measured: {self._unmeasured}"
-        return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'nobody says where {handle} is'}"
+        return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'no measured position of {handle} is'}"
 
     def _document(self, handle: str, motion: Motion, ms: float) -> dict[str, Any]:
         units = {one.name: one.unit for one in self.gate.inputs}

@@ -200,7 +200,7 @@ def test_it_is_not_made_twice(tmp_path: Path, quick: Blocks) -> None:
         mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick) == json.loads(json.dumps(first))
         and len(quick.calls) == 1
     )
-    assert "holds this mesh already" in said[0]
+    assert "contains this mesh already" in said[0]
     mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick, again=True)
     mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append, mesher=quick)
     assert len(quick.calls) == 3 and len(said) == 1
@@ -303,7 +303,9 @@ def test_crumbs_are_left_out_and_parts_are_refused() -> None:
         mesher = made_before(*[both] * 5)
         if fits:
             filled = fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
-            assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
+            assert len(filled.mesh.tets) == len(body.tets) and filled.done == (
+                "1 disconnected pieces of negligible volume were removed",
+            )
             continue
         with pytest.raises(InputError, match="fall into parts that no face joins"):
             fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
@@ -317,7 +319,7 @@ def test_a_wall_inside_is_said_and_filled(quick: Blocks) -> None:
     )
     faces = np.vstack([left.triangles, right.triangles[(right.triangles[:, :, 0] > 1).any(axis=1)]])
     filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM, mesher=quick)
-    assert any(note.startswith("4 edges have more than two triangles (walls inside") for note in filled.done)
+    assert any(note.startswith("4 edges have more than two triangles (inner walls") for note in filled.done)
     assert quick.calls[0]["check_volume"] is False
 
 
@@ -357,7 +359,7 @@ def test_what_takes_too_long_is_stopped() -> None:
             ),
             "a cloud of 2 points",
         ),
-        ("noise.stl", bytes(range(256)) * 10, "the file does not hold what it announces"),
+        ("noise.stl", bytes(range(256)) * 10, "the content disagrees with its header"),
         ("cut.stl", stl_bytes(BOX.triangles)[:300], "12 triangles announced, room for 4"),
         (
             "nan.stl",
@@ -386,7 +388,7 @@ def test_tetrahedra_are_no_surface(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("unit", "extent", "text", "hint"),
     [
-        (None, 100.0, "the unit of a surface file stands nowhere in it", "--unit mm makes it 100 mm long"),
+        (None, 100.0, "a surface file does not contain its unit", "--unit mm makes it 100 mm long"),
         ("m", 100.0, "the body has an unlikely size", "--unit mm makes it 100 mm long"),
         ("mm", 0.1, "the body has an unlikely size", "--unit m makes it 100 mm long"),
         ("inch", 100.0, "unknown unit", "--unit mm makes it 100 mm long"),

@@ -257,7 +257,7 @@ def _warn_of_distance(file: Path, unit: float, said: bool, layout: str) -> None:
     ]
     begin = f"the scene is {away:.3g} m away where one unit of depth is {1e3 * unit:.3g} mm"
     from_layout = "" if said else f", as {layout} has it"
-    text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M says another'}"
+    text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M states another'}"
     warnings.warn(text, stacklevel=3)
 
 

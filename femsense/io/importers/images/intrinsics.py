@@ -273,7 +273,7 @@ def _in_text(text: str, width: int, height: int) -> _Found | None:
     named = _named_numbers(lines)
     found = _of_names(named) or _of_model(named, width, height) or _of_shape(lines) or _of_order(lines, width, height)
     if found is not None and any(name.removesuffix(AGAIN) in (*KNOWN, *MATRICES) for name in named if name.endswith(AGAIN)):
-        found = replace(found, notes=(*found.notes, "several lenses stand there, and the first is read"))
+        found = replace(found, notes=(*found.notes, "the file has several lenses; the first is used"))
     if found is not None or "fx" in named:
         return found
     bare = [" ".join(NUMBER.findall(line)) for line in lines]  # numbers among words that name nothing

@@ -88,7 +88,7 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: Stamps) -> Plan:
             notes.append(f"the forces of {stream.topic.name} (frame {stream.frame or '–'}) are taken in the robot's axes")
         else:
             notes.append(
-                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z says where they act"
+                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z states where they act"
             )
     poses = _marker_poses(bag, choice, notes)
     used = [s for s in choice.markers if s.topic.name in poses]

@@ -102,7 +102,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             where=bag.path,
             found=found,
             expected="depth images, PointCloud2, markers or inputs",
-            hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
+            hint=f"{lost[0]} has 8 bits: the depth is not recoverable; record 16UC1 or compressedDepth" if lost else None,
         )
     choice = Choice(primary, tuple(of[Kind.MARKERS]), tuple(of[Kind.INPUTS]), tuple(of[Kind.LOADS]))
     if depth is None:
@@ -309,7 +309,7 @@ def _with_color(bag: Bag, choice: Choice, streams: Sequence[Stream]) -> Choice:
     lens = _lens(bag, color)
     T = _extrinsics(bag, depth, color)
     if lens is None or T is None:
-        lacking = "its CameraInfo" if lens is None else "its place beside the depth camera (TF, extrinsics)"
+        lacking = "its CameraInfo" if lens is None else "its pose relative to the depth camera (TF, extrinsics)"
         return replace(choice, notes=(*choice.notes, f"the colours of {color.topic.name} are left out: the bag lacks {lacking}"))
     return replace(choice, color=color, color_lens=lens, T_color_depth=T)
 

@@ -92,7 +92,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
             if len(back)
             else f"{len(time_s)} rows",
             expected="rows in order of time",
-            hint="stamps that stand still were rounded: log more digits" if len(back) > 1 else None,
+            hint="repeated time stamps were rounded: log more digits" if len(back) > 1 else None,
         )
     values = np.stack([column.values(table[kept]) for column in chosen], axis=1)
     notes += notation_notes(file) + unit_notes(chosen, names, columns)
@@ -219,7 +219,7 @@ def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
 
 def _unsure(log: ActuationLog, found: str) -> InputError:
     return InputError(
-        "the motion does not tell the offset between the log of actuation and the frames",
+        "the motion does not determine the offset between the actuation log and the frames",
         where=log.path,
         found=found,
         expected="--offset SECONDS: the frames' time minus the log's (0 where both have one clock)",

@@ -61,5 +61,5 @@ def _unwrapped(values: FloatArray, scale: float) -> tuple[FloatArray, list[str]]
         period = min(periods, key=lambda p: abs(steps[k] + p - usual))
         if 0.0 < steps[k] + period <= AFTER_WRAP * usual:
             added[known[k + 1] :] += period
-            notes.append(f"the time begins again at row {known[k + 1] + 1}: {periods[period]} went round; it is counted on")
+            notes.append(f"the time begins again at row {known[k + 1] + 1}: {periods[period]} overflowed, which is undone")
     return values + added, notes

@@ -248,6 +248,6 @@ def unit_beside(name: str, target: str, *, mapped: bool = True) -> Unit | None:
             where=f"column {name}",
             found=bracketed[1] if bracketed else spelt,
             expected="|".join(units_of(*wanted)),
-            hint=f"--map '{name}={bare if target == name else target}*FACTOR' says what one of it is in SI units",
+            hint=f"--map '{name}={bare if target == name else target}*FACTOR' states one of it in SI units",
         )
     return None

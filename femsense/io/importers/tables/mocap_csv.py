@@ -116,7 +116,7 @@ def _notes(export: Export, options: Options, step: float | None) -> list[str]:
     if export.rate and step and abs(step * export.rate - 1.0) > 0.05:
         notes.append(f"the header says {export.rate:g} frames a second, the times {1.0 / step:.4g}: the times count")
     if options.rate is not None and (export.time is not None or export.rate is not None):
-        notes.append("--rate has no effect: the file says its times")
+        notes.append("--rate has no effect: the file contains times")
     return notes
 
 

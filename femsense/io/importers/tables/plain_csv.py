@@ -118,7 +118,7 @@ def notation_notes(path: Path) -> list[str]:
     """Return the assumptions about the notation of a table's numbers."""
     notation = layout_of(path).notation
     decimal = ["numbers are read with decimal commas"] if notation.commas else []
-    return decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
+    return decimal + (["thousands separators are ignored"] if notation.grouped else [])
 
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
@@ -138,9 +138,7 @@ def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[
     units = " and ".join(
         dict.fromkeys("Pa" if name.startswith("chamber_") else "N, or m for --inputs displacement" for name in bare)
     )
-    return notes + (
-        [f"no unit stands beside {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT says another"] if bare else []
-    )
+    return notes + ([f"no unit for {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT states another"] if bare else [])
 
 
 def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> Samples:
@@ -166,7 +164,7 @@ def _times(path: Path, names: list[str], headed: bool, options: Options) -> tupl
     if clock is None:
         return np.arange(sum(1 for _ in number_rows(path))) / (options.rate or 1.0), []
     times, notes = seconds_of(np.fromiter((row[clock[0]] for row in number_rows(path)), dtype=np.float64), clock[1])
-    return times, notes + (["--rate has no effect: the table says its times"] if options.rate is not None else [])
+    return times, notes + (["--rate has no effect: the table contains times"] if options.rate is not None else [])
 
 
 def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
@@ -201,7 +199,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
         raise InputError("two columns become the same", where=path, found=twice, expected="a name each")
     if len(kinds) > 1:
         raise InputError(
-            "cables that hold tensions beside others that hold displacements",
+            "cables with tensions together with cables with displacements",
             where=path,
             found=", ".join(names[column.index] for column in found if column.name.startswith("cable_")),
             expected="one of both in all columns",
