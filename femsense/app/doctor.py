@@ -176,7 +176,7 @@ def _solver() -> Finding:
     from femsense.fem.linalg.factorization import pardiso_library
 
     name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
-    return note(name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along")
+    return note(name, f"FEMSENSE_SOLVER={chosen} selects it: slower than the own solver")
 
 
 def _viewer() -> Finding:
@@ -267,7 +267,7 @@ PARTS: dict[str, Callable[[], Finding]] = {
     "system libraries": _libraries,
     "linear solver": _solver,
     "viewer page": _viewer,
-    "robots that come along": _robots,
+    "robots of the package": _robots,
     "cache of compiled kernels": _numba_cache,
     "compiled kernels": _kernels,
     "a tiny solve": _tiny_solve,

@@ -269,7 +269,8 @@ def _require_one(
                 raise DataError(
                     f"the markers of camera {name} have no names, and two poses fit them equally well: the residuals are "
                     f"{1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm, and they place the markers "
-                    f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
+                    f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, "
+                    f"pull cables in free frames, or declare T_robot_camera"
                 )
 
 

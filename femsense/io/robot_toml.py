@@ -68,7 +68,7 @@ def find_robot(path_or_name: str | Path) -> Path:
         if str(path_or_name) in known and known[str(path_or_name)].resolve() != path.resolve():
             warnings.warn(
                 (
-                    f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name that comes along is "
+                    f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name in the package is "
                     f"{known[str(path_or_name)]}"
                 ),
                 stacklevel=3,
@@ -77,7 +77,7 @@ def find_robot(path_or_name: str | Path) -> Path:
     if str(path_or_name) in known:
         if path.exists():
             warnings.warn(
-                f"{path_or_name}: the robot that comes along is used; the folder {path.absolute()} has no robot.toml",
+                f"{path_or_name}: the robot of the package is used; the folder {path.absolute()} has no robot.toml",
                 stacklevel=3,
             )
         return known[str(path_or_name)] / "robot.toml"

@@ -83,7 +83,7 @@ def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[st
         idle = "a cable that was slack" if kind == "cable" else "a chamber without pressure"
         column = f"{kind}_" if recording.folder else ""
         renamed = (
-            f"rename the column of frames.csv, or import again with --map {extra[0]}={kind}_NAME"
+            f"rename the column of frames.csv, or import again with --map {extra[0]}={kind}_{(lacking or ['NAME'])[0]}"
             if extra and recording.folder
             else None
         )

@@ -198,10 +198,10 @@ def test_an_own_folder_with_the_name_of_a_robot_that_comes_along(tmp_path: Path,
     monkeypatch.chdir(tmp_path)
     name = sorted(robot_names())[0]
     write_block_robot(tmp_path / name)
-    with pytest.warns(UserWarning, match="is used; the robot of that name that comes along"):
+    with pytest.warns(UserWarning, match="is used; the robot of that name in the package"):
         assert find_robot(name) == Path(name) / "robot.toml"
     (tmp_path / name / "robot.toml").unlink()
-    with pytest.warns(UserWarning, match=r"comes along is used; the folder .* has no robot\.toml"):
+    with pytest.warns(UserWarning, match=r"of the package is used; the folder .* has no robot\.toml"):
         assert find_robot(name) == robot_names()[name] / "robot.toml"
 
 

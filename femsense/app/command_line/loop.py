@@ -49,13 +49,13 @@ def improve(
     correct: Annotated[
         bool, option("--correct", help="Also fit an empirical correction of the remaining residual, tested on held-out data.")
     ] = False,
-    again: Annotated[bool, option("--again", help="Compute even where OUT contains this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat the computation even if OUT contains its result.")] = False,
     workers: Annotated[
         int | None,
         option(
             "--workers",
             "N",
-            "Threads, and processes that many recordings are spread over; 0: this process; by default one a core.",
+            "Number of threads, and of processes for many recordings; 0: this process; default: one per core.",
             min=0,
         ),
     ] = None,
@@ -64,12 +64,12 @@ def improve(
     ] = False,
     given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: existing recordings.")] = None,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
-    frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
+    frames: Annotated[int, option("--frames", "N", "With --plan: largest number of new frames.", min=1)] = 60,
     actuation: Annotated[Inputs, option("--actuation", help="With --plan: quantity of the cable inputs.")] = Inputs.tension,
     dask: Dask = None,
     memory: Memory = None,
 ) -> Answer:
-    """Find what the model lacks and write the better robot."""
+    """Find the effects that the model lacks and write the improved robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.io.recording_folder import load_recording

@@ -45,8 +45,10 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
     return type_(**{field.name: values[field.name] for field in fields(type_) if field.name in values} | others)
 
 
-RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-Recordings = Annotated[list[Path], argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")]
+RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot of the package.")]
+Recordings = Annotated[
+    list[Path], argument("RECORDING…", "A folder with recording.toml; several folders, or a pattern, are several jobs.")
+]
 
 
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]

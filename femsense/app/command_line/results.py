@@ -178,7 +178,10 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
 @command(Several.EACH)
 def report(
-    folders: Annotated[list[Path], argument("DIR…", "A folder of results; several, or one of many jobs, are many jobs.")],
+    folders: Annotated[
+        list[Path],
+        argument("DIR…", "A folder of results; several folders, or one with the results of several jobs, are several jobs."),
+    ],
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report

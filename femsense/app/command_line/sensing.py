@@ -14,7 +14,7 @@ from femsense.app.command_line.parameters import Recordings, RobotPath, filled, 
 from femsense.app.command_line.several import Several
 from femsense.app.live_options import LiveOptions
 
-USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
+USE_CORRECTION = "Use the empirical correction of femsense improve --correct, which applies to markers."
 
 
 class SensingMethod(StrEnum):
@@ -62,20 +62,24 @@ def estimate(
     output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
     calibration: Annotated[
         Path | None,
-        option("-c --calibration", "FILE", "Of femsense calibrate, or its folder of many; made first where not given."),
+        option(
+            "-c --calibration",
+            "FILE",
+            "Result of femsense calibrate, or its folder for several recordings; by default it is computed first.",
+        ),
     ] = None,
-    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Where forces act, in metres on the body at rest.")] = None,
+    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Contact point, in metres on the body at rest.")] = None,
     method: Annotated[
         SensingMethod,
         option("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
     ] = SensingMethod.rays,
-    friction: Annotated[float, option("--friction", "MU", "The cone about the normal in which contact forces lie.")] = 1.0,
+    friction: Annotated[float, option("--friction", "MU", "Coefficient of the friction cone of contact forces.")] = 1.0,
     push: Annotated[
         bool, option("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
     ] = False,
-    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
+    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
-    again: Annotated[bool, option("--again", help="Compute even where RUN contains this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat the computation even if RUN contains its result.")] = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into

@@ -29,10 +29,10 @@ class Several(Enum):
 
 Jobs = Annotated[
     str | None,
-    option("--jobs", "TABLE|GLOB", "Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
+    option("--jobs", "TABLE|GLOB", "Several jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
 ]
 Workers = Annotated[int | None, option("--workers", "N", "Several jobs: number of processes; default: one per core.", min=0)]
-Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see femsense docs many.")]
+Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Several jobs: on workers of dask; see femsense docs many.")]
 Memory = Annotated[float | None, option("--memory", "GB", "Several jobs: memory limit of a worker.")]
 MANY = {"jobs": Jobs, "workers": Workers, "dask": Dask, "memory": Memory}
 """Options of commands that take many jobs."""
@@ -100,7 +100,7 @@ def spread_over(count: int, most: int, workers: int | None, dask: str | None, me
     from femsense.many.limits import memory_share
 
     if count <= most and (dask is not None or memory is not None):
-        raise typer.BadParameter(f"--dask and --memory are of many jobs, or of more than {most} recordings")
+        raise typer.BadParameter(f"--dask and --memory apply to several jobs, or to more than {most} recordings")
     if count <= most or (workers == 0 and dask is None):
         yield None
         return
