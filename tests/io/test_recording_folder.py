@@ -714,7 +714,7 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
         "markers.csv, line 3, column marker",
         ["named and unnamed markers in one frame", "frame 0"],
     ),
-    ({"rest_csv": "marker,x_m,y_m,z_m\n,0,0,0\n"}, "rest.csv, line 2, column marker", ["named and unnamed markers"]),
+    ({"rest_csv": "marker,x_m,y_m,z_m\n,0,0,0\n"}, "rest.csv, line 2, column marker", ["a marker without a name"]),
     (
         {"recording_toml": TOML + CAMERA + '[camera.noise]\nkind = "stereo"\nfloor_m = 0.1\n'},
         "recording.toml: camera.noise",

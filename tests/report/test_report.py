@@ -675,7 +675,7 @@ def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
     [
         ("effects", "The data name what the model lacks."),
         ("none", "The model explains the data to their noise."),
-        ("unexplained", "A residual is left that no effect explains."),
+        ("unexplained", "A residual remains that no effect explains."),
     ],
 )
 def test_a_loop_of_the_verdict_alone_shows_just_that(tmp_path: Path, verdict: str, sentence: str) -> None:

@@ -1,4 +1,4 @@
-"""Effects of weight: a density that is not as declared, and a mass that nobody declared. Both turn with gravity."""
+"""Effects of weight: a wrong density and an undeclared mass. Both rotate with gravity."""
 
 from __future__ import annotations
 
