@@ -162,7 +162,7 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
 
 
 def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray]) -> Named:
-    """Return the reading under given poses and states: names by assignment,
+    """Return the names under given poses and states, by assignment,
     without outliers and without pairs that cannot be distinguished."""
     marker = np.full(len(recording.unnamed_frame), -1, dtype=np.int64)
     left: list[FloatArray] = []

@@ -1,4 +1,4 @@
-"""Tetrahedra of bodies that are built of blocks: a grid of cells, some of them left out, placed in space by a function."""
+"""Tetrahedra of bodies made of blocks: a grid of cells, some of them omitted, mapped into space by a function."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the
 chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
 chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless asked): it goes slack where T would be
 negative, and taut again where its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
-Friction moves the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they rest.
+Friction changes the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they converge.
 """
 
 from __future__ import annotations
@@ -116,9 +116,8 @@ class SolveOptions:
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
     along: tuple[FloatArray, ...] | None = None
-    """Tension of each segment of each cable for a tension of 1 at its motor [1], held still:
-    for laws of friction of one's own. Cables with friction of theirs move on from it. None: 1 without friction,
-    and with it as the start left it."""
+    """Tension of each segment of each cable for a motor tension of 1 [1], kept constant: for user-defined friction laws. Cables with own
+    friction start from it. None: 1 without friction, else the values of the start."""
     reuse_factor: bool = False
     """Begin with the factor of the start, for changes so small that its stiffness still serves."""
     max_iterations: int = 60

@@ -28,8 +28,8 @@ from femsense.fem.newton_state import (
 from femsense.fem.slack_and_friction import let_go, update_friction, update_slack
 
 SURE = 0.1
-"""If a step left less than this share of the residual, the next one will likely leave less than `NewtonOptions.chord`, so no
-tangent is assembled at the state it leads to."""
+"""If a step reduces the residual below this fraction, the next one will probably reach `NewtonOptions.chord`, so no tangent is assembled
+at the new state."""
 LENT = 0.1
 """The same for a factor borrowed from a nearby state."""
 RUBS = 0.3
@@ -193,7 +193,7 @@ def factor_here(
 
 
 def definite_factor(pattern: Pattern, values: FloatArray, state: State) -> Factorization | None:
-    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last.
+    """Factorise a stiffness with the shift that makes it positive definite, starting from the last one.
     Where it is indefinite in single precision alone, as a body about to buckle may be, no other factor of this state is."""
     first, plain = state.shift / 4.0, None
     if state.single:

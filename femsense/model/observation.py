@@ -150,7 +150,7 @@ def with_rest_markers(robot: Robot, scene: Scene) -> Scene:
 
 
 def placements(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
-    """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
+    """Return the marker positions at rest [m], shape (m, 3): measured in rest.csv, or as declared."""
     places = robot.marker_points.copy()
     if len(scene.rest_marker):
         places[scene.rest_marker] = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)

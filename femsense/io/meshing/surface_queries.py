@@ -71,8 +71,7 @@ def nearest_on(points: FloatArray, triangles: IntArray, places: FloatArray) -> F
 
 
 def wall_thickness(points: FloatArray, triangles: IntArray, places: FloatArray, inward: FloatArray) -> FloatArray:
-    """Return how far it is from places just inside of the surface, along unit vectors, to the next wall, shape (p,);
-    inf: none."""
+    """Return the distance from points just inside of the surface along unit vectors to the next wall, shape (p,); inf without one."""
     import open3d as o3d
 
     centre, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())

@@ -221,7 +221,7 @@ def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLengt
 
 
 def range_units(parameters: Sequence[Parameter], cables: Sequence[str], ranges: FloatArray) -> FloatArray:
-    """Return the unit that sizes of parameters are shares of, shape (p,): the range of the cable's input [N] or [m], or 1."""
+    """Return the unit of relative parameter sizes, shape (p,): the range of the cable's input [N] or [m], or 1."""
     return np.array([float(ranges[cables.index(str(path_of(p.part)[0]))]) if p.of_range else 1.0 for p in parameters])
 
 
