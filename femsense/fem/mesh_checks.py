@@ -69,7 +69,9 @@ def check_mesh(mesh: TetMesh, where: str) -> None:
 
 
 def hinged_parts(mesh: TetMesh) -> IntArray:
-    """Return the index of the face-connected part of each element, shape (m,). Parts that share only an edge or a corner act as hinges."""
+    """Return the index of the face-connected part of each element, shape (m,).
+
+    Parts that share only an edge or a corner act as hinges."""
     m, n = len(mesh.tets), len(mesh.nodes)
     faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3).astype(np.int64), axis=1)
     keys = (faces[:, 0] * n + faces[:, 1]) * n + faces[:, 2]
