@@ -252,7 +252,7 @@ def _clean_stdout(active: bool) -> Iterator[None]:
 
 
 def _flush_c() -> None:
-    """Have C libraries write what they hold back."""
+    """Flush the buffers of C libraries."""
     import ctypes
 
     with contextlib.suppress(OSError, AttributeError, TypeError):

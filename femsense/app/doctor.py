@@ -135,7 +135,7 @@ def _python() -> Finding:
 def _package(module: str, package: str) -> Finding:
     try:
         loaded = importlib.import_module(module)
-    except Exception as error:  # OSError and ImportError, and what a broken binary raises
+    except Exception as error:  # OSError, ImportError, and errors of a broken binary
         return bad(_short(error), import_hint(str(error), package))
     return good(_version(package) or str(getattr(loaded, "__version__", "version not known")))
 

@@ -44,14 +44,14 @@ def import_into(
     Arguments:
         folder: of the recording.
         paths: the captures, one a camera; NAME=PATH names it.
-        options: what a person says about it.
-        say: called with one line about what is happening.
-        driven: what a person says about the inputs.
-        again: repeat the import although the recording is there.
+        options: of the user.
+        say: called with a line on each step.
+        driven: options of the user on the inputs.
+        again: repeat the import even if the recording exists.
         progress: called with (frames done, frames in all).
 
     Raises:
-        InputError: whatever is wrong with the capture, or another thing at this place.
+        InputError: a problem of the capture, or other content of the folder.
     """
     options, driven = _spelt(options), driven or InputOptions()
     _check_options(options)
@@ -87,7 +87,7 @@ def import_into(
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
-    """Return what was imported as plain text."""
+    """Return the summary of an import as plain text."""
     from femsense.app.inspection.text import section_text
 
     notes = document.get("notes", [])
@@ -154,9 +154,9 @@ def _check_options(options: Options) -> None:
 
 
 def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Options:
-    """Return the options without the mappings that are about columns of the log of actuation.
+    """Return the options without the mappings of columns of the actuation log.
 
-    Of a column that stands in a table of the capture too, only a mapping to an input is the log's alone.
+    For a column that is also in a table of the capture, only a mapping to an input belongs to the log.
     """
     of_log = mappable(header_of(log)[0])
     files = [path for _, path in map(split_name, paths)]

@@ -1,4 +1,4 @@
-"""What makes robots and recordings: `import`, `mesh`, `simulate`."""
+"""Commands that make robots and recordings: `import`, `mesh`, `simulate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What shows results: `export`, `view`, `stream`, `report`."""
+"""Commands that show results: `export`, `view`, `stream`, `report`."""
 
 from __future__ import annotations
 

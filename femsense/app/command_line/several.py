@@ -24,7 +24,7 @@ class Several(Enum):
     EACH = "each"
     """Each is a job."""
     TOGETHER = "together"
-    """All are one joint job, which has its own use for workers; `--jobs` alone asks for more."""
+    """All recordings are one joint job, which uses the workers itself; only `--jobs` makes several."""
 
 
 Jobs = Annotated[

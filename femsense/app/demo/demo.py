@@ -27,7 +27,7 @@ ROBOT = "four-leg"
 
 @dataclass(frozen=True, slots=True)
 class DemoSteps:
-    """What the chain is made of."""
+    """The steps of the chain."""
 
     estimate: Callable[..., Run] = estimate_into
     improve: Callable[..., dict[str, Any]] = improve_into
@@ -42,7 +42,7 @@ def run_demo(
 ) -> dict[str, Any]:
     """Estimate with the declared robot, improve it, estimate again; export the result and measure both against the truth.
 
-    Steps that the folder holds already are not done again.
+    Steps whose results are in the folder are not repeated.
 
     Arguments:
         folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.

@@ -1,4 +1,4 @@
-"""What every inspection does: collect problems and notes."""
+"""Common parts of inspections: collecting problems and notes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from femsense.core.errors import FemsenseError
 
 Report = dict[str, Any]
 Problems = list[FemsenseError | str]
-"""What is wrong, as errors that would be raised or as texts."""
+"""Problems, as exceptions or as texts."""
 
 
 @contextmanager
 def collected(problems: Problems, notes: list[str]) -> Iterator[None]:
-    """Turn what the block raises into a problem, and its warnings into notes."""
+    """Turn an exception of the block into a problem, and its warnings into notes."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -29,7 +29,7 @@ def collected(problems: Problems, notes: list[str]) -> Iterator[None]:
 
 
 def attempt(action: Callable[[], Any], problems: Problems) -> Any:
-    """Return what the action returns; None where it raises, with the text among the problems."""
+    """Return the result of the action; if it raises, None, with the text among the problems."""
     notes: list[str] = []
     result = None
     with collected(problems, notes):
