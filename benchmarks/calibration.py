@@ -289,7 +289,7 @@ def labels(seeds: int) -> None:
                     off.append(
                         1e3 * float(np.linalg.norm(step_between(found.poses[0], T_ROBOT_CAMERA, np.array([0.05, 0, 0]))[3:]))
                     )
-                    said += any("left out" in str(w.message) or "put right" in str(w.message) for w in heard)
+                    said += any("left out" in str(w.message) or "corrected" in str(w.message) for w in heard)
                 except DataError:
                     said += 1
         told = ("–", said) if kind == "nothing" else (said, "–")
@@ -401,7 +401,7 @@ def _named_rms(robot: Robot, recording: Recording, truth: IntArray) -> tuple[flo
         except DataError as error:
             print(f"  accused: {error}"[:160])
             return np.nan, np.nan, 1
-    accused = sum("left out" in str(w.message) or "put right" in str(w.message) for w in heard)
+    accused = sum("left out" in str(w.message) or "corrected" in str(w.message) for w in heard)
     spread = np.sqrt(((robot.marker_points - robot.marker_points.mean(axis=0)) ** 2).sum(axis=1).mean())
     return 1e3 * found.rms_m, found.rms_m / float(spread), accused
 

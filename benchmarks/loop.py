@@ -282,7 +282,7 @@ def table(records: Sequence[dict[str, Any]]) -> None:
     seen = [[d["d"] > d["needed"] and d["retained"] >= 0.1 for d in r["d_primes"]] for r in two]
     sure = [(r, h) for r, h, each in zip(two, hidden, seen) if all(each)]
     row(
-        "  where each of the two is detectable beside the other",
+        "  where each of the two is detectable in addition to the other",
         wilson(sum(h <= answer_set(r) for r, h in sure), len(sure)),
         ">= 50 % | >= 75 %",
     )
@@ -294,7 +294,7 @@ def table(records: Sequence[dict[str, Any]]) -> None:
     row("  as before, names whose set holds a hidden one not false", wilson(sum(unsure), len(two)), "")
     poor = [r for r in done if r["kind"] == "poor"]
     unsaid = [r for r in poor if r["label"] in named(r) and not r["not_testable"]]
-    row("what the recording cannot show is not named", wilson(len(poor) - len(unsaid), len(poor)), ">= 90 % | 100 %")
+    row("undetectable effects are not named", wilson(len(poor) - len(unsaid), len(poor)), ">= 90 % | 100 %")
     sure = [r for r in unsaid if len(answer_set(r)) == len(set(named(r)))]
     row("  as before, or named as one of a set that is not distinguishable", wilson(len(poor) - len(sure), len(poor)), "")
     times = [r["cpu_s"] for r in done]

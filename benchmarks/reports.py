@@ -51,7 +51,7 @@ REPORTS = (
         "one marker TipAngles in metres, six tracks dropped",
         "tests/io/importers/test_what_files_say.py",
         ("import unnamed_outputs.c3d -o OUT/a", "import named_outputs.c3d -o OUT/b"),
-        "no places",
+        "not positions",
     ),
     Report(
         "c3d-nul-padding",
@@ -71,7 +71,7 @@ REPORTS = (
             "import rounded_by_excel.csv -o OUT/b --unit m",
             "import tenths_of_seconds.csv -o OUT/c --unit m",
         ),
-        "went round|not later|dropped, since",
+        "overflowed|not later|dropped, since",
     ),
     Report(
         "csv-excel-days",
@@ -100,7 +100,7 @@ REPORTS = (
     Report(
         "lens-refused-then-accepted",
         "4 × 4, 3 × 4, fy < 0",
-        "refused, then 'holds this import already'",
+        "refused, then 'contains this import already'",
         "tests/io/importers/test_intrinsics.py, tests/io/importers/test_refused_import.py",
         ("import scannet -o OUT/a", "import proj34 -o OUT/b", "import iclnuim -o OUT/c", "import iclnuim -o OUT/c"),
         "^ *lens |try:",

@@ -1,10 +1,9 @@
-"""Small inputs that once went wrong: what the commands make of each now, beside what they made of it before.
+"""Small wrong inputs: the results and messages of the commands, and those of an early version.
 
     python benchmarks/trials.py FOLDER [--only NAME …] [--page docs/results/trials.md]
 
 FOLDER holds the inputs (data/trials): robots, recordings and files, each of a kind.
-Every row runs the commands a user would run, in a folder of its own, and prints their exit status, forces and what they say.
-Prints the table of docs/results/trials.md.
+Each row runs the commands of a user in a folder of its own, and prints exit status, forces and messages: the first table of docs/results/trials.md.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import io
 import json
 import sys
 import tempfile
+import textwrap
 import time
 import warnings
 from collections.abc import Sequence
@@ -107,8 +107,9 @@ def call(arguments: Sequence[str]) -> tuple[int, str, list[str]]:
 
 def first_line(said: Sequence[str], folder: Path) -> str:
     lines = [" ".join(text.replace(str(folder) + "/", "").split()) for text in said]
-    lines = [line for line in lines if "compiling kernels" not in line and "is used; the robot" not in line]
-    return lines[0][:150] if lines else ""
+    silent = ("compiling kernels", "is used; the robot", "linear tetrahedra make")
+    lines = [line for line in lines if not any(text in line for text in silent)]
+    return textwrap.shorten(lines[0], 150, placeholder=" …") if lines else ""
 
 
 def forces(run: Path) -> str:

@@ -25,17 +25,15 @@ from femsense.model.effects import EFFECT_NAMES
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "formats" / "files.md"
 HEAD = """# Files: robot and recording
 
-Written by `scripts/file_pages.py` from the tables that read the files; a test holds it up to date.
-
-All lengths are in metres, unless a key `unit` says otherwise; a unit stands at the end of a name. Camera frames are OpenCV's: x right, y down, z forward,
-right-handed. `T_a_b` takes points of frame b to frame a: 4 rows of 4 numbers. An unknown key or column is an error.
+All lengths are in metres, unless a key `unit` declares another unit; names of keys and columns end with their unit. Camera frames are those of OpenCV:
+x right, y down, z forward, right-handed. `T_a_b` takes points of frame b to frame a: 4 rows of 4 numbers. An unknown key or column is an error.
 """
 ROBOT = """## A robot: a folder with `robot.toml` and a mesh
 
-The mesh file stands beside `robot.toml`. It holds tetrahedra, or a closed surface (STL, OBJ, PLY, OFF) that is filled on first use. Tetrahedra come as
-VTU in one or more pieces, VTK, Gmsh 1 to 4.1, Abaqus with one part or instance, Medit, TetGen, Nastran, XDMF and MED (`pip install h5py`) and what else
-meshio reads.
-A tetrahedron that stands twice is used once.
+The mesh file is next to `robot.toml`. It contains tetrahedra, or a closed surface (STL, OBJ, PLY, OFF) that is filled on first use. Tetrahedra come as
+VTU in one or more pieces, VTK, Gmsh 1 to 4.1, Abaqus with one part or instance, Medit, TetGen, Nastran, XDMF and MED (`pip install h5py`) and the other
+formats of meshio.
+A duplicate tetrahedron is used once.
 """
 RECORDING = """## A recording: a folder
 
@@ -144,7 +142,7 @@ def _folders() -> str:
     return (
         "### Clouds and images\n\nA file's name is the number of its frame. With several cameras each has folders of its "
         "own: `clouds/NAME/`, `depth/NAME/`,\n"
-        f"`color/NAME/`. Notes ({', '.join(BESIDE)}) may lie beside; other files are named in a warning.\n\n| folder | "
+        f"`color/NAME/`. Notes ({', '.join(BESIDE)}) are allowed in these folders; a warning lists other files.\n\n| folder | "
         f"endings | |\n|---|---|---|\n{rows}"
     )
 

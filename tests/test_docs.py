@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import re
 import tomllib
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import femsense
@@ -169,3 +171,10 @@ def test_every_public_name_is_in_the_reference() -> None:
     pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs/reference").glob("*.md"))
     described = re.findall(r"^\.\. auto\w+:: femsense\.(\w+)$", pages, re.MULTILINE)
     assert sorted(described) == sorted(set(femsense.__all__) - {"__version__"})
+
+
+@pytest.mark.parametrize("name", [name for name in femsense.__all__ if ">>>" in (getattr(femsense, name).__doc__ or "")])
+def test_examples_of_the_reference_give_what_they_show(name: str) -> None:
+    public = getattr(femsense, name)
+    [test] = doctest.DocTestFinder(recurse=False).find(public, name, globs={"fs": femsense, "np": np})
+    assert doctest.DocTestRunner().run(test).failed == 0

@@ -102,6 +102,8 @@ def _default(parameter: Any) -> str:
 def plain_docstring(sphinx: Sphinx, what: str, name: str, _: Any, __: Any, lines: list[str]) -> None:
     """Escape what reStructuredText would take for markup: docstrings here are plain text with `names` in backquotes."""
     for i, line in enumerate(lines):
+        if line.lstrip().startswith((">>>", "...")):
+            continue
         parts = re.split(r"(``[^`]*``|`[^`]*`)", line)
         lines[i] = "".join(
             part if part.startswith("`") else re.sub(r"(?<=\w)_(?=\W|$)", r"\_", re.sub(r"([*|])", r"\\\1", part))

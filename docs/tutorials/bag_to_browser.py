@@ -126,7 +126,8 @@ with Writer(Path("take"), version=8, storage_plugin=StoragePlugin.MCAP) as bag:
 # %% [markdown]
 # ## Look, then import
 #
-# `inspect` lists what the bag contains. `import` makes a recording; `--free FROM:TO` marks the seconds without contact.
+# `inspect` lists what the bag contains. `import` makes a recording; `--free FROM:TO` marks the seconds without contact. The joint
+# has the name of the cable here; otherwise `--map motor_1=cable_flexor` renames it.
 
 # %%
 shell("femsense inspect take")

@@ -1,1 +1,1 @@
-"""What a user starts: the command line and its commands."""
+"""The command line and its commands."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
-STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
+STOPPED_TEXT = "stopped without half-written files; the same command continues"
 STOPPED_EARLY = "stopped before anything was served"
 SERVING = ("stream", "view")
 """Commands that end with Ctrl-C; before they serve, they were stopped."""
@@ -202,7 +202,7 @@ def _explained(error: Exception) -> tuple[str, int]:
         return f"{message}{'' if message.endswith('?') else '.'} See: {command} --help", 2
     if isinstance(error, ImportError) and not (error.name or "").startswith("femsense"):
         return (
-            f"a part of the installation does not load: {' '.join(str(error).split())}. femsense doctor says what is missing",
+            f"a part of the installation does not load: {' '.join(str(error).split())}. femsense doctor lists what is missing",
             2,
         )
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
@@ -262,7 +262,7 @@ def _clean_stdout(active: bool) -> Iterator[None]:
 
 
 def _flush_c() -> None:
-    """Have C libraries write what they hold back."""
+    """Flush the buffers of C libraries."""
     import ctypes
 
     with contextlib.suppress(OSError, AttributeError, TypeError):

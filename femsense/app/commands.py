@@ -55,7 +55,7 @@ def estimate_into(
         calibration: calibration.json; None calibrates first.
         at: places of contact at rest [m], shape (k, 3).
         options: of `estimate`.
-        again: compute even where the result is there.
+        again: repeat the computation even if the result exists.
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -71,7 +71,7 @@ def estimate_into(
     given = None if calibration is None else read_calibration(calibration)
     inputs = run_inputs(body, frames, given, at=at, options=options)
     if not again and finished(folder, inputs):
-        say(f"{folder} holds this result already (--again computes it anew)")
+        say(f"{folder} contains this result already (--again repeats it)")
         return read_run(folder, robot=body)
     if given is None:
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
@@ -111,7 +111,7 @@ def improve_into(
         say: called with a line on each step besides the loop.
         effects, without: names of effects to try, or not to try.
         options: of `improve`; its checkpoint is set here.
-        again: compute even where the result is there.
+        again: repeat the computation even if the result exists.
         progress: as of `improve`.
 
     Returns:
@@ -142,7 +142,7 @@ def improve_into(
     inputs |= {"references": [recording_input(twin) for twin in how.references]} if how.references else {}
     _require_different([*inputs["recordings"], *inputs["validation"], *inputs.get("references", [])])
     if not again and finished(folder, inputs):
-        say(f"{folder} holds this result already (--again computes it anew)")
+        say(f"{folder} contains this result already (--again repeats it)")
         return read_loop(folder)
     with only_writer(folder):
         with beside(load_pages):
@@ -174,7 +174,7 @@ def _require_different(recordings: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
-    """Return the file in which a killed command left its progress, and the input of that."""
+    """Return the checkpoint file of a killed command, and the inputs that it belongs to."""
     return Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}
 
 
@@ -191,7 +191,7 @@ def loop_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Pat
 
     Arguments:
         folder: what the loop wrote.
-        say: called with why there is no page.
+        say: called with the reason if there is no page.
         write: writes the page of a folder; None: `femsense.report.write_report`.
     """
     page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
@@ -289,7 +289,7 @@ def plan_into(
         given: a recording that exists; None starts from nothing.
         noise: of a marker's coordinate [m].
         frames: budget.
-        control: "tension" or "displacement"; a given recording says it itself.
+        control: "tension" or "displacement"; a given recording declares it.
         progress: called with (items done, items in all).
 
     Raises:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 COMPILING = frozenset({"demo", "mesh", "simulate", "calibrate", "estimate", "improve", "export", "reach"})
 """Commands that use compiled kernels."""
 DRAGGING = frozenset({"--drag", "--commands"})
-"""With these `stream` uses them too, when somebody drags for the first time."""
+"""Options with which `stream` uses them too, at the first drag."""
 COMPILING_TEXT = "compiling kernels, once after an installation: up to a minute"
 
 

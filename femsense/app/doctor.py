@@ -135,7 +135,7 @@ def _python() -> Finding:
 def _package(module: str, package: str) -> Finding:
     try:
         loaded = importlib.import_module(module)
-    except Exception as error:  # OSError and ImportError, and what a broken binary raises
+    except Exception as error:  # OSError, ImportError, and errors of a broken binary
         return bad(_short(error), import_hint(str(error), package))
     return good(_version(package) or str(getattr(loaded, "__version__", "version not known")))
 
@@ -176,7 +176,7 @@ def _solver() -> Finding:
     from femsense.fem.linalg.factorization import pardiso_library
 
     name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
-    return note(name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along")
+    return note(name, f"FEMSENSE_SOLVER={chosen} selects it: slower than the own solver")
 
 
 def _viewer() -> Finding:
@@ -203,7 +203,7 @@ def _numba_cache() -> Finding:
     places = [Path(chosen)] if chosen else [package / "__pycache__", package, Path.home() / ".cache"]
     if any(place.is_dir() and _writable(place) for place in places):
         return good("can be written")
-    return note("no folder can be written: each start compiles anew", "set NUMBA_CACHE_DIR to a folder of your own")
+    return note("no writable folder: kernels are compiled at each start", "set NUMBA_CACHE_DIR to a folder of your own")
 
 
 def _kernels() -> Finding:
@@ -267,7 +267,7 @@ PARTS: dict[str, Callable[[], Finding]] = {
     "system libraries": _libraries,
     "linear solver": _solver,
     "viewer page": _viewer,
-    "robots that come along": _robots,
+    "robots of the package": _robots,
     "cache of compiled kernels": _numba_cache,
     "compiled kernels": _kernels,
     "a tiny solve": _tiny_solve,

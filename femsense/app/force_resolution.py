@@ -11,10 +11,9 @@ from femsense.model.robot import Robot
 
 
 def force_resolution(robot: Robot, recording: Recording, calibration: Calibration) -> tuple[dict[str, Any], str]:
-    """Return what `recorded_forces` finds, as plain tables and as text; where it finds nothing, the reason in both.
+    """Return the result of `recorded_forces` as plain tables and as text; the reason, if there is none.
 
-    A result that was asked for does not fail because its resolution is not known.
-    """
+    An unknown resolution does not make a command fail."""
     from femsense.rig.recorded_forces import recorded_forces, resolution_document, resolution_text
 
     try:

@@ -44,14 +44,14 @@ def import_into(
     Arguments:
         folder: of the recording.
         paths: the captures, one a camera; NAME=PATH names it.
-        options: what a person says about it.
-        say: called with one line about what is happening.
-        driven: what a person says about the inputs.
-        again: repeat the import although the recording is there.
+        options: of the user.
+        say: called with a line on each step.
+        driven: options of the user on the inputs.
+        again: repeat the import even if the recording exists.
         progress: called with (frames done, frames in all).
 
     Raises:
-        InputError: whatever is wrong with the capture, or another thing at this place.
+        InputError: a problem of the capture, or other content of the folder.
     """
     options, driven = _spelt(options), driven or InputOptions()
     _check_options(options)
@@ -61,7 +61,7 @@ def import_into(
     identity = _identity(paths, options, driven)
     known = _standing(final, identity, again)
     if known is not None:
-        say(f"{final} holds this import already (--again makes it anew)")
+        say(f"{final} contains this import already (--again repeats it)")
         return known
     log = None if driven.actuation is None else read_actuation_log(driven.actuation, options)
     source = open_sources(paths, options if driven.actuation is None else _without_log(options, driven.actuation, paths))
@@ -87,7 +87,7 @@ def import_into(
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
-    """Return what was imported as plain text."""
+    """Return the summary of an import as plain text."""
     from femsense.app.inspection.text import section_text
 
     notes = document.get("notes", [])
@@ -118,8 +118,8 @@ def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
         late = [f"{first:g}:{last:g}" for first, last in options.free if first > found["duration_s"] or last < 0]
         return tuple(f"--free {span}: no frame lies there; the frames last {found['duration_s']:.4g} s" for span in late)
     return (
-        f"nothing says when nothing touches the robot: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
-        "frames.csv; calibrate and improve use these frames, and estimate learns from them how well camera and model agree",
+        f"no contact-free frames are declared: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
+        "frames.csv; calibrate and improve use these frames, and estimate measures noise and model error in them",
     )
 
 
@@ -154,9 +154,9 @@ def _check_options(options: Options) -> None:
 
 
 def _without_log(options: Options, log: Path, paths: Sequence[str | Path]) -> Options:
-    """Return the options without the mappings that are about columns of the log of actuation.
+    """Return the options without the mappings of columns of the actuation log.
 
-    Of a column that stands in a table of the capture too, only a mapping to an input is the log's alone.
+    For a column that is also in a table of the capture, only a mapping to an input belongs to the log.
     """
     of_log = mappable(header_of(log)[0])
     files = [path for _, path in map(split_name, paths)]
@@ -188,7 +188,7 @@ def _check_apart(paths: Sequence[str | Path], final: Path) -> None:
         inside = place.is_relative_to(final.resolve())
         if inside and (place.is_dir() or OWN_FILES.fullmatch(place.relative_to(final.resolve()).as_posix())):
             raise InputError(
-                "the recording would replace what it is made from", where=place, found=f"-o {final}", expected="a new place"
+                "the recording would replace its own source", where=place, found=f"-o {final}", expected="a new place"
             )
 
 
@@ -209,9 +209,7 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
         return None
     record = final / RECORD
     if not record.is_file():
-        raise InputError(
-            "something stands there already", where=final, found="no import of femsense", expected="a new place for the recording"
-        )
+        raise InputError("the folder exists and is not an import", where=final, expected="a new folder for the recording")
     kept = json.loads(record.read_text(encoding="utf-8"))
     if again:
         check_unchanged(final)
@@ -219,8 +217,8 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
     if kept.get("identity") == json.loads(json.dumps(identity)):
         return dict(kept["found"])
     raise InputError(
-        "another import stands there already",
+        "the folder holds an import of another source or with other options",
         where=final,
         found=str(kept.get("identity", {}).get("source", ["?"])[0]),
-        expected="a new place, or --again to replace it",
+        expected="a new folder, or --again to replace it",
     )

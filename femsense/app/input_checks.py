@@ -23,7 +23,7 @@ def warn_of_pictures(robot: Robot, recording: Recording) -> None:
     clouds = some_clouds(recording)
     if robot.color_rgb is not None and clouds and all(cloud.colors is None for _, _, cloud in clouds):
         where = recording.folder or "the recording"
-        text = "the robot declares a colour, but the clouds have none: the robot is told from what touches it by its shape alone"
+        text = "the robot declares a colour, but the clouds have none: robot and objects are separated by geometry only"
         warnings.warn(f"{where}: {text}, and contacts found by clouds are doubtful", stacklevel=3)
 
 

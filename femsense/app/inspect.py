@@ -68,11 +68,11 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
 
     Returns:
         plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cad, cloud, image, calibration, run, loop,
-        capture, table or unknown), what is in it with units in the names, and at the end `problems` and `warnings`,
+        capture, table or unknown), its contents with units in the keys, and at the end `problems` and `warnings`,
         lists of texts.
 
     Raises:
-        InputError: where there is nothing at this path, or a pipe; nothing else, whatever the content is.
+        InputError: nothing exists at this path, or a pipe. Any content is reported, not raised.
     """
     target = _existing(path)
     check_no_pipe([target])
@@ -111,7 +111,7 @@ def _resolution(robot: Robot, recording: Recording) -> Report:
     from femsense.calib.calibrate import calibrate
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # calibrate says them itself
+        warnings.simplefilter("ignore")  # calibrate prints them itself
         try:
             calibration = calibrate(robot, recording)
         except FemsenseError as error:
@@ -189,7 +189,7 @@ KINDS: dict[str, tuple[str, Inspector]] = {
     "table": ("a table", inspect_table),
     "unknown": ("not a kind of file that femsense knows", inspect_unknown),
 }
-"""Kind → its title, and the function that reports what such a file or folder holds. A report may refine its kind."""
+"""Kind → its title, and the function that reports the contents of such a file or folder. A report may refine its kind."""
 
 
 # What it is

@@ -120,16 +120,18 @@ def report_text(report: dict[str, Any]) -> str:
     lines += ["", "  the error grows by, when a channel is taken from another time:"]
     ranked = sorted(report["importance_mm"].items(), key=lambda item: -item[1])
     lines += [f"  {name:<12} {grown:6.2f} mm" for name, grown in ranked]
-    for key, words in (("dead", "never changes"), ("saturated", "stands at the end of its range"), ("unused", "not used")):
+    for key, words in (("dead", "never changes"), ("saturated", "is at the end of its range"), ("unused", "not used")):
         if report[key]:
             lines.append(f"  {words}: {', '.join(report[key])}")
     if report.get("bones_mm") is not None:
         lines.append(f"  bones straight from the readings: {report['bones_mm']:.2f} mm")
     lines += interval_text(report)
     if report["error_mm"] > POOR * report["motion_mm"]:
-        lines.append(f"  the markers themselves move by {report['motion_mm']:.2f} mm (rms): these sensors say little of them")
+        lines.append(
+            f"  the markers themselves move by {report['motion_mm']:.2f} mm (rms): these sensors contain little information on them"
+        )
     if report["test_outside"] > 0.02:
-        lines.append(f"  {100 * report['test_outside']:.0f} % of the held-out rows are outside what was learnt")
+        lines.append(f"  {100 * report['test_outside']:.0f} % of the held-out rows are outside the training domain")
     return "\n".join(lines)
 
 

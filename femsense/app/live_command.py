@@ -66,7 +66,7 @@ def sense_live(
     if folder is not None:
         check_session(folder)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of single frames; what matters is a notice
+        warnings.simplefilter("ignore")  # of single frames; important ones are notices
         body = load_robot(robot)
     actuation = (
         None if options.actuation is None else make_actuation(options.actuation, body, ActuationLimits(delay_s=options.delay_s))

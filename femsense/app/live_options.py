@@ -29,7 +29,7 @@ class LiveOptions:
         bool, Flag("--as-fast-as-possible", help="Of a recording: every frame, not at its own time.")
     ] = False
     delay_s: Annotated[float, Flag("--delay", "SECONDS", "From an input to its effect.", min=0.0)] = 0.0
-    inputs: Annotated[Inputs, Flag("--inputs", help="What the inputs of cables are; a recording says it itself.")] = (
+    inputs: Annotated[Inputs, Flag("--inputs", help="Quantity of the cable inputs; a recording declares its own.")] = (
         Inputs.tension
     )
     zero: Annotated[Zero, Flag("--zero", help="Whether inputs count from an unknown zero.")] = Zero.absolute

@@ -97,7 +97,7 @@ def _check_size(robot: Robot, wanted: Mapping[Any, FloatArray]) -> None:
 
 
 def _target(text: str) -> tuple[str | tuple[float, float, float], np.ndarray]:
-    """Return what NAME=X,Y,Z or X,Y,Z=X,Y,Z says."""
+    """Return the target of NAME=X,Y,Z or X,Y,Z=X,Y,Z."""
     name, equals, place = text.rpartition("=")
     if not equals or not name:
         raise InputError("not a target", where="--target", found=text, expected="MARKER=X,Y,Z in metres, robot frame")

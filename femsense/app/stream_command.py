@@ -105,7 +105,7 @@ class LiveStream:
 
 
 def quiet(_text: str) -> None:
-    """Say nothing."""
+    """Report nothing."""
 
 
 def stream_runs(
@@ -141,7 +141,8 @@ def stream_sensors(
     skin: UserSkin | None = None,
     say: Callable[[str], None] = quiet,
 ) -> LiveStream:
-    """Send the poses that a learnt model predicts from sensors while they are read; return at once. `say` is called where a file is waited for.
+    """Send the poses that a learnt model predicts from sensors while they are read; return at once. `say` is called while it waits for a
+    file.
 
     `skin`: the robot's own surface, in the frame of reference of the model; a tube without it.
 
@@ -168,7 +169,7 @@ def stream_sensors(
 def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
     """Let viewers drag the robot of a run that streams; the first that `live` plays.
 
-    Raises InputError where commands are allowed but `StreamOptions.commands` was not: brokers were not asked whom they let in.
+    Raises InputError if commands are allowed but `StreamOptions.commands` is not set: the access control of brokers was not checked then.
     """
     if options.gate.allowed and not live.commands:
         raise InputError("this stream sends no commands", where="options.gate", expected="StreamOptions(commands=True)")
@@ -236,7 +237,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
 def show_stream(
     url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None, authority: Path | None = None
 ) -> LiveStream:
-    """Serve the page on this machine with what streams at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
+    """Serve the page on this machine for the stream at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
     files = live_page_files(page)
     hub = Hub()
     bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)), authority=authority)

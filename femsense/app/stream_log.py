@@ -26,12 +26,12 @@ class Watched:
 
 
 def connection(where: str, why: Callable[[], str]) -> Watched:
-    """Return what watches a connection to elsewhere."""
+    """Return the observer of an outgoing connection."""
     return Watched(f"no connection to {where}", f"connected to {where}", "trying again", why)
 
 
 def readings_from(source: str, why: Callable[[], str], refused: Callable[[], str] = lambda: "") -> Watched:
-    """Return what watches a source of readings; `refused` says what was passed over."""
+    """Return the observer of a source of readings; `refused` describes ignored messages."""
 
     def beside() -> str:
         return f"some of {source} is passed over: {said}" if (said := refused()) else ""
@@ -49,7 +49,7 @@ class StreamLog:
         self._said: set[Watched] = set()
 
     def news(self) -> list[str]:
-        """Return what has changed since the last call."""
+        """Return the changes since the last call."""
         told = []
         for one in self._watched:
             trouble = one.trouble
@@ -64,7 +64,7 @@ class StreamLog:
 
 @dataclass(frozen=True, slots=True)
 class Streamed:
-    """What was streamed, and who got it."""
+    """Summary of a stream: poses and viewers."""
 
     poses: dict[str, int]
     """Of each robot."""

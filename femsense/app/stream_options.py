@@ -1,4 +1,4 @@
-"""Options of `femsense stream`, and which of them and of `femsense view` go together: what would do nothing is refused."""
+"""Options of `femsense stream`, and the valid combinations with those of `femsense view`: options without effect are refused."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ def need_with(option: str, given: bool, other: str, there: bool) -> None:
 
 
 def is_encrypted(address: str | None) -> bool:
-    """Return whether an address says that what travels is encrypted."""
+    """Return whether an address denotes an encrypted connection."""
     return (address or "").partition("://")[0] in ("https", "wss", "mqtts")

@@ -1,7 +1,7 @@
 """Whether measured markers can be those of the robot: unit, handedness, swapped labels, outliers.
 
-All is judged against the fitted model, by what another reading of the same numbers would leave: a scale,
-a mirror or a swap counts where it takes most of the residual away.
+Each alternative reading of the same numbers (a scale, a mirror image, a swap) is fitted to the model. It is reported if it removes most
+of the residual.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from femsense.model.recording import Recording, with_marker_table
 from femsense.model.robot import Robot
 
 SUSPICIOUS = 0.02
-"""A residual below this share of the markers' spread needs no other reading. No measurement set it:
-recordings of the rig leave less, and a real tendon robot whose model lacks something leaves 0.03 to 0.26, where other readings
-are tried and do not explain it better."""
+"""A residual below this share of the markers' spread needs no alternative reading. The value was chosen, not calibrated: recordings of
+the rig have smaller residuals, and a real tendon robot with an incomplete model 0.03 to 0.26; there alternatives are tried and do not fit
+better."""
 EXPLAINED = 4.0
 """Another reading counts where the residual falls by this factor."""
 HOPELESS = 0.5
@@ -71,7 +71,7 @@ def similarity(a: FloatArray, b: FloatArray, *, mirrored: bool = False) -> tuple
 
 
 def rigid_rms(a: FloatArray, b: FloatArray, *, mirrored: bool = False, scale: float = 1.0) -> float:
-    """Return the rms [m] that the best turn and shift of b / scale leaves."""
+    """Return the rms residual [m] of the best rotation and translation of b / scale onto a."""
     p, q = a - a.mean(axis=0), (b - b.mean(axis=0)) / scale * ([-1.0, 1.0, 1.0] if mirrored else [1.0, 1.0, 1.0])
     U, _, Vt = np.linalg.svd(p.T @ q)
     R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
@@ -92,7 +92,7 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str
         robot: for the names of its markers.
         pairs: the markers of each camera.
         cameras: their names.
-        strict: also refuse what does not fit for a reason that is not found.
+        strict: also refuse markers that do not fit for an unknown reason.
 
     Raises:
         DataError: says what was found and what it looks like.
@@ -107,8 +107,8 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, cameras: Sequence[str
         if plain < SUSPICIOUS * one.spread:
             continue
         found = (
-            f"the markers{which} do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
-            f"mm is left"
+            f"the markers{which} do not fit the robot: the residual is {100 * plain / one.spread:.0f} % of their spread of "
+            f"{1e3 * one.spread:.3g} mm"
         )
         most_fit = float(np.median(np.linalg.norm(one.measured - one.modelled, axis=1))) < SUSPICIOUS * one.spread
         scale, _ = similarity(one.modelled, one.measured)
@@ -246,20 +246,20 @@ def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, n
 def relabelled(
     robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float, *, strict: bool = True
 ) -> tuple[Recording, bool]:
-    """Return the recording with swapped labels put right and outliers left out in the scene's frames, each named in a warning.
+    """Return the recording with swapped labels corrected and outliers removed in the scene's frames, each listed in a warning.
 
     Arguments:
         robot: the robot.
         scene: the markers that were fitted.
         pairs: their places, one item a camera, rows in the order of the scene's.
-        noise: what the fit leaves along an axis [m].
+        noise: rms residual of the fit along one axis [m].
         strict: refuse labels that are swapped in most frames, but not in all.
 
     Returns:
         the recording, and whether anything changed.
 
     Raises:
-        DataError: labels that seem swapped in most frames: which of them are right cannot be told.
+        DataError: labels that seem swapped in most frames: the correct ones cannot be identified.
     """
     marker, far = scene.marker.copy(), np.zeros(len(scene.marker), dtype=np.bool_)
     for view, one in enumerate(pairs):
@@ -292,11 +292,11 @@ def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
 
 
 def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None:
-    """Warn of what was put right and left out, frame by frame."""
+    """Warn of corrected labels and removed outliers, frame by frame."""
     texts = []
     for k in np.unique(scene.frame[renamed | far]):
         parts = []
-        for rows, what in ((renamed, "labels are swapped, put right"), (far, "outliers, left out")):
+        for rows, what in ((renamed, "labels were swapped, and are corrected"), (far, "outliers, left out")):
             names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
             parts += [f"{names} ({what})"] if names else []
         texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")
@@ -305,17 +305,17 @@ def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None
 
 
 def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:
-    """Return where the model has every marker in a frame; one that nobody sees is far away."""
+    """Return the model positions of all markers in a frame; those that no camera sees are placed far away."""
     places = np.full((len(robot.marker_names), 3), 1e3)
     places[pairs.marker[mine]] = pairs.modelled[mine]
     return places
 
 
 def _outliers(off: FloatArray, spread: float) -> BoolArray:
-    """Return which markers of one frame [m], shape (k,), are far from where the model has them while most others are near.
+    """Return which markers of one frame, shape (k,), have a large residual [m] while most others have a small one.
 
-    Sorted by distance, outliers stand behind a jump by the factor EXPLAINED in the upper two fifths:
-    errors of a model grow along the body without one.
+    In the sorted residuals, outliers follow a jump by the factor EXPLAINED within the upper two fifths. Model errors grow along the body
+    without such a jump.
     """
     order = np.argsort(off)
     first = max(int(np.ceil(0.6 * len(off))), 3)

@@ -1,10 +1,11 @@
-"""The pose of a camera from clouds alone, from nowhere: the body's visible side is laid everywhere into what the camera saw.
+"""The pose of a camera from clouds alone, without an initial guess: a global search that aligns the visible side of the body with the
+cloud.
 
-Poses on a grid of rotations and places are judged by a map of distances to the measured points (Fitzgibbon,
-"Robust registration of 2D and 3D point sets", 2003); the best are refined by closest points (Besl and McKay 1992), from the
-visible side to what was measured: a silhouette holds the body in its plane. In the end each part of the visible side was measured
-or not, and each ray that meets the body ends there, or behind it, which speaks against the pose; what something else stands before
-speaks neither for it nor against it. Planes that are larger than the body are taken out before: a flat side fits everywhere into a table.
+Poses on a grid of rotations and translations are scored with a distance map of the measured points (Fitzgibbon, "Robust registration of
+2D and 3D point sets", 2003). The best are refined by closest-point registration (Besl and McKay 1992) from the visible side to the
+measured points; the silhouette determines the translation in the image plane. The final score counts the parts of the visible side that
+were measured, and counts rays that pass through the body against the pose. Occluded parts count half. Planes larger than the body are
+removed first, because a flat side fits anywhere into a table.
 """
 
 from __future__ import annotations
@@ -44,28 +45,28 @@ RAYS = 10000
 MOST_CELLS = 4e6
 """Cells of the map of distances: 16 MB; a wider scene gets larger ones."""
 UNKNOWN = 0.5
-"""What a part of the visible side counts that something hides: between measured, 0, and not measured, 1."""
+"""Cost of an occluded part of the visible side, between measured, 0, and not measured, 1."""
 LEAST = 0.25
 """A pose needs this gain: right ones of benchmarks/calibration.py have 0.5 and more,
 wrong ones 0 and less where the robot is in sight."""
 CAP = 0.1
-"""Distances beyond this share of the body's diagonal count alike."""
+"""Distances are truncated at this fraction of the body's diagonal."""
 PLANE_SHARE = 0.3
 """A plane has this share of the points at least."""
 ALIKE = 1.2
-"""Another pose fits as well where what it leaves is below this times what the best leaves: a body with a symmetry leaves 1.0."""
+"""Another pose fits equally well if its error is below this multiple of the best one's; a symmetric body has 1.0."""
 TURNED, SHIFTED = 0.3, 0.1
 """Poses are different where they are turned by this [rad], or shift the body by this share of its diagonal."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """What one camera saw in one free frame, and how the body then stands."""
+    """The cloud of one camera in one contact-free frame, and the state of the body in it."""
 
     points: FloatArray
     """[m], camera frame, shape (k, 3)."""
     mine: BoolArray
-    """Points that may be of the robot by their colour; all where colour does not tell, shape (k,)."""
+    """Points that may belong to the robot by their colour, shape (k,); all without colour."""
     surface: Surface
     """Of the body in that frame, robot frame."""
     colored: bool = False
@@ -79,21 +80,21 @@ class CloudPose:
     T_robot_camera: FloatArray
     """shape (4, 4)."""
     error_m: float
-    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal; rays through the body
-    count as that far, and what something hides as `UNKNOWN` of its square [m]."""
+    """Root mean square distance of the visible side from measured points [m], truncated at REACH of the diagonal. Rays through the body
+    count as that distance, occluded parts as `UNKNOWN` of its square."""
     gain: float
-    """Share of the visible side that was measured less the share that was not, and less rays that go through; what is hidden counts as
-    neither [1]; 1 is perfect, below 0 is no fit."""
+    """Measured fraction of the visible side, minus the unmeasured fraction and the rays that pass through it; occluded parts count as
+    neither [1]. 1 is perfect, below 0 is no fit."""
 
 
 def find_cloud_pose(views: Sequence[View]) -> CloudPose:
-    """Return the pose of a camera that saw a body in some free frames.
+    """Return the pose of a camera from the clouds of some contact-free frames.
 
     Arguments:
-        views: one a frame; the first is searched, all judge.
+        views: one per frame; the search uses the first, the score all of them.
 
     Raises:
-        DataError: nothing fits, or two poses fit alike (a body with a symmetry).
+        DataError: no pose fits, or two poses fit equally well (a symmetric body).
     """
     poses = search_cloud_poses(views)
     size = size_of(views[0].surface)
@@ -108,9 +109,8 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
         apart = turn > TURNED or shift > SHIFTED * size
         if apart and other.error_m < ALIKE * best.error_m:
             raise DataError(
-                f"two poses fit the clouds alike: {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm are left, "
-                f"turned by {np.degrees(turn):.0f}° and "
-                f"{1e3 * shift:.0f} mm apart. Has the robot a symmetry? Record markers, pull cables in free frames, or "
+                f"two poses fit the clouds equally well: the residuals are {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm, "
+                f"and they differ by {np.degrees(turn):.0f}° and {1e3 * shift:.0f} mm. Is the robot symmetric? Record markers, pull cables in free frames, or "
                 f"write T_robot_camera in recording.toml"
             )
     return best
@@ -169,7 +169,7 @@ def _scene(view: View, size: float) -> FloatArray:
         width = np.linalg.norm(np.ptp(points[on], axis=0)) if on.any() else 0.0
         if on.mean() < PLANE_SHARE or width < 1.5 * size:
             break
-        points = points[np.abs(plane.distance(points)) >= REACH * size]  # noise of what is far away goes with it
+        points = points[np.abs(plane.distance(points)) >= REACH * size]  # the noise of distant points is removed with it
     return points
 
 
@@ -325,8 +325,7 @@ def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) ->
 
 
 def _judged(views: Sequence[_Fine], trees: Sequence[Any], T: FloatArray, size: float) -> CloudPose:
-    """Return how a pose fits: each visible sample has a measured point beside it or not,
-    each ray ends on the body or behind it."""
+    """Return error and gain of a pose: each visible sample is near a measured point or not, each ray ends on the body or behind it."""
     limit, squares = REACH * size, []
     for view, tree in zip(views, trees):
         placed, looking = view.samples.looking(invert_pose(T), 0.1)

@@ -1,4 +1,4 @@
-"""Whether a pose that is declared can be that of the camera: a pose that is fitted to the same data tells how far it is off."""
+"""Check of declared camera poses against poses fitted to the same data."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from femsense.model.recording import Recording
 TRIED = 1.5
 """A pose is fitted where it could take a third of the residual away, inputs as they are; and spoken of where it does."""
 DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
-"""What a declared pose may be off beside clouds: turn [rad] and shift [m] along each axis (docs/appendix/forces-before-0.2.md has the trial)."""
+"""Prior standard deviation of a declared pose when clouds are fitted: rotation [rad] and translation [m] along each axis
+(trial: docs/appendix/forces-before-0.2.md)."""
 Fitted = tuple[float, Sequence[FloatArray]]
-"""What is left [m], and the poses."""
+"""Residual [m], and the poses."""
 
 
 def check_declared_poses(
     recording: Recording, poses: Sequence[FloatArray], pairs: Sequence[Pairs], refit: Callable[[Recording], Fitted]
 ) -> None:
-    """Refuse a declared pose where one that is fitted leaves a quarter of the residual. What the model lacks does not: with a modulus
-    of half to three times the true one, the arm of the tests leaves half, as it sags by the same in all frames. Where the fitted one
-    leaves a third less, a warning names both, pose and model.
+    """Refuse a declared pose if a fitted one reduces the residual to a quarter. Model error does not reduce it that far: with half to
+    three times the true modulus, a fitted pose of the arm of the tests halves it, since the sag is the same in all frames. If the
+    residual falls by a third, a warning lists pose and model as possible causes.
 
     Arguments:
-        recording: as it is calibrated.
+        recording: to be calibrated.
         poses: of the cameras, declared ones among them.
         pairs: the markers of each camera.
         refit: fits the same markers with other poses declared.
 
     Raises:
-        DataError: says how far it is off.
+        DataError: states the difference of the two poses.
     """
     usable = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and _tells(pairs[v])]
     found = [one for v in usable if (one := _fitted(recording, (v,), pairs, refit)) is not None]
@@ -56,7 +57,7 @@ def check_declared_poses(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Fitted:
-    """What is left with some declared poses fitted: one camera's, or all, as where the robot's base is elsewhere."""
+    """A fit with some declared poses free: that of one camera, or all of them, for a displaced base of the robot."""
 
     views: tuple[int, ...]
     before: float
@@ -73,9 +74,9 @@ def _tells(one: Pairs) -> bool:
 def _fitted(
     recording: Recording, views: tuple[int, ...], pairs: Sequence[Pairs], refit: Callable[[Recording], Fitted]
 ) -> _Fitted | None:
-    """Return what is left with some poses fitted; None where nothing suggests it, or nothing fits.
+    """Return the fit with some poses free; None if nothing suggests it, or it does not converge.
 
-    With inputs as they are a rigid motion tells whether it may be worth it; inputs that are fitted have taken up a part of it.
+    With known inputs, a rigid motion of the markers shows whether the fit is worthwhile; fitted inputs absorb a part of that motion.
     """
     mine = [pairs[v] for v in views]
     counts = np.array([len(one.marker) for one in mine])
@@ -93,7 +94,7 @@ def _fitted(
 
 
 def _rms(counts: IntArray, each: Sequence[float]) -> float:
-    """Return the root mean square over all rows of what it is in groups of so many."""
+    """Return the root mean square over all rows from the values of groups of given sizes."""
     return float(np.sqrt(counts @ np.square(each) / counts.sum()))
 
 
@@ -106,14 +107,14 @@ def said(
     before: float,
     left: float,
 ) -> str:
-    """Return in words how far declared poses are from fitted ones.
+    """Return a sentence with the difference between declared and fitted poses.
 
     Arguments:
-        recording: names the cameras.
+        recording: with the names of the cameras.
         views: of the cameras.
         declared, fitted: T_robot_camera of all cameras, shape (4, 4) each.
-        middles: where the shifts are told, one a view [m], shape (3,).
-        before, left: residual with the ones and the others [m].
+        middles: point at which the translation is stated, one per view [m], shape (3,).
+        before, left: residual with the declared and with the fitted poses [m].
     """
     names = [recording.camera_names[v] or "(only one)" for v in views]
     one = len(views) == 1

@@ -59,7 +59,7 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     target = Path(path)
     if target.is_dir():
         raise InputError(
-            "a folder stands where the file should be written", where=target, hint=f"-o {target / 'calibration.json'}"
+            "a folder exists where the file should be written", where=target, hint=f"-o {target / 'calibration.json'}"
         )
     check_target(target, folder=False, kind=CALIBRATION)
     write_json(target, calibration_document(calibration))

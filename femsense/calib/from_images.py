@@ -42,18 +42,18 @@ class Spots:
 
 
 def has_image_markers(robot: Robot, recording: Recording) -> bool:
-    """Return whether markers can be read from images: none stand in files, the robot says how they look,
-    and there are colour images."""
+    """Return whether markers can be detected in images: markers.csv has none, robot.toml declares their appearance, and there are colour
+    images."""
     images = any(file is not None for files in recording.color_files for file in files)
     return bool(robot.marker_looks) and images and not recording.has_markers and not len(recording.unnamed_frame)
 
 
 def with_image_markers(robot: Robot, recording: Recording, frames: IntArray) -> tuple[Recording, BoolArray]:
-    """Return the recording with what the images of some frames show as markers without names, and which marker each may be,
-    shape (U, markers).
+    """Return the recording with the markers detected in the images of some frames, without names, and which marker each may be, shape (U,
+    markers).
 
     Raises:
-        InputError: images that are broken or do not fit the camera table.
+        InputError: images that are broken or disagree with the camera table.
     """
     frame, view, xyz, allowed = [], [], [np.zeros((0, 3))], [np.zeros((0, len(robot.marker_names)), dtype=bool)]
     for k in frames.tolist():
@@ -83,7 +83,7 @@ def find_spots(robot: Robot, color: FloatArray, depth: FloatArray, camera: Camer
     """Return the tags and dots of an image.
 
     Arguments:
-        robot: says how its markers look.
+        robot: with the appearance of its markers.
         color: red, green, blue in 0 … 1, shape (H, W, 3).
         depth: along the optical axis [m], registered to the colour, 0 where there is none, shape (H, W).
         camera: the lens.

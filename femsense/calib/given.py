@@ -42,7 +42,7 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
     if len(frames) < FEWEST or len(calibration.poses) != len(recording.camera_names):
         return
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the estimate says the same
+        warnings.simplefilter("ignore")  # reported by the estimate
         fitting = check_against(robot, recording)
     if calibration.is_corrected:
         fitting = corrected(fitting, robot.require_correction(), calibration.poses)

@@ -18,9 +18,9 @@ from femsense.core.errors import DataError
 from femsense.model.recording import Recording
 
 REFUSED = 3.0
-"""Motions so many times too large or small are no modulus that is off: silicones of one name differ by a factor of two."""
+"""Ratio of measured and modelled motion that no wrong modulus explains: silicones of one name differ by a factor of two."""
 WARNED = 1.5
-"""Motions so many times too large or small are worth a word."""
+"""Ratio of measured and modelled motion above which a warning is raised."""
 UNITS = {
     "tension": {9.807: "kilogram-force", 4.448: "pounds", 1e-3: "millinewton", 0.00981: "gram-force"},
     "displacement": {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"},
@@ -33,7 +33,7 @@ UNITS = {
         1e6: "megapascal",
     },
 }
-"""One of this unit is so many of what the files hold."""
+"""Number of SI units in another unit → its name."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,8 +51,7 @@ class Motions:
 
 
 def motions_of(pairs: Pairs) -> Motions | None:
-    """Return the motions of those markers that one camera saw in all frames; None where there is no such marker,
-    or one frame alone."""
+    """Return the motions of the markers that one camera saw in all frames; None without such markers, or with a single frame."""
     frames = np.unique(pairs.group)
     counts = np.bincount(pairs.marker)
     always = np.flatnonzero(counts == len(frames))
@@ -65,10 +64,10 @@ def motions_of(pairs: Pairs) -> Motions | None:
 
 
 def check_inputs(recording: Recording, pairs: Sequence[Pairs]) -> None:
-    """Refuse inputs in another unit; warn where motions hint at another modulus.
+    """Refuse inputs in another unit; warn if the motions suggest another modulus.
 
     Arguments:
-        recording: as it is calibrated.
+        recording: to be calibrated.
         pairs: the markers of each camera.
 
     Raises:

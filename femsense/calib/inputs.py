@@ -24,7 +24,7 @@ class InputTables:
     displacement: dict[str, float]
     """[m]."""
     tension_std: dict[str, float | None]
-    """[N]; None where the data say nothing."""
+    """[N]; None if the data do not determine it."""
     displacement_std: dict[str, float | None]
     """[m]."""
 
@@ -45,15 +45,15 @@ def input_tables(robot: Robot, recording: Recording, initial: FloatArray | None,
 
 
 def initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
-    """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
+    """Return the equilibrium under the initial inputs if these are unknown, else under those of the first frame."""
     if initial is not None:
         recording = replace(recording, inputs=np.zeros_like(recording.inputs), pressures=np.zeros_like(recording.pressures))
     return solve_frame(DrivenRobot(robot, drive_of(robot, recording, initial=initial)), 0)
 
 
 def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
-    """Return initial inputs to start from [N] or [m], shape (a,): the smallest that leave no cable pushing;
-    None where they are known."""
+    """Return the initial guess of the initial inputs [N] or [m], shape (a,): the smallest without negative tensions; None if they are
+    known."""
     if recording.actuation_zero == "absolute":
         return None
     lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
@@ -73,10 +73,9 @@ def largest_input(robot: Robot, actuation: str) -> float:
 
 
 def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of the initial inputs, so that no frame leaves the limits of its cable: initial + recorded stays within them.
+    """Return bounds of the initial inputs such that initial + recorded input stays within the limits of each cable in every frame.
 
-    A cable whose recorded tensions alone span more than its limits (`check_against` warns of it) keeps max_tension_n as its
-    bound.
+    If the recorded tensions of a cable span more than its limits (`check_against` warns of it), its bound is max_tension_n.
     """
     cables = robot.body.cables
     if recording.actuation == "displacement":

@@ -37,9 +37,9 @@ def fit_joint(
     free_inputs: bool = True,
     solver: PathSolver | None = None,
 ) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    """Finish over poses and initial inputs together; noise and outliers are weighed anew from the residual until they stay.
+    """Fit poses and initial inputs together; the weights of noise and outliers are re-estimated from the residual until they converge.
 
-    Poses that the recording declares stay as they are. States are solved with the `solver`.
+    Declared poses stay fixed. States are solved with the `solver`.
     """
     problem = _Problem(robot, scene, poses, initial, free_inputs=free_inputs, solver=solver)
     low, high = problem.bounds()
@@ -55,19 +55,20 @@ def fit_joint(
         problem.weigh(jet, huber, len(theta))
     moved, inputs = problem.place(theta)
     fit = replace(fit, covariance=problem.beside_declared(jet, fit.covariance))
-    return fit, moved, inputs, jet  # an input at its bound is no better known than others: what they have in common moves all
+    # an input at its bound is no better determined than others: their common error moves all of them
+    return fit, moved, inputs, jet
 
 
 def moved_by_law(
     robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet
 ) -> FloatArray:
-    """Return by how much the neo-Hookean law moves a fit, shape (p,); 0 where the robot declares its law.
+    """Return the change of the fit under the neo-Hookean law, shape (p,); 0 if the robot declares its constitutive law.
 
-    One step from where the fit ended, −C Jᵀ Δr: Δr is how the whitened residual changes with the law, C = (JᵀJ)⁻¹.
+    One Gauss–Newton step from the solution, −C Jᵀ Δr, with the change Δr of the whitened residual and C = (JᵀJ)⁻¹.
 
     Arguments:
-        robot, scene: as they were fitted.
-        fit, poses, initial, jet: where `fit_joint` ended.
+        robot, scene: of the fit.
+        fit, poses, initial, jet: results of `fit_joint`.
     """
     other, nothing = with_other_law(robot), np.zeros(len(fit.theta))
     if other is None or not np.isfinite(fit.covariance).all():
@@ -165,8 +166,8 @@ class _Problem:
         )
 
     def beside_declared(self, jet: SceneJet, covariance: FloatArray) -> FloatArray:
-        """Return the covariance of what is free where declared poses may be off by `DECLARED_STD`, as far as the markers do not tell them
-        (the block of the inverse of all normal equations)."""
+        """Return the covariance of the free parameters with the prior σ = `DECLARED_STD` on declared poses: the block of the inverse of
+        all normal equations."""
         if not self.declared or not self.free_inputs or not np.isfinite(covariance).all():
             return covariance
         row = (self.weights / self.std)[:, None, None]

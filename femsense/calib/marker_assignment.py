@@ -1,9 +1,7 @@
-"""Names for markers that nobody named, by the model: they may stand in another order in each frame,
-with outliers among them and others missing.
+"""Assignment of unnamed markers to the model's: their order may differ between frames, some may be outliers, others missing.
 
-`search_poses` finds poses from nowhere for the model's states;
-the joint fit (pose and unknown inputs) of each likely one moves the states, the names follow by assignment,
-and so in turns until no name changes. A layout that fits under two poses alike is said to do so: nothing is picked.
+`search_poses` finds candidate poses for the model's states without an initial guess. For each likely one, the joint fit (pose and unknown
+inputs) and the assignment alternate until no name changes. If two poses fit equally well, the markers are refused as ambiguous.
 """
 
 from __future__ import annotations
@@ -30,9 +28,8 @@ from femsense.model.recording import Recording, state_key, with_marker_table
 from femsense.model.robot import Robot
 
 AS_GOOD = 1.2
-"""Another pose is as good where what it leaves is below this times what the best leaves, however many points there are:
-errors of a model are common to points. Wrong poses of data/tentacle leave 1.2 times as much and more,
-those of layouts with a symmetry 1.0."""
+"""Another pose fits equally well if its error is below this multiple of the best one's, for any number of points: model errors are common
+to all points. Wrong poses of data/tentacle have a ratio of at least 1.2, symmetric layouts 1.0."""
 ELSEWHERE = 0.1
 """Poses are different where they place the markers this share of their spread apart."""
 ROUNDS = 4
@@ -65,7 +62,7 @@ class Named:
     marker: IntArray
     """Which marker each unnamed row of the recording is, shape (U,): −1 none of the robot's, or not distinguishable."""
     error_m: float
-    """By how much the points are off after the fit, see `typical_error` [m]."""
+    """Error of the points after the fit, see `typical_error` [m]."""
     poses: tuple[FloatArray, ...]
     doubtful: tuple[tuple[int, int, int], ...] = ()
     """(frame, marker, marker) that cannot be distinguished there."""
@@ -80,7 +77,7 @@ def name_markers(
     poses: Sequence[FloatArray | None] | None = None,
     initial: FloatArray | None = None,
 ) -> Recording:
-    """Return the recording with names for its unnamed markers in some frames; what gets none is named in a warning and left out.
+    """Return the recording with names for its unnamed markers in some frames; markers without an assignment are removed with a warning.
 
     Arguments:
         robot, recording: as loaded.
@@ -165,7 +162,7 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
 
 
 def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray]) -> Named:
-    """Return the reading under given poses and states: names by assignment,
+    """Return the names under given poses and states, by assignment,
     without outliers and without pairs that cannot be distinguished."""
     marker = np.full(len(recording.unnamed_frame), -1, dtype=np.int64)
     left: list[FloatArray] = []
@@ -185,7 +182,7 @@ def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named
 
 
 def _without_doubt(robot: Robot, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray], noise: float) -> Named:
-    """Return the reading without names that could as well be swapped, or be those of a point beside that got none."""
+    """Return the assignment without ambiguous names: those that could be exchanged, or belong to a nearby point without a name."""
     marker, doubtful = named.marker.copy(), []
     for one in seen:
         for k, rows, points, may in zip(one.frames.tolist(), one.rows, one.points, one.allowed):
@@ -240,7 +237,7 @@ def _check_handed(
     left = _fitted(robot, turned, others, first).error_m
     if left * EXPLAINED < named.error_m:
         raise DataError(
-            f"the markers without names do not fit the robot: {1e3 * named.error_m:.3g} mm are left of their spread of "
+            f"the markers without names do not fit the robot: the residual is {1e3 * named.error_m:.3g} mm for a spread of "
             f"{1e3 * spread:.3g} mm, mirrored {1e3 * left:.3g} mm. {LEFT_HANDED}"
         )
 
@@ -248,10 +245,10 @@ def _check_handed(
 def _require_one(
     robot: Robot, recording: Recording, seen: Sequence[Nameless], readings: Sequence[Sequence[PosedNames]], best: Named
 ) -> None:
-    """Refuse markers of a camera that fit under another pose about as well.
+    """Refuse markers of a camera that fit about equally well under another pose.
 
     Raises:
-        DataError: says how far the poses are apart and what each leaves.
+        DataError: states the difference of the two poses and the residual of each.
     """
     spread = _spread(robot)
     for i, one in enumerate(seen):
@@ -270,15 +267,15 @@ def _require_one(
             ):
                 name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} "
-                    f"and {1e3 * other_fit.error_m:.3g} mm are left, "
-                    f"and they place the markers {1e3 * away:.3g} mm apart. Name the markers, place one more where it "
-                    f"breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
+                    f"the markers of camera {name} have no names, and two poses fit them equally well: the residuals are "
+                    f"{1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm, and they place the markers "
+                    f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, "
+                    f"pull cables in free frames, or declare T_robot_camera"
                 )
 
 
 def _margin(seen: Nameless) -> float:
-    """Return how many times as much a wrong pose leaves at least [1]: few points are soon explained by chance."""
+    """Return the least ratio of the errors of a wrong pose and the best one [1]; it is larger for few points, which fit by chance."""
     freedom = 3.0 * sum(len(points) for points in seen.points) / seen.repeats - 6.0
     return max(AS_GOOD, float(np.exp(SURE / max(freedom, 1.0))))
 

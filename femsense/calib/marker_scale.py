@@ -1,8 +1,8 @@
-"""Whether the markers of a camera are all a little too large or too small: a scale, fitted beside poses and initial inputs.
+"""Scale error of the markers of a camera, fitted together with poses and initial inputs.
 
-A motion capture that was calibrated with a wand of another length, or a camera whose depth is off by a share, enlarges all that it sees.
-Poses and inputs take up a part of that, and the rest looks like an error of the model. To first order about the fit of the files as
-they stand, beside the modulus, which inputs that are fitted turn into a scale; a scale counts by what a fit then leaves.
+A motion capture calibrated with a wand of another length, or a camera with a relative depth error, scales all its measurements. Poses and
+inputs absorb a part of that, and the rest looks like model error. The scale is fitted to first order about the calibration, together with
+the modulus, with which fitted inputs are collinear; the residual of a refit then decides.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
 KNOWN = 3.0
-"""A scale is off where it is farther than so many standard deviations from 1."""
+"""A scale is wrong if it differs from 1 by more than this number of standard deviations."""
 STIFFER = 0.02
-"""Step for the derivative by the modulus, as a share of it."""
+"""Relative step of the derivative with respect to the modulus."""
 MARKERS, FRAMES = 4, 2
-"""Fewer markers or frames tell nothing."""
+"""Least number of markers and of frames."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MarkerScale:
-    """How many times too large the markers of a camera are."""
+    """The scale of the markers of a camera, measured over true."""
 
     scale: float
     """[1]."""
     std: float
-    """The errors of a frame counted as one [1]."""
+    """Clustered by frame [1]."""
     share: float
-    """What is left with it, as a share of what poses, initial inputs and what is beside them leave [1]."""
+    """Residual with the scale, as a fraction of that with poses, initial inputs and further parameters alone [1]."""
 
 
 def check_marker_scale(
@@ -83,13 +83,13 @@ def _tells(found: MarkerScale | None) -> bool:
 def marker_scale(
     scene: Scene, poses: Sequence[FloatArray], jet: SceneJet, views: Sequence[int], beside: FloatArray | None = None
 ) -> MarkerScale | None:
-    """Return how many times too large the markers of some cameras are; None where they are too few to tell. Declared poses may be off, too:
-    a scale about the camera shifts the body as they would.
+    """Return the scale of the markers of some cameras; None if there are too few. Declared poses are free too, because a scale about the
+    camera shifts the body like a wrong pose.
 
     Arguments:
         scene, poses, jet: as of `check_marker_scale`.
-        views: the cameras; all, where one motion capture speaks for several.
-        beside: what else may be off, as the change of the residual with it, shape (k, 3).
+        views: the cameras; all of them for a single motion capture.
+        beside: further parameters, as the derivative of the residual, shape (k, 3).
     """
     mine = np.isin(scene.view, views)
     if len(np.unique(scene.marker[mine])) < MARKERS or len(np.unique(scene.frame[mine])) < FRAMES:

@@ -1,9 +1,8 @@
-"""Whether the same files fit far better if read otherwise: inputs with another sign, order or delay, gravity another way.
-Or is the body softer or stiffer?
+"""Alternative readings of the files: inputs with another sign, order or delay, another direction of gravity, another modulus.
 
-Each reading is first weighed with the poses free and all else held: inputs by the linear response of the markers, gravity, which
-may bend a body far, by the states of a few frames. The best is then fitted like the files themselves, and counts by what it
-leaves. Another zero of the inputs and another modulus have parameters of their own, and are only mentioned.
+Each reading is screened with free poses and all else fixed: inputs by the linear response of the markers, gravity, whose effect can be
+large, by the equilibria of a few frames. The best one is then fitted like the files themselves and judged by its residual. Another zero
+of the inputs and another modulus have parameters of their own; they are only mentioned.
 """
 
 from __future__ import annotations
@@ -39,24 +38,25 @@ FEW = 3
 """Frames by which directions of gravity are weighed."""
 
 MODULI = (0.4, 0.63, 1.6, 2.5)
-"""Other moduli, as shares of the declared one. An arm declared 1.67 times as stiff was refused for gravity that points elsewhere."""
+"""Other moduli, as shares of the declared one. Without them, an arm declared 1.67 times too stiff was refused because of another
+direction of gravity."""
 
 Refit = Callable[[Robot, Recording, IntArray], FloatArray]
-"""Returns what a fit of a robot to frames of a recording leaves [m], shape (k, 3)."""
+"""Returns the residual of a fit of a robot to frames of a recording [m], shape (k, 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Reading:
-    """Another way to read the same files."""
+    """An alternative reading of the same files."""
 
     text: str
-    """What is wrong with the files if this reading is right."""
+    """The error in the files if this reading is right."""
     robot: Robot
     recording: Recording
     frames: IntArray
-    """The frames that it speaks of, shape (f,)."""
+    """The frames that it applies to, shape (f,)."""
     fitted: bool = False
-    """Whether it has parameters that were fitted: what the model lacks may pass for them, so that files are never refused for it."""
+    """Whether it has fitted parameters. These can absorb model error, so files are never refused because of it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,27 +73,27 @@ class Response:
     """[m per unit of each driver], shape (d, markers, 3)."""
 
     def by(self, change: FloatArray, scene: Scene) -> FloatArray:
-        """Return by how much the scene's markers move [m], shape (k, 3), where drivers change, shape (F, d)."""
+        """Return the displacement of the scene's markers [m], shape (k, 3), for changed drivers, shape (F, d)."""
         return np.asarray(np.einsum("kd,dki->ki", change[scene.frame], self.slope[:, scene.marker]))
 
 
 def check_other_readings(
     robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None, residual: FloatArray, refit: Refit
 ) -> float:
-    """Refuse files that fit far better if read otherwise; warn where they fit better.
+    """Refuse files that fit far better under an alternative reading; warn of those that fit better.
 
-    Return what is left so [m]; infinite where nothing was said.
+    Return the rms residual of the reported reading [m]; infinite without one.
 
     Arguments:
         robot: the robot.
         scene: the markers that were fitted.
         pairs: their places, one item a camera, rows in the order of the scene's.
         initial: fitted initial inputs [N] or [m], shape (a,); None where they are known.
-        residual: what the fit leaves [m], shape (k, 3).
+        residual: of the fit [m], shape (k, 3).
         refit: fits another reading.
 
     Raises:
-        DataError: says what is wrong with the files if the better reading is right.
+        DataError: states the error in the files if the better reading is right.
     """
     if all(_rms(residual[scene.view == v]) < SUSPICIOUS * one.spread for v, one in enumerate(pairs) if len(one.marker)):
         return np.inf
@@ -116,7 +116,7 @@ def check_other_readings(
 
 
 def readings(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
-    """Yield other readings of a recording whose columns stand in the robot's order.
+    """Yield alternative readings of a recording whose columns are in the robot's order.
 
     Arguments:
         robot, recording: as they stand.
@@ -133,7 +133,7 @@ def _of_inputs(robot: Robot, recording: Recording, frames: IntArray) -> Iterator
 
 
 def _by_inputs(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None) -> Iterator[tuple[float, Reading]]:
-    """Yield what readings of the inputs leave to first order, as a share of what is left now."""
+    """Yield alternative readings of the inputs with their residual to first order, as a fraction of the current one."""
     response = _response(robot, scene, initial)
     if response is None:
         return
@@ -153,7 +153,7 @@ def _by_inputs(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: Floa
 def _by_zero(
     robot: Robot, scene: Scene, pairs: Sequence[Pairs], response: Response, modelled: FloatArray
 ) -> tuple[float, Reading]:
-    """Return what inputs of cables leave that count from another zero, to first order, as a share of what is left now."""
+    """Return the residual with another zero of the cable inputs, to first order, as a fraction of the current one."""
     measured, recording, a = np.zeros_like(modelled), scene.recording, len(robot.body.cables)
     columns = [response.slope[:a, scene.marker].transpose(1, 2, 0)]
     for v, one in enumerate(pairs):
@@ -176,7 +176,7 @@ def _by_zero(
 
 
 def _by_body(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None) -> Iterator[tuple[float, Reading]]:
-    """Yield what other directions of gravity, and other moduli, leave in a few frames, as a share of what is left now."""
+    """Yield other directions of gravity and other moduli with their residual in a few frames, as a fraction of the current one."""
     few = scene.frames[np.unique(np.linspace(0, len(scene.frames) - 1, FEW).round().astype(int))]
     rows = np.isin(scene.frame, few)
     now = _states(robot, scene.recording, few, initial) if rows.any() else None
@@ -225,7 +225,7 @@ def _orders(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Re
 
 
 def _permutations(count: int) -> Iterator[tuple[int, ...]]:
-    """Yield orders of so many columns other than their own."""
+    """Yield the permutations of n columns except the identity."""
     own = tuple(range(count))
     if count <= PERMUTED:
         yield from (order for order in itertools.permutations(own) if order != own)
@@ -273,7 +273,7 @@ def _moduli(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Re
 
 
 def _inputs(robot: Robot, recording: Recording) -> tuple[tuple[str, ...], FloatArray]:
-    """Return the names of cables and chambers, and what is recorded of them, shape (F, a + c)."""
+    """Return the names of cables and chambers, and their recorded inputs, shape (F, a + c)."""
     return (*robot.body.cable_names, *robot.body.chamber_names), np.hstack([recording.inputs, recording.pressures])
 
 
@@ -283,8 +283,8 @@ def _with_inputs(recording: Recording, table: FloatArray) -> Recording:
 
 
 def _drivers(recording: Recording, initial: FloatArray | None, frames: IntArray) -> FloatArray:
-    """Return what drives the markers in each frame, shape (F, d). Cables that would push pull like none;
-    where their zero is unknown, only what changes counts."""
+    """Return the drivers of the markers in each frame, shape (F, d). Cables cannot push: negative tensions are zero. If their zero is
+    unknown, only changes count."""
     cables = recording.inputs
     cables = np.maximum(cables, 0.0) if initial is None else cables - cables[frames].mean(axis=0)
     return np.hstack([cables, recording.pressures])
@@ -324,7 +324,7 @@ def _response(robot: Robot, scene: Scene, initial: FloatArray | None) -> Respons
 
 
 def _share(pairs: Sequence[Pairs], scene: Scene, rows: BoolArray, shift: FloatArray) -> float:
-    """Return what some rows leave where the model's markers are shifted [m], shape (k, 3), as a share of what is left now."""
+    """Return the residual of some rows with displaced model markers [m], shape (k, 3), as a fraction of the current one."""
     return _left(pairs, scene.view, rows, shift) / max(_left(pairs, scene.view, rows, 0.0 * shift), 1e-300)
 
 

@@ -1,7 +1,7 @@
-"""The pose of a camera from points whose names nobody knows: congruent triangles, then assignment and rigid fit in turns.
+"""The pose of a camera from unnamed points: congruent triangles, then alternating assignment and rigid registration.
 
-Every triangle of measured points is laid onto the triangles of the model whose sides are most alike;
-the poses that bring most points near the model are refined in all frames at once. A pose is judged by a likelihood in which every
+Triangles of measured points are aligned with the triangles of the model that have the most similar sides. The poses that bring most
+points near the model are refined in all frames at once. A pose is judged by a likelihood in which every
 point is a marker or an outlier. Sources: Fischler and Bolles, "Random sample consensus" (1981); Kuhn (1955) for the assignment.
 """
 
@@ -19,9 +19,10 @@ from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
 
 TRIANGLES = 30
-"""Measured triangles that are tried: with a third of outliers, 30 % of them have none; none of 30 is clean once in 2e5 times."""
+"""Number of measured triangles that are tried. With a third of outliers, 30 % of the triangles contain none; that none of 30 is clean
+happens once in 2e5 times."""
 ALIKE = 300
-"""Triangles of the model that each is laid onto, those whose sides are most alike: 5 markers have 60, 12 have 1320."""
+"""Number of model triangles that each is aligned with, those with the most similar sides: 5 markers have 60, 12 have 1320."""
 REFINED = 40
 """Poses that are refined in all frames."""
 FINEST = 1e-5
@@ -34,12 +35,12 @@ FAR = 1e3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedNames:
-    """A pose and the names that go with it."""
+    """A pose and its assignment."""
 
     T_robot_camera: FloatArray
     """shape (4, 4)."""
     marker: tuple[IntArray, ...]
-    """Which marker each point of each frame is, −1 where none is left for it, each (n,)."""
+    """Index of the marker assigned to each point of each frame, −1 for an outlier, each (n,)."""
     error_m: float
     """See `typical_error` [m]."""
 
@@ -90,14 +91,14 @@ def refine_names(
     fixed: bool = False,
     repeats: float = 1.0,
 ) -> PosedNames:
-    """Return the pose and the names to which assignment and rigid fit lead in turns from a pose.
+    """Return the pose and the assignment to which alternating assignment and rigid registration converge from a pose.
 
-    A point is an outlier where that is likelier than an error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
+    A point is an outlier if that is more likely than a measurement error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
 
     Arguments:
         model, seen, allowed: as of `search_poses`.
         T_robot_camera: the start, shape (4, 4).
-        fixed: leave the pose as it is.
+        fixed: keep the pose.
         repeats: frames a state.
     """
     T, room = T_robot_camera, room_of(model[0])
@@ -158,15 +159,15 @@ def squared(points: FloatArray, model: FloatArray) -> FloatArray:
 
 
 def typical_error(squares: FloatArray, room: float, *, repeats: float = 1.0) -> FloatArray:
-    """Return by how much points are off [m], shape (…,), outliers counted for what they cost.
+    """Return the equivalent error of the points [m], shape (…,), including the cost of outliers.
 
-    The nearer h points are the model's, with one noise; the others lie anywhere in the room. Of all h the likeliest counts, and the answer is the noise
-    that would make N points all of the model's as likely:  log e = min_h (h log σ_h + (N − h) log room) / N,  σ_h² = Σ_h d² / (3 h − 6 r).
+    The nearest h points are markers, with one noise σ_h; the others are uniform in the room. The most likely h is used. The result is the
+    noise under which N markers without outliers would be equally likely:  log e = min_h (h log σ_h + (N − h) log room) / N,  σ_h² = Σ_h d² / (3 h − 6 r).
 
     Arguments:
         squares: squared distances of the points from their markers [m²], shape (…, N).
         room: side of the cube in which an outlier may lie [m].
-        repeats: r, frames a state: such frames repeat the same error of the model.
+        repeats: r, frames per state: they share the same model error.
     """
     return _likeliest(squares, room, repeats)[1]
 
@@ -184,9 +185,10 @@ def _likeliest(squares: FloatArray, room: float, repeats: float) -> tuple[FloatA
 
 
 def room_of(model: FloatArray) -> float:
-    """Return the side of the cube in which an outlier is as likely as an error of a marker [m].
+    """Return the side [m] of the cube that makes an outlier and a marker error equally likely.
 
-    Outliers lie in a cube twice as wide as the markers (m, 3), and a point in ten is one: the cube root of 9 counts for that.
+    Outliers are uniform in a cube twice as wide as the markers (m, 3). One point in ten is an outlier; the cube root of the odds 9
+    accounts for that.
     """
     return 4.16 * float(np.ptp(model, axis=0).max())
 
@@ -202,7 +204,7 @@ def _squares(
 def _from_triangles(
     model: FloatArray, seen: FloatArray, allowed: BoolArray, rng: np.random.Generator
 ) -> list[tuple[float, FloatArray]]:
-    """Return poses that lay triangles of a frame onto alike ones of the model, with what is then left in the frame [m]."""
+    """Return poses that align triangles of a frame with similar ones of the model, each with the residual of that frame [m]."""
     corners = np.array(list(permutations(range(len(model)), 3)))
     sides = _sides(model[corners])
     result: list[tuple[float, FloatArray]] = []

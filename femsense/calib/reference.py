@@ -47,7 +47,7 @@ def less_reference(robot: Robot, recordings: Sequence[Recording], references: Se
     for one in (*recordings, *references):
         _require_markers(one, references[0])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whoever uses the recordings says the same
+        warnings.simplefilter("ignore")  # reported when the recordings are used
         known = [_missed(robot, check_against(robot, one)) for one in references]
         recordings = [check_against(robot, one) for one in recordings]
     inputs, of_markers = np.concatenate([k.inputs for k in known]), np.concatenate([k.of_markers for k in known])

@@ -39,7 +39,7 @@ def fit_rigid_robust(points_a: FloatArray, points_b: FloatArray, *, rounds: int 
     """Return T_a_b and weights (n,) in (0, 1] that make little of points that do not fit (Cauchy weights on the MAD scale)."""
     weights = np.ones(len(points_a))
     T = fit_rigid(points_a, points_b)
-    if len(points_a) < 5:  # too few to tell who is wrong
+    if len(points_a) < 5:  # too few to identify the outlier
         return T, weights
     for _ in range(rounds):
         distance = np.linalg.norm(points_b @ T[:3, :3].T + T[:3, 3] - points_a, axis=1)

@@ -1,4 +1,4 @@
-"""What the cameras see in one frame, as measurements: each point of the robot with its ray and the noise of its depth."""
+"""The depth measurements of one frame: each point of the robot with its ray and the noise of its depth."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from femsense.pointcloud.rays import Surface, SurfaceHits, together
 from femsense.pointcloud.segmentation import color_mask
 
 REACH = 0.04
-"""A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond,
-METHODS section 3)."""
+"""Points farther from the surface than this fraction of the body's diagonal are not assigned to the robot (12 mm for the diamond)."""
 OFF = 4.0
-"""A point farther from the surface than so many standard deviations is not on it."""
+"""Points farther from the surface than this number of standard deviations are not on it."""
 AROUND = 9
-"""Points of which more than half have to lie on the surface, its own included."""
+"""Number of neighbours, the point included, of which more than half must be on the surface."""
 DIM = 0.5
-"""Points so much darker than the robot's mostly are have no sure hue: they are of it where more than half of those around them are. Of a dark
-gray plate on a soft dome, every fortieth point had the dome's hue; they held its surface up, and the force came out a quarter too small."""
+"""Points darker than this fraction of the robot's typical brightness have no reliable hue: they are assigned to it if more than half of
+their neighbours are. On a dark gray plate on a soft dome, every fortieth point had the dome's hue, and the estimated force was a quarter
+too small."""
 SOME = 300
-"""Rays that tell the angle between neighbours."""
+"""Number of rays from which the angle between neighbours is estimated."""
 MARGIN = 0.25
-"""Points farther from the body than this share of its diagonal are left out."""
+"""Points farther from the body than this fraction of its diagonal are discarded."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -48,13 +48,13 @@ class Scan:
     others_view: IntArray
     """Camera of each, shape (o,)."""
     segmented: bool = True
-    """Whether colour separated the robot from the rest; else all points stand among those that may be of the robot."""
+    """Whether colour separated the robot from the rest; otherwise all points may belong to the robot."""
     count: FloatArray | None = None
     """How many measured points each point of the robot is the mean of, shape (k,); None: each is one (see `in_blocks`)."""
 
     @property
     def measured(self) -> FloatArray:
-        """How many measured points each point of the robot stands for, shape (k,)."""
+        """Number of measured points that each point of the robot represents, shape (k,)."""
         return np.ones(len(self.view)) if self.count is None else self.count
 
     def points(self, poses: Sequence[FloatArray]) -> FloatArray:
@@ -70,7 +70,7 @@ class Scan:
         return np.array([T[:3, 3] for T in poses])[self.view]
 
     def ray_std(self, noises: Sequence[CameraNoise]) -> FloatArray:
-        """Return the noise of a measured point along its ray, where each point lies [m], shape (k,)."""
+        """Return the noise of each measured point along its ray [m], shape (k,)."""
         z = self.camera_points[:, 2]
         std = np.empty(len(z))
         for view, noise in enumerate(noises):
@@ -94,12 +94,12 @@ class RayRows:
     """[m], shape (r,)."""
 
     def off(self, nodes: BoolArray) -> RayRows:
-        """Return the rows on triangles that do not lie on given nodes alone, shape (n,)."""
+        """Return the rows on triangles with at least one node that is not among the given ones, shape (n,)."""
         kept = np.asarray(~nodes[self.hits.nodes].all(axis=1))
         return RayRows(self.hits.pick(kept), self.points[kept], self.view[kept], self.residual[kept], self.std[kept])
 
     def operator(self, node_count: int) -> sp.csr_array:
-        """Return what maps node displacements to the rows, shape (r, 3n)."""
+        """Return the operator from node displacements to the rows, shape (r, 3n)."""
         r = len(self.residual)
         columns = (3 * self.hits.nodes[:, :, None] + np.arange(3)).reshape(r, 9)
         values = (self.hits.weights[:, :, None] * self.hits.normal[:, None, :]).reshape(r, 9)
@@ -115,15 +115,15 @@ class RayRows:
 
 
 def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatArray], positions: FloatArray) -> Scan | None:
-    """Return what the cameras see in frame k near the body; None where the frame has no cloud.
+    """Return the measured points near the body in frame k; None if the frame has no cloud.
 
-    By colour where the robot declares one and the cloud has them; else all points may be of the robot, and the residuals tell.
+    Colour separates the robot if robot and cloud have one. Otherwise all points may belong to the robot, and the residuals decide.
 
     Arguments:
         robot, recording: as loaded.
         k: index of the frame.
         poses: of the cameras, each (4, 4).
-        positions: nodes of the body about as they stand [m], shape (n, 3).
+        positions: approximate nodes of the body [m], shape (n, 3).
     """
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     low, high = positions.min(axis=0) - MARGIN * size, positions.max(axis=0) + MARGIN * size
@@ -164,8 +164,8 @@ def ray_rows(
         surface: the deformed surface.
         poses, noises: of the cameras.
         reach: see `Surface.cast` [m].
-        catch: points whose ray misses count by the closest face instead, up to this distance [m]:
-            for states that are still far off.
+        catch: points whose ray misses the body are compared with the closest face, up to this distance [m]: for states far from the
+            solution.
     """
     points, origins = scan.points(poses), scan.origins(poses)
     hits = surface.cast(points, origins, reach=reach)
@@ -178,11 +178,10 @@ def ray_rows(
 
 
 def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
-    """Return the scan with its points separated by a state: of the robot is what lies on the surface,
-    and whose neighbours do too.
+    """Return the scan segmented by a state: points on the surface whose neighbours are on it too belong to the robot.
 
     Arguments:
-        scan: what was seen, colourless.
+        scan: the measured points, without colour.
         surface: the deformed surface.
         poses, noises: of the cameras.
         reach: see `Surface.cast` [m].
@@ -190,7 +189,7 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     rows = ray_rows(scan, surface, poses, noises, reach=reach)
     on = np.zeros(len(scan.view), dtype=bool)
     on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
-    missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those beside a silhouette
+    missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those next to a silhouette
     points = scan.points(poses)
     on[missed] = surface.gap(points[missed]) < 0.5 * OFF * scan.ray_std(noises)[missed]
     own = np.flatnonzero(on)

@@ -1,9 +1,9 @@
-"""Whether the input of one cable alone is off: its gain and offset, fitted beside poses and a gain of all cables.
+"""Gain and offset of a single cable's input, fitted together with the poses and a common gain of all cables.
 
-To first order about the fit of the files as they stand, for each cable in turn. What the model lacks, a modulus above all, moves
-all cables alike, so that the gain they have in common is fitted with it. Of two cables one too weak is then one too strong: each that
-explains much is put right, and the one counts with which a fit leaves least. Intervals alone accuse the model's own error
-(0.985 ± 0.003 for a gain of 1 on the arm of the tests).
+Each cable in turn, to first order about the calibration. Model errors, above all of the modulus, scale all cables equally, so the common
+gain is fitted too. With two cables, one that is too weak looks like the other one too strong: each cable that explains much is corrected
+and refitted, and the smallest residual decides. Standard errors alone would report model error as a wrong input (0.985 ± 0.003 for a gain
+of 1 on the arm of the tests).
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from femsense.model.robot import Robot
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SingleInput:
-    """How the input of one cable would have to be read for the markers to fit best."""
+    """The gain and offset of one cable's input that fit the markers best."""
 
     cable: int
     """Index of the cable."""
     offset: float
-    """To be added to what frames.csv has, times the gain [N] or [m]."""
+    """Added to the values of frames.csv times the gain [N] or [m]."""
     offset_std: float
     gain: float
     """[1]; 1 where only one cable moves, as a modulus then does the same."""
     gain_std: float
     share: float
-    """What is left with it and the gain in common, as a share of what poses leave [1]."""
+    """Residual with it and the common gain, as a fraction of the residual with poses alone [1]."""
 
     @property
     def is_off(self) -> bool:
@@ -60,16 +60,16 @@ def check_single_inputs(
     *,
     said: float = np.inf,
 ) -> None:
-    """Warn where the markers fit far better with another gain and offset of one cable's input.
+    """Warn if the markers fit far better with another gain and offset of one cable's input.
 
     Arguments:
         robot: the robot.
-        scene: the markers that were fitted; the inputs count from a known zero.
+        scene: the fitted markers; the zero of the inputs is known.
         poses: as fitted, each (4, 4).
-        residual: what the fit leaves [m], shape (k, 3).
+        residual: of the fit [m], shape (k, 3).
         states: the equilibrium of each frame.
         refit: fits another reading.
-        said: what is left by another reading that was named already [m].
+        said: residual of an alternative reading that was reported already [m].
     """
     recording, before = scene.recording, _rms(residual)
     left, best = np.inf, None
@@ -86,7 +86,7 @@ def check_single_inputs(
 
 
 def single_inputs(robot: Robot, scene: Scene, poses: Sequence[FloatArray], states: dict[int, Equilibrium]) -> list[SingleInput]:
-    """Return, for each cable that moves, how its input would have to be read; empty where frames are too few to tell.
+    """Return the best gain and offset of each cable that moves; empty if there are too few frames.
 
     Arguments:
         robot, scene, poses, states: as of `check_single_inputs`.
@@ -123,9 +123,9 @@ def single_inputs(robot: Robot, scene: Scene, poses: Sequence[FloatArray], state
 
 
 def fit_by_frames(J: FloatArray, residual: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the step that takes most of a residual (r,) away, its standard deviations, and what is left.
+    """Return the least-squares step for a residual (r,), its standard errors, and the remaining residual.
 
-    The errors of one frame are counted as one (Liang and Zeger 1986): the model errs alike in all its markers.
+    Standard errors are clustered by frame (Liang and Zeger 1986), because the model error is correlated between its markers.
     """
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     A = J / size

@@ -12,20 +12,20 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
 FEWEST, MARKERS = 4, 4
-"""Fewer frames, or fewer markers before or after, tell nothing."""
+"""Least number of frames, and of markers before and after."""
 WIDE = 0.2
-"""Markers closer together than this share of the body's diagonal move as one, whatever the model lacks: they tell nothing."""
+"""Markers closer together than this fraction of the body's diagonal move together under any model error, and are not used."""
 
 
 def check_camera_still(robot: Robot, recording: Recording, pairs: Sequence[Pairs]) -> None:
-    """Refuse a camera that moved between two frames: a pose of its own before and after explains what one leaves.
+    """Refuse a camera that moved between two frames: separate poses before and after fit far better than one.
 
     Arguments:
-        robot, recording: as they are calibrated.
+        robot, recording: to be calibrated.
         pairs: the markers of each camera.
 
     Raises:
-        DataError: says between which frames.
+        DataError: states the two frames.
     """
     diagonal = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     for name, one in zip(recording.camera_names, pairs):
@@ -46,7 +46,7 @@ def check_camera_still(robot: Robot, recording: Recording, pairs: Sequence[Pairs
 
 
 def _two_poses(pairs: Pairs, split: int) -> float:
-    """Return the rms [m] that two poses leave, the second one from a frame on."""
+    """Return the rms residual [m] with two poses, the second one from a given frame on."""
     squares = 0.0
     for mine in (pairs.group < split, pairs.group >= split):
         if mine.sum() < MARKERS:

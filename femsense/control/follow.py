@@ -26,7 +26,7 @@ its own stiffness. Without `least_m` the gripper pulls its other finger to the l
 
 
 class Follower:
-    """Brings points of a robot towards places that change, within limits."""
+    """Inputs that move points of a robot towards changing targets, one step per call, within limits."""
 
     def __init__(
         self,

@@ -63,6 +63,11 @@ def reach(
 
     Raises:
         InputError: an unknown marker, cable or control, reversed limits, or a requested correction that the robot lacks.
+
+    Example:
+        >>> motion = fs.reach(fs.load_robot("finger"), {"tip": (np.nan, np.nan, 0.02)})
+        >>> motion.status, round(motion.inputs["flexor"], 1)  # N
+        ('reached', 1.0)
     """
     known = options or ReachOptions()
     bounds = make_limits(robot, control, limits or {}, calibration)

@@ -44,7 +44,7 @@ def _pose_hint(pose: FloatArray) -> str | None:
     R = pose[:3, :3]
     scale = float(np.cbrt(abs(np.linalg.det(R))))
     if not pose[:3, 3].any() and pose[3, :3].any():
-        return "it is transposed: the translation stands in the last column"
+        return "it is transposed: the translation belongs into the last column"
     if scale > 0.0 and np.allclose(R @ R.T, scale**2 * np.eye(3), atol=1e-3 * scale**2):
         if np.linalg.det(R) < 0:
             return "an axis is mirrored: left-handed coordinates, as Unity has them?"

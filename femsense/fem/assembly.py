@@ -82,7 +82,7 @@ def internal(
 
 
 def element_forces(body: BodyModel, positions: FloatArray) -> FloatArray:
-    """Return the internal forces of each element by itself [N], shape (m, k, 3); in every law they go with its modulus."""
+    """Return the internal forces of each element [N], shape (m, k, 3); in every law they are proportional to its modulus."""
     stencil, material = body.stencil, body.material
     mu, lam = material.lame()
     x = read_only(positions[stencil.tets].reshape(-1, 3))

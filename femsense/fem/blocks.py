@@ -1,4 +1,4 @@
-"""Tetrahedra of bodies that are built of blocks: a grid of cells, some of them left out, placed in space by a function."""
+"""Tetrahedra of bodies made of blocks: a grid of cells, some of them omitted, mapped into space by a function."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def block_mesh(
         centres = np.stack([(axis[:-1] + axis[1:])[cells[:, i]] / 2.0 for i, axis in enumerate(axes)], axis=1)
         cells = cells[np.asarray(keep(centres), dtype=bool)]
     if not len(cells):
-        raise InputError("no cell is left", where="keep", found=f"0 of {np.prod(counts)}", expected="some cells of the grid")
+        raise InputError("no cell remains", where="keep", found=f"0 of {np.prod(counts)}", expected="some cells of the grid")
     corner = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     at = cells[:, None] + np.where(cells[:, None] % 2 == 0, corner, 1 - corner)  # odd cells are mirrored
     numbers = np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), [count + 1 for count in counts])

@@ -162,7 +162,7 @@ class BodyModel:
         return replace(self, clamp_nodes=freeze(as_indices(nodes, len(self.mesh.nodes), "clamp_nodes"), np.int64))
 
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
-        """Return the body on a clamp that gives (see `femsense.fem.clamp`).
+        """Return the body on a compliant clamp (see `femsense.fem.clamp`).
 
         Arguments:
             stiffness: of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: none gives.
@@ -308,8 +308,7 @@ def tie_cable(
     max_tension: float = np.inf,
     friction: float = 0.0,
 ) -> Cable:
-    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first,
-    goes with an element (see `embed_points`)."""
+    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, is embedded in an element (see `embed_points`)."""
     if not (np.isfinite(friction) and friction >= 0):
         raise InputError("out of range", where=f"friction of cable {name}", found=friction, expected="≥ 0")
     embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")

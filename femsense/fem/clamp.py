@@ -1,4 +1,4 @@
-"""A clamp that gives: springs at its nodes, and a rigid plate that turns about its centre against a spring.
+"""A compliant clamp: springs at its nodes, and a rigid plate that rotates about its centre against a spring.
 
 The plate turns by R = exp[φ]× about the centroid c of the clamped nodes of the declared mesh. Each tied node i, at rest X_i,
 has its anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the clamp's energy is
@@ -6,11 +6,11 @@ has its anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the cla
     E(x) = min over φ of  ½ Σ k |y_i − b_i|² + ½ κ |φ|².
 
 At the minimum κ φ = Σ k b_i × y_i; the force on a node is k (b_i − y_i), and d²E/dx² = k I − P J⁻¹ Pᵀ with P_i = k [b_i]× and
-J = κ J_l⁻¹(φ) + Σ k ((b·y) I − b yᵀ), J_l the left Jacobian of the rotation. The part P J⁻¹ Pᵀ has rank three and goes beside the
-sparse stiffness (Woodbury).
+J = κ J_l⁻¹(φ) + Σ k ((b·y) I − b yᵀ), J_l the left Jacobian of the rotation. The part P J⁻¹ Pᵀ has rank three and is kept separate from
+the sparse stiffness (Woodbury).
 
 A clamped node without a spring, in the middle of an edge whose ends a and b have some, is tied to (x_a + x_b)/2:
-the clamp that hardly gives is the clamp.
+a nearly rigid clamp thus tends to the rigid one.
 """
 
 from __future__ import annotations
@@ -82,10 +82,10 @@ def ties_of(body: BodyModel) -> Ties | None:
 
 
 def followers_of(body: BodyModel) -> Followers | None:
-    """Return the clamped nodes that follow those with springs; None where there are none.
+    """Return the clamped nodes that are tied to those with springs; None without any.
 
-    Between springs at the corners of quadratic elements alone the middles of the edges would bulge out:
-    an even pull on a face acts on these.
+    With springs at the corners of quadratic elements only, the mid-edge nodes would bulge, because a uniform traction on a face acts on
+    them.
     """
     if np.isinf(body.clamp_stiffness) or body.mesh.tets.shape[1] != 10:
         return None
@@ -209,14 +209,13 @@ def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
 
 
 def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> FloatArray | None:
-    """Return where the nodes come to [m], shape (n, 3), when the whole body moves with its clamp,
-    which was rigid until now and gives as `body` says, as one rigid piece; None where the clamp does not give, does not hold the
-    moment, or turns by more than a radian.
+    """Return the node positions [m], shape (n, 3), after a rigid motion of the body with its clamp, which was rigid and now has the
+    compliance of `body`; None if the clamp is rigid, cannot carry the moment, or rotates by more than a radian.
 
     Arguments:
-        body: with the clamp that gives.
+        body: with the compliant clamp.
         positions: with the rigid clamp [m], shape (n, 3).
-        forces: all that act on the body but the clamp [N], shape (n, 3); they stay as they are in space.
+        forces: all forces on the body except those of the clamp [N], shape (n, 3), constant in space.
     """
     ties = ties_of(body)
     if ties is None:
@@ -242,8 +241,7 @@ def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> Fl
 
 
 def _shares(points: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Return how much of each point (p, 3) goes with each node (k, 3): all with a node that it is,
-    half with both ends of its edge."""
+    """Return the weights of the nodes (k, 3) for each point (p, 3): 1 for an equal node, one half for both ends of its edge."""
     distance = np.linalg.norm(points[:, None] - nodes[None], axis=2)
     near = np.argsort(distance, axis=1)[:, :2]
     share = np.zeros(distance.shape)

@@ -162,7 +162,7 @@ def carry(
     carrier: IntArray,
     outside: FloatArray,
 ) -> None:
-    """Write `_carriers_of_outsiders`: those of each point stand in `candidate` from `start` on."""
+    """Write `_carriers_of_outsiders`: those of each point are in `candidate` from `start` on."""
     off, distance = np.empty(len(candidate)), np.empty(len(candidate))
     for i in range(len(points)):
         p = _vector(points, i)

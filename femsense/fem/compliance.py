@@ -102,11 +102,18 @@ def compliance(
 
     Returns:
         W [m/N], shape (k + a + c, k + a + c): displacement of row i along its direction (for a cable: its shortening, for a
-        chamber: its growth [m³]) under a unit force of column j (for a chamber: one pascal). Rows and columns of what is held are
-        those of the free cable or chamber (its tension or pressure as the input).
+        chamber: its growth [m³]) under a unit force of column j (for a chamber: one pascal). Rows and columns of held cables and chambers
+        are those of the free ones, with tension or pressure as the input.
 
     Raises:
         InputError: points and directions do not fit; FemsenseError: nothing holds the body.
+
+    Example:
+        >>> body = fs.load_robot("finger").body
+        >>> tip = np.array([[0.092, 0.0, 0.007]])
+        >>> W = fs.compliance(body, fs.solve_equilibrium(body), points=tip, directions=np.array([[0.0, 0.0, 1.0]]))
+        >>> W.shape  # the tip along z, then the cable
+        (2, 2)
     """
     P, D = as_points(points, "points"), as_points(directions, "directions")
     if P.shape != D.shape:

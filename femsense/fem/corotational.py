@@ -1,13 +1,13 @@
 # mypy: allow-untyped-decorators
-"""The corotational element: linear elasticity in the frame that the polar decomposition F = V R turns along.
+"""The corotational element: linear elasticity in the frame rotated by the polar decomposition F = V R.
 
 Energy of an element with quadrature points q of volume w_q and V = Σ w_q:
 
     W = Σ w_q (μ ‖F_q − R_q‖² + λ'/2 θ_q²) + V (λ − λ')/2 θ²,    θ_q = tr(R_qᵀ F_q) − 3,    θ = Σ w_q θ_q / V,
 
-R_q the closest rotation to F_q, λ' = min(λ, ¾ μ). What λ exceeds λ' by acts on θ, one number an element, the mean
-dilatation: that part of a tetrahedron with ten nodes asks for one thing, not four, and the element does not lock where ν is
-close to ½. Why ¾ stands in docs/method/elements.md. With one point (four nodes) it is the textbook element, whatever λ'.
+R_q the closest rotation to F_q, λ' = min(λ, ¾ μ). The excess λ − λ' acts on θ, the mean dilatation of the element: in a tetrahedron with
+ten nodes it imposes one constraint instead of four, and the element does not lock for ν close to ½. docs/method/elements.md derives the
+factor ¾. With one point (four nodes) it is the textbook element, whatever λ'.
 With h_qa = R_q ∇N_a, h_a = Σ w_q h_qa / V, V_q = F_q R_qᵀ, D_q = tr(V_q) I − V_q and p_q = λ' θ_q + (λ − λ') θ:
 
     force      f_a  = Σ w_q (2μ (F_q − R_q) + p_q R_q) ∇N_a
@@ -46,9 +46,9 @@ def add_blocks(count, K, slots, e, blocks):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST)
 def _four_rotations(F: FloatArray, R: FloatArray, flat_F: FloatArray, flat_R: FloatArray, change: FloatArray) -> None:
-    """Write the rotations closest to the matrices of four points, see `closest_rotation`; `change` is room for four.
+    """Write the rotations closest to the matrices of four points, see `closest_rotation`; `change` is work memory for four.
 
-    The flat views are what a compiler can see to be apart from each other, so that it takes the four at once.
+    The flat views let the compiler see that they do not overlap, so that it processes the four at once.
     """
     for q in range(4):
         size = 0.0
@@ -126,7 +126,7 @@ def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignor
 def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
     """Add T's product to the blocks of the pairs a ≤ b; K is room for it."""
     width = T.itemsize
-    for pair in range(55):  # while the product is made
+    for pair in range(55):  # work memory of the product
         fetch_ahead(blocks.ctypes.data + 9 * width * slots[pair], 9 * width)
     K[:] = 0.0
     for first, count in ((0, 6), (6, 4)):
@@ -270,9 +270,8 @@ def _linear_stiffness(H, D, shear, bulk, turn, slots, blocks):  # type: ignore[n
 def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
 
-    Arrays are those of `Stencil`; `limit` is not used. With one point λ' does not matter,
-    and nothing is kept from point to point:
-    twice as fast as the kernel of ten nodes would be. For these see `corotational_tet10`.
+    Arrays are those of `Stencil`; `limit` is not used. With one point λ' has no influence and no data are kept between points: twice as
+    fast as the kernel for ten nodes, `corotational_tet10`.
     """
     F, R, P, H, D = np.empty((9, 1)), np.empty((9, 1)), np.empty(9), np.empty((4, 3)), np.empty(6)
     first = np.int64(0)  # a number that is written here would compile the rotations a second time
@@ -308,10 +307,9 @@ def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slo
 
 @njit(cache=True, fastmath=FAST)
 def stretched_tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch):  # type: ignore[no-untyped-def]
-    """The same with the stress of another state in its stiffness.
+    """The same, with the stress of another state in the stiffness.
 
     Without `tangent`, RᵀF is written to `stretch`, shape (m, 4, 9); with it,
-    the stiffness is that of the rotations R at x and of the stretches that stand there,
-    as if F were R times these (forces and energy are those of x).
+    the stiffness uses the rotations R at x and the stored stretches, as if F were R times these (forces and energy are those of x).
     """
     return _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch)

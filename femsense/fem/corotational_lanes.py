@@ -109,7 +109,7 @@ def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type:
     local, rest, theta, whole = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
     first, energy = gradients.ctypes.data, 0.0
     for e in range(len(nodes)):
-        if e + 1 < len(nodes):  # while this group is worked on
+        if e + 1 < len(nodes):  # work memory of this group
             fetch_ahead(first + 8 * (e + 1) * points * wide, 8 * points * wide)
         for a in range(count):
             for q in range(LANES):

@@ -1,4 +1,4 @@
-"""How much elastic energy each element of a deformed body holds."""
+"""Elastic energy of each element of a deformed body."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the
 chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
 chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless asked): it goes slack where T would be
 negative, and taut again where its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
-Friction moves the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they rest.
+Friction changes the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they converge.
 """
 
 from __future__ import annotations
@@ -116,9 +116,8 @@ class SolveOptions:
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
     along: tuple[FloatArray, ...] | None = None
-    """Tension of each segment of each cable for a tension of 1 at its motor [1], held still:
-    for laws of friction of one's own. Cables with friction of theirs move on from it. None: 1 without friction,
-    and with it as the start left it."""
+    """Tension of each segment of each cable for a motor tension of 1 [1], kept constant: for user-defined friction laws. Cables with own
+    friction start from it. None: 1 without friction, else the values of the start."""
     reuse_factor: bool = False
     """Begin with the factor of the start, for changes so small that its stiffness still serves."""
     max_iterations: int = 60
@@ -164,6 +163,12 @@ def solve_equilibrium(
 
     Raises:
         InputError: unknown cable or chamber, one named twice, wrong shapes or values.
+
+    Example:
+        >>> body = fs.load_robot("finger").body
+        >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})
+        >>> pulled.converged, round(1e3 * pulled.shortening["flexor"], 1)  # mm
+        (True, 4.5)
     """
     given = {"tension": tension, "shortening": shortening, "pressure": pressure, "volume": volume}
     how = options or SolveOptions()
@@ -190,7 +195,7 @@ def solve_equilibrium(
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
         state, status, reached = _step_loads(body, nothing, loads, rest, state, how.max_iterations)
-    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has moved since Newton looked
+    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has changed since the last residual of Newton
         state.residual = _residual(body, loads, state)
     if status != CONVERGED:
         status = status if body.is_held() else "singular"
@@ -321,7 +326,7 @@ def _initial_state(
         motor = start.tension[body.cable_names[i]]
         if motor > 0 and body.cables[i].friction > 0 and along is None:
             shares[i] = tensions / motor
-    far = np.inf if start.status == "unstable" else 0.0  # where nothing moves, stability is looked at all the same
+    far = np.inf if start.status == "unstable" else 0.0  # stability is checked even if nothing moves
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
     return State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
 

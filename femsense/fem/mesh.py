@@ -66,7 +66,7 @@ class Embedding:
     outside: FloatArray
     """How far outside of the mesh each point is at rest [m], shape (p,); 0 inside."""
     still: FloatArray | None = None
-    """The part of each point that stays where it is [m], shape (p, 3); None: points go with the mesh wholly. See `following`."""
+    """The fixed part of each point [m], shape (p, 3); None: points follow the mesh completely. See `following`."""
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -258,7 +258,7 @@ def closest_in_triangle(corners: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "nearest_element") -> Embedding:
-    """Tie points to the elements that hold them at rest.
+    """Embed points in the elements that contain them at rest.
 
     A point outside goes with one element through the first-order expansion of that element's shape functions at the
     closest point of the element (for tet4 this is the element's affine map).

@@ -14,7 +14,7 @@ from femsense.fem.mesh import TetMesh, body_parts, element_volumes
 
 
 def check_mesh(mesh: TetMesh, where: str) -> None:
-    """Refuse what cannot be computed: no elements, flat or inverted ones, unused nodes, loose parts. Raises InputError.
+    """Refuse meshes that cannot be computed: no elements, flat or inverted ones, unused nodes, loose parts. Raises InputError.
 
     Parts connected by an edge or a corner only can be computed but act as hinges; this is a warning.
     """
@@ -69,10 +69,9 @@ def check_mesh(mesh: TetMesh, where: str) -> None:
 
 
 def hinged_parts(mesh: TetMesh) -> IntArray:
-    """Return the number of the part that each element belongs to where only faces join, shape (m,).
+    """Return the index of the face-connected part of each element, shape (m,).
 
-    Parts that share an edge or a corner alone swing about it.
-    """
+    Parts that share only an edge or a corner act as hinges."""
     m, n = len(mesh.tets), len(mesh.nodes)
     faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3).astype(np.int64), axis=1)
     keys = (faces[:, 0] * n + faces[:, 1]) * n + faces[:, 2]

@@ -28,8 +28,8 @@ from femsense.fem.newton_state import (
 from femsense.fem.slack_and_friction import let_go, update_friction, update_slack
 
 SURE = 0.1
-"""If a step left less than this share of the residual, the next one will likely leave less than `NewtonOptions.chord`, so no
-tangent is assembled at the state it leads to."""
+"""If a step reduces the residual below this fraction, the next one will probably reach `NewtonOptions.chord`, so no tangent is assembled
+at the new state."""
 LENT = 0.1
 """The same for a factor borrowed from a nearby state."""
 RUBS = 0.3
@@ -86,7 +86,9 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
     secants = Secants()
     for iteration in range(max_iterations):
         follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
-        if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
+        if follows and (
+            iteration or state.borrowed
+        ):  # from a nearby state in one step: its bend angles are nearly the final ones
             update_friction(body, loads, state)
         rows = drive_rows(body, state)
         H = kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
@@ -186,12 +188,12 @@ def factor_here(
         state.shifted = exact is None or not _held_definite(exact, H, C, stretch, lever)
         whole = whole if state.shifted else exact
     state.indefinite_steps += state.shifted
-    # the plate only ever softens, so that the factor without it leads downhill
+    # the plate only softens the stiffness, so the factor without it still gives a descent direction
     return plain if state.shifted and whole is not None and whole.negative > 0 else whole
 
 
 def definite_factor(pattern: Pattern, values: FloatArray, state: State) -> Factorization | None:
-    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last.
+    """Factorise a stiffness with the shift that makes it positive definite, starting from the last one.
     Where it is indefinite in single precision alone, as a body about to buckle may be, no other factor of this state is."""
     first, plain = state.shift / 4.0, None
     if state.single:

@@ -77,7 +77,7 @@ class State:
     shifted: bool = False  # the stiffness was not positive definite where it was last factorised
     shift: float = 0.0  # shift that made the stiffness positive definite there [N/m]
     single: bool = False  # factors in single precision
-    rough: bool = False  # the state is only tried
+    rough: bool = False  # a trial state
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
     here: Internal | None = None  # last residual of Newton, at x

@@ -30,30 +30,30 @@ UNFINISHED = ".unfinished"
 NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
 PATHS = ("Path", "PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")
 DIGEST = 32
-"""Bytes at the beginning of the file that say what the search is made from."""
+"""Number of bytes at the beginning of the file that identify the inputs of the computation."""
 NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
     Equilibrium: ("factor", lambda: None),
     Analysis: ("idle", dict),
     Pattern: ("idle", list),
     FreeMap: ("laplacian", list),
 }
-"""What is large and soon made again: factors that later ones start from, and memory that waits for use."""
+"""Large objects that are quickly recomputed and therefore not stored: factorisations and work memory."""
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
-"""What comes of a file that is cut off, or that another version wrote."""
+"""Exceptions raised by a truncated file, or by one of another version."""
 
 
 class Checkpoint:
-    """Keeps how far a computation has come, if it is told where: a help that may fail, and then all begins anew."""
+    """Stores the progress of a computation, if a file is given. If storing or reading fails, the computation starts from the beginning."""
 
     def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect] = ()) -> None:
-        """where: the file, and what the computation is made from. effects: all those that it may hold; they are not written."""
+        """where: the file, and the inputs of the computation. effects: all that it may refer to; they are not written."""
         self.file = None if where is None else Path(where[0])
         self.made_from = b"" if where is None else hashlib.sha256(json_text(where[1]).encode()).digest()
         self.effects = effects
         self.last = time.monotonic()
 
     def keep(self, course: object, *, every: float = 0.0) -> None:
-        """Write how far a computation has come, not more often than `every` so many seconds."""
+        """Write the progress of a computation, at most once in `every` seconds."""
         if self.file is None or time.monotonic() < self.last + every:
             return
         with (
@@ -82,9 +82,9 @@ class Checkpoint:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Remove the file, and its folder where it is empty, after a result and after an error that would come again.
+        """Remove the file, and its folder if empty, after a result or a reproducible error.
 
-        With it goes what was left by a computation that was killed while it wrote the file.
+        Unfinished files of a killed computation are removed too.
         """
         if self.file is not None and (error is None or isinstance(error, FemsenseError)):
             with contextlib.suppress(OSError):

@@ -26,7 +26,7 @@ class CorrectionTable(Schema):
     format: Literal["femsense-correction-1"] = Field(description=f'format = "{FORMAT}"')
     kernel: Literal["each input by itself", "all inputs together"] = Field(description="of which inputs a term is a function")
     length: float = Field(gt=0, description="of the kernel, in ranges of an input")
-    control: Literal["tension", "displacement"] = Field(description="what drives the cables")
+    control: Literal["tension", "displacement"] = Field(description="the quantity of the cable inputs")
     inputs: list[str] = Field(description="names of cables, then of chambers")
     ranges: list[float] = Field(description="of the inputs [N], [m] or [Pa]")
     markers: list[str] = Field(description="names of the markers")

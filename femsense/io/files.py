@@ -1,4 +1,4 @@
-"""Writing results so that nothing half-written ever stands at the final name, and hashing what was read."""
+"""Atomic writing of results under their final names, and hashes of the files that were read."""
 
 from __future__ import annotations
 
@@ -32,14 +32,13 @@ LONGEST_ARRAY = 100
 
 @contextmanager
 def write_beside(path: str | Path) -> Iterator[Path]:
-    """Yield a free path beside `path`; what the block writes there (a file or a folder) gets the final name at its end.
+    """Yield a free path next to `path`; the file or folder that the block writes there is renamed to `path` at the end.
 
-    The temporary name keeps the ending of the final one. If the block raises, nothing is left behind and what stood at
-    `path` before is untouched. A folder replaces the whole folder that stood there. Symbolic links are followed; devices and
-    pipes are written through, not replaced.
+    The temporary name has the suffix of the final one. If the block raises, the temporary file is removed and `path` is unchanged. A
+    folder replaces the whole previous folder. Symbolic links are followed; devices and pipes are written to, not replaced.
 
     Raises:
-        InputError: a place that cannot be written, or holds something of another kind. FileNotFoundError:
+        InputError: a path that cannot be written, or exists as another kind of file. FileNotFoundError:
             the block wrote nothing.
     """
     if writes_through(path):
@@ -62,16 +61,16 @@ def write_beside(path: str | Path) -> Iterator[Path]:
 
 
 def check_target(path: str | Path, *, folder: bool, kind: FileKind | None = None, inputs: Iterable[str | Path] = ()) -> None:
-    """Refuse, before anything is computed, a place where no result can be written.
+    """Refuse a path at which the result cannot be written, before anything is computed.
 
     Arguments:
         path: the place.
         folder: a folder is to be written there.
-        kind: what a file that stands there must be, to be replaced.
-        inputs: files that the result is made from: none of them is replaced.
+        kind: the kind of file that may be replaced there.
+        inputs: input files of the result: none of them is replaced.
 
     Raises:
-        InputError: with what stands there.
+        InputError: states the existing file.
     """
     if writes_through(path):
         if folder:
@@ -97,7 +96,8 @@ def check_no_pipe(sources: Iterable[Path]) -> None:
 
 
 def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
-    """Refuse to replace a folder that holds more than what `own` matches, as paths below it; `what` names that.
+    """Refuse to replace a folder with files that `own` does not match (relative paths); `what` describes the matching ones in the
+    message.
 
     Unfinished files of femsense do not count; links do. Raises InputError.
     """
@@ -105,16 +105,16 @@ def check_own(folder: Path, own: re.Pattern[str], what: str) -> None:
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
         raise InputError(
-            "files stand there that would be deleted",
+            "other files in the folder would be deleted",
             where=folder,
             found=", ".join(foreign[:3]) + more,
-            expected=f"a new folder, or {what} and nothing beside",
+            expected=f"a new folder, or {what} and nothing else",
             hint="another -o",
         )
 
 
 def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
-    """Return what lies below a folder and `own` does not match, as paths from there; links count, unfinished files do not."""
+    """Return the relative paths below a folder that `own` does not match; links count, unfinished files do not."""
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     return sorted(name for name in names if PART_PREFIX not in name and not own.fullmatch(name))
 
@@ -146,14 +146,14 @@ def _through(final: Path) -> Iterator[Path]:
 
 
 def _opened(final: Path) -> BinaryIO:
-    """Open a device or a pipe for writing; a pipe that nobody reads is waited for, as the system does, and that is said."""
+    """Open a device or a pipe for writing; opening a pipe without a reader blocks, which is reported."""
     if final.is_fifo():
         try:
             handle = os.open(final, os.O_WRONLY | os.O_NONBLOCK)
         except OSError as error:
             if error.errno != errno.ENXIO:
                 raise
-            warnings.warn(f"{final} is a pipe that nobody reads: waiting for a reader", stacklevel=2)
+            warnings.warn(f"{final} is a pipe without a reader: waiting for one", stacklevel=2)
         else:
             os.set_blocking(handle, True)
             return os.fdopen(handle, "wb")
@@ -170,7 +170,7 @@ def followed(path: str | Path) -> Path:
 
 
 def _check_writable(final: Path) -> None:
-    """Make the parent; refuse what is protected against writing. Raises InputError."""
+    """Make the parent folder; refuse write-protected paths. Raises InputError."""
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -307,7 +307,7 @@ def _replace(part: Path, final: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Have the content on the disk before the name: a crash leaves the old file or the new one."""
+    """Flush the content to disk before the rename, so that after a crash either the old or the new file exists."""
     with path.open("r+b") as stream:
         os.fsync(stream.fileno())
 

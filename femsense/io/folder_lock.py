@@ -13,7 +13,7 @@ from femsense.io.files import PART_PREFIX, followed
 
 try:
     import fcntl
-except ImportError:  # Windows has none: there two commands are not kept apart
+except ImportError:  # Windows has none: two commands are not prevented there
     fcntl = None  # type: ignore[assignment]
 
 
@@ -21,11 +21,11 @@ except ImportError:  # Windows has none: there two commands are not kept apart
 def only_writer(folder: str | Path) -> Iterator[None]:
     """Keep other commands out of a folder of results while the block works.
 
-    A file beside the folder is locked, which says who works. A command that is killed leaves it behind without its lock.
-    A file system without locks keeps nobody out.
+    A file next to the folder is locked and names the working command. A killed command leaves the file behind unlocked. On a file system
+    without locks nothing is prevented.
 
     Raises:
-        InputError: another command works there.
+        InputError: another command is working there.
     """
     final, handle = followed(Path(folder).expanduser()), None
     with contextlib.suppress(OSError):
@@ -70,12 +70,12 @@ def _locked(final: Path) -> int | None:
             os.ftruncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
             return handle
-        os.close(handle)  # who held it has just removed it
+        os.close(handle)  # the previous holder has just removed it
     return None
 
 
 def _is_at(handle: int, file: Path) -> bool:
-    """Return whether an open file still stands at a path."""
+    """Return whether an open file still exists at a path."""
     try:
         return os.path.samestat(os.fstat(handle), file.stat())
     except OSError:

@@ -1,4 +1,4 @@
-"""Rows of markers.csv that no camera measured: zeros, or another constant, stand for a marker that was lost."""
+"""Rows of markers.csv without a measurement: many programs write a lost marker as zeros or another constant."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ SHOWN = 6
 
 
 def is_a_place(path: object, xyz: FloatArray, names: Sequence[str], frame: IntArray) -> BoolArray:
-    """Return which rows are places, shape (rows,): 0, 0,
-    0 or another number three times is how many programs write a lost marker.
+    """Return which rows are positions, shape (rows,): many programs write a lost marker as 0, 0, 0 or another number three times.
 
     Arguments:
-        path: what messages name.
+        path: for messages.
         xyz: as the file has them, shape (rows, 3).
-        names: of each row's marker, "" where it has none.
+        names: of each row's marker, "" without one.
         frame: number of each row's frame.
 
     Raises:
@@ -36,10 +35,9 @@ def is_a_place(path: object, xyz: FloatArray, names: Sequence[str], frame: IntAr
     if never:
         text = ", ".join(name or "(without a name)" for name in never)
         raise DataError(
-            f"{path}: {what} in every row of {text}: these markers were lost all the time. Take their rows out, or name "
-            f"the columns anew"
+            f"{path}: {what} in every row of {text}: these markers were always lost. Remove their rows, or rename the columns"
         )
-    warnings.warn(f"{path}: {what} is how a lost marker is written; left out: {_rows(cells[lost], frame[lost])}", stacklevel=4)
+    warnings.warn(f"{path}: {what} is a lost marker, left out: {_rows(cells[lost], frame[lost])}", stacklevel=4)
     return np.asarray(~lost)
 
 

@@ -1,14 +1,14 @@
 """Silicones that soft robots are cast from: hardness, density and Young's modulus, each with its source.
 
-Young's modulus here is that of small strains, where the model lives. Data sheets do not give it; it is derived in four ways:
+Young's modulus is that of small strains. Data sheets do not contain it; it is derived in four ways:
 
     measured   E = 3 s / (λ − λ⁻²) from the engineering stress s of a tensile test at a stretch λ (incompressible neo-Hookean);
     bulletin   the same from the vendor's "100 % modulus", the stress at λ = 2;
     fitted     E = 6 C₁ of a published Yeoh fit, or what a paper states;
     hardness   E = 98.1 kPa (56 + 7.66 S) / (0.137505 (254 − 2.54 S)) from Shore A hardness S (Gent 1958).
 
-`young_modulus_pa` is the geometric mean of the lowest and the highest of what is known of a material, and these two are its
-spread. It is a start: cure, batch, age, thinner and strain rate move the modulus, and calibration finds it (effect `stiffness`).
+`young_modulus_pa` is the geometric mean of the lowest and highest published value, which are the spread. It is an initial guess: the
+modulus depends on cure, batch, age, thinner and strain rate, and is estimated from a recording (effect `stiffness`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Modulus:
     young_modulus_pa: float
     """[Pa]."""
     way: str
-    """What was measured and how it was turned into a modulus."""
+    """The measurement, and its conversion into a modulus."""
     source: str
 
 
@@ -55,7 +55,7 @@ class Silicone:
 
     @property
     def spread_pa(self) -> tuple[float, float]:
-        """Lowest and highest of what is known [Pa]."""
+        """Lowest and highest published value [Pa]."""
         values = [modulus.young_modulus_pa for modulus in self.moduli]
         return min(values), max(values)
 
@@ -122,7 +122,7 @@ SILICONES = (
         WACKER,
     ),
 )
-"""What is known. Measured stresses are read from the database's curves, engineering stress against crosshead strain."""
+"""Published values. Measured stresses are read from the database's curves, engineering stress over crosshead strain."""
 
 
 def silicone(name: str) -> Silicone:

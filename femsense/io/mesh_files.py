@@ -31,13 +31,13 @@ SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron",
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
 
-    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder).
+    A closed surface is tetrahedralised on first use; the result is stored next to it (or in the cache folder).
     Nodes that no tetrahedron uses are dropped with a warning.
-    A mesh whose elements are all inverted has another order of nodes and is turned.
+    If all elements are inverted, the file uses another node order, which is converted.
 
     Arguments:
         path: the file.
-        where: what a message names; by default the file.
+        where: for messages; by default the file.
 
     Raises:
         InputError: no such file, not readable, no tetrahedra, other solid elements, an open surface.
@@ -96,7 +96,7 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
             where=where,
             found=reason(error),
             expected="triangles (ply, stl, obj, off)",
-            hint="is the file whole, and what its ending says?",
+            hint="is the file complete, and does its suffix fit the content?",
         ) from None
     if not len(triangles):
         raise _no_triangles(path, where)
@@ -126,14 +126,13 @@ def _with_points(path: Path, where: str) -> io.BytesIO | None:
 
 
 def _no_triangles(path: Path, where: str) -> InputError:
-    """Return what to say of a file without triangles: points alone are a cloud;
-    else it is something else than its ending says."""
+    """Return the message for a file without triangles: points alone are a cloud; otherwise the suffix does not fit the content."""
     with path.open("rb") as stream:
         head = stream.read(1_000_000)
     announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
     if path.suffix.lower() == ".stl" and size >= 84 and not head.lstrip().startswith(b"solid") and announced:
         return InputError(
-            "the file does not hold what it announces",
+            "the content disagrees with its header",
             where=where,
             found=f"{announced} triangles announced, room for {(size - 84) // 50}",
             expected="a whole binary STL file",
@@ -154,7 +153,7 @@ def _no_triangles(path: Path, where: str) -> InputError:
         where=where,
         found="no points either",
         expected="triangles",
-        hint="is this file what its ending says?",
+        hint="does the suffix fit the content?",
     )
 
 
@@ -210,7 +209,7 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
     if len(kept) < len(tets):
         warnings.warn(
             (
-                f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical "
+                f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra occur twice (once for each physical "
                 f"group?): each is used once"
             ),
             stacklevel=4,
@@ -224,7 +223,7 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
 
 
 def tet_values(path: Path, name: str, where: str) -> npt.NDArray[np.generic]:
-    """Return what a mesh file says of each tetrahedron of `read_tets`, shape (m, p): p values where it says several.
+    """Return the cell data of each tetrahedron of `read_tets`, shape (m, p), with p components.
 
     Raises:
         InputError: no tetrahedra, or no such cell data.
@@ -264,7 +263,7 @@ def _from_zero(tets: IntArray, count: int, where: str) -> IntArray:
 
 
 def _check_faces(mesh: TetMesh, where: str) -> None:
-    """Refuse elements that overlap: a face belongs to one tetrahedron, or lies between two. Raises InputError."""
+    """Refuse overlapping elements: a face belongs to one or two tetrahedra. Raises InputError."""
     faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
     count = np.unique(faces, axis=0, return_counts=True)[1]
     if len(count) and (count > 2).any():
@@ -306,7 +305,7 @@ def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple
             where=where,
             found=f"{int((count == 1).sum())} edges with one triangle, {int((count > 2).sum())} with more than two",
             expected="every edge between two triangles",
-            hint="femsense mesh SURFACE -o ROBOT closes holes and mends what it can",
+            hint="femsense mesh SURFACE -o ROBOT closes holes and repairs the surface",
         )
     made = repaired(points, triangles, where=where)
     return np.array(made.points), np.array(made.triangles)

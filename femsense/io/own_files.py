@@ -1,4 +1,4 @@
-"""Files of femsense, known by what they begin with and hold: only these give way to a new result of the same kind."""
+"""Files written by femsense, identified by their first bytes and content: only these are replaced by a new result of the same kind."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 from femsense.core.errors import InputError
 
 ENDS = 1 << 20
-"""So many bytes of both ends of a file are searched for what it holds."""
+"""Number of bytes at both ends of a file that are searched for the identifying text."""
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """What tells a file that femsense wrote from any other."""
+    """The identifying properties of a file that femsense wrote."""
 
     name: str
     """As messages call it."""
     begins: bytes
     """Its first bytes."""
     holds: bytes = b""
-    """What stands near its beginning or its end besides."""
+    """Further text near its beginning or end."""
 
     def fits(self, file: Path) -> bool:
         """Return whether a file is of this kind. Raises OSError where it cannot be read."""
@@ -76,22 +76,22 @@ DEMO = {
 
 
 def check_replaceable(file: Path, kind: FileKind | None, inputs: Iterable[str | Path] = ()) -> None:
-    """Refuse a place where another file stands than a kind of femsense, or one that is read; an empty file gives way.
+    """Refuse a path that exists as another kind of file, or is an input; an empty file is replaced.
 
-    `kind` None asks for no kind.
+    `kind` None accepts any kind.
 
     Raises:
-        InputError: with what stands there.
+        InputError: states the existing file.
     """
     if not file.exists():
         return
     if any(Path(path).exists() and file.samefile(path) for path in inputs):
-        raise InputError("the result would replace what it is made from", where=file, expected="a new name", hint="another -o")
+        raise InputError("the result would replace its own input", where=file, expected="a new name", hint="another -o")
     if kind is None:
         return
     expected = f"a new name, or {kind.name}"
     if not file.is_file():
-        raise InputError("no file stands there", where=file, expected=expected, hint="another -o")
+        raise InputError("no file exists there", where=file, expected=expected, hint="another -o")
     try:
         fits = not file.stat().st_size or kind.fits(file)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What a result was made from: inputs with their hashes, and versions."""
+"""Provenance of a result: inputs with their hashes, and versions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 RECORDING_PARTS = ("recording.toml", "frames.csv", "markers.csv", "rest.csv", "loads.csv", "clouds", "depth", "color")
-"""What results depend on; other files of a recording, such as the truth beside it, do not count."""
+"""Files that results depend on; other files of a recording, such as its truth, do not count."""
 
 
 def robot_input(robot: Robot) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def _without_paths(value: Any) -> Any:
 
 
 def _without_hash(value: Any) -> bool:
-    """Return whether an input was made in Python, so that nobody can say what it held."""
+    """Return whether an input was made in Python and therefore has no hash."""
     if isinstance(value, Mapping):
         return ("sha256" in value and value["sha256"] is None) or any(map(_without_hash, value.values()))
     return any(map(_without_hash, value)) if isinstance(value, list | tuple) else False

@@ -1,4 +1,4 @@
-"""The columns of a recording's CSV files: what is read, and what the page of files says."""
+"""The columns of a recording's CSV files, for reading and for the page on files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class Column:
 
     name: str
     holds: str
-    """What it says, with its unit."""
+    """Its quantity and unit."""
     required: bool = True
 
 
@@ -41,7 +41,7 @@ COLUMNS: dict[str, tuple[Column, ...]] = {
     ),
     "markers.csv": (
         Column("frame", "number of a frame of frames.csv"),
-        Column("marker", "name of the marker; empty in all rows of a frame where nobody knows which is which"),
+        Column("marker", "name of the marker; empty in all rows of a frame with unnamed markers"),
         *PLACE,
         CAMERA,
     ),

@@ -51,10 +51,15 @@ OWN_FILES = re.compile(
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Load a recording folder (or its recording.toml). Clouds and images are found, not read.
+    """Load a recording folder, or its recording.toml. Clouds and images are read later, frame by frame.
 
     Raises:
-        InputError: with file, place, what was found and what was expected.
+        InputError: with file, place, found and expected value.
+
+    Example:
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> recording.frame_count, recording.cable_names
+        (44, ('north', 'west', 'south', 'east'))
     """
     folder = _recording_folder(Path(path).expanduser())
     toml = folder / "recording.toml"
@@ -102,7 +107,7 @@ def _recording_folder(path: Path) -> Path:
 
 
 def _check_depth(clouds: Any, cameras: Sequence[Camera | None], views: Sequence[str], table: RecordingTable, toml: Path) -> None:
-    """Check what depth images need of recording.toml, on the first whole image of each view."""
+    """Check the entries of recording.toml that depth images need, on the first whole image of each view."""
     for v, name in enumerate(views):
         images = [files[v] for files in clouds if files[v] is not None and files[v].suffix.lower() == ".png"]
         if not images:

@@ -30,7 +30,7 @@ TOO_LONG = 5.0
 
 
 def read_frames(path: Path, actuation: str, actuation_zero: str) -> tuple[Timeline, Drives]:
-    """Return what stands in frames.csv; the actuation is recording.toml's. Raises InputError."""
+    """Return the content of frames.csv; `actuation` is that of recording.toml. Raises InputError."""
     if not path.is_file():
         raise InputError(
             "frames.csv is missing",
@@ -58,7 +58,7 @@ def read_frames(path: Path, actuation: str, actuation_zero: str) -> tuple[Timeli
             found=f"{inputs[row, column]:g} m",
             expected="metres",
             hint=("divide the column by 1000; or " if likely else "")
-            + f"ticks, degrees or steps of a motor? femsense import --map NAME={cables[column]}*FACTOR says metres in one of them",
+            + f"ticks, degrees or steps of a motor? femsense import --map NAME={cables[column]}*FACTOR states metres per unit",
         )
     timeline = Timeline(
         time_s,
@@ -98,7 +98,7 @@ def read_markers(path: Path, views: tuple[str, ...], numbers: IntArray, noise_m:
     if len(first) < len(keys):
         row = int(np.setdiff1d(np.arange(len(keys)), first)[0])
         raise InputError(
-            "a marker stands twice in one frame",
+            "a marker occurs twice in one frame",
             where=table.place(row),
             found=f"frame {numbers[frame[row]]}, marker {names[index[row]]!r}",
             expected="one row a frame and marker",
@@ -124,7 +124,7 @@ def read_rest(path: Path, views: tuple[str, ...]) -> RestMarkers | None:
     for row, key in enumerate(zip(index.tolist(), view.tolist())):
         if key in seen:
             raise InputError(
-                "a marker stands twice", where=table.place(row, "marker"), found=names[key[0]], expected="one row a marker"
+                "a marker occurs twice", where=table.place(row, "marker"), found=names[key[0]], expected="one row a marker"
             )
         seen[key] = row
     return RestMarkers(tuple(names[i] for i in index), freeze(xyz), freeze(std), freeze(view, np.int64))
@@ -202,11 +202,11 @@ def _check_order(table: Table, numbers: IntArray, time_s: FloatArray) -> None:
     for row, number in enumerate(numbers.tolist()):
         if number in first:
             raise InputError(
-                "a frame stands twice",
+                "a frame occurs twice",
                 where=table.place(row, "frame"),
                 found=number,
                 expected="each frame once",
-                hint=f"it stands in line {table.lines[first[number]]} too",
+                hint=f"it is already in line {table.lines[first[number]]} too",
             )
         first[number] = row
     bad = np.flatnonzero(np.diff(time_s) <= 0)
@@ -251,10 +251,10 @@ def _unnamed(table: Table, frame: IntArray, numbers: IntArray) -> BoolArray:
     mixed = np.flatnonzero(empty & np.isin(frame, frame[~empty]))
     if len(mixed):
         raise InputError(
-            "a marker without a name beside markers with names",
+            "named and unnamed markers in one frame",
             where=table.place(int(mixed[0]), "marker"),
             found=f"an empty cell in frame {numbers[frame[mixed[0]]]}",
-            expected="a name, or empty cells in all rows of the frame, where nobody knows which marker is which",
+            expected="a name, or empty cells in all rows of a frame with unnamed markers",
         )
     return empty
 

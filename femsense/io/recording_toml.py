@@ -1,4 +1,4 @@
-"""recording.toml ↔ its tables: cameras, noise, tools; what is wrong with them."""
+"""recording.toml ↔ its tables: cameras, noise, tools, with their checks."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ToolTable(Schema):
     radius_m: Length | None = Field(None, description="a ball: its radius in metres, > 0")
     cylinder: CylinderTable | None = Field(None, description="cylinder = { radius_m = 0.004, length_m = 0.15 }")
     mesh: Annotated[str, Field(min_length=1)] | None = Field(
-        None, description="a closed surface beside recording.toml, with unit"
+        None, description="a closed surface next to recording.toml, with unit"
     )
     unit: LengthUnit | None = Field(None, description='unit = "m", "cm" or "mm": of the coordinates in the mesh file')
 
@@ -89,12 +89,12 @@ class CameraTable(Schema):
         default_factory=lambda: [0.0] * 5,
         description="five numbers in OpenCV's order: k1, k2, p1, p2, k3 (or 4, or 8 with k4, k5, k6)",
     )
-    distortion_model: Models = Field("brown_conrady", description="what the numbers of distortion mean")
+    distortion_model: Models = Field("brown_conrady", description="the distortion model")
     depth_unit_m: Annotated[float, Field(gt=0, lt=1)] | None = Field(
         None, description="metres in one unit of a depth image, such as 0.001"
     )
     T_robot_camera: Matrix | None = Field(None, description=POSE)
-    noise: NoiseTable | None = Field(None, description="a table [camera.noise]: what a single depth is off by")
+    noise: NoiseTable | None = Field(None, description="a table [camera.noise]: noise of a single depth value")
 
     @model_validator(mode="after")
     def _distortion_fits(self) -> CameraTable:
@@ -127,12 +127,12 @@ class RecordingTable(Schema):
     camera: CameraTable | None = Field(None, description="a table [camera] with width, height, fx, fy, cx, cy")
     cameras: Annotated[dict[str, CameraTable], Field(min_length=1)] | None = Field(None, description="tables [cameras.NAME]")
     marker_noise_m: Annotated[float, Field(gt=0, lt=1)] | None = Field(
-        None, description="what a marker repeats to along each axis in metres, such as 0.0002"
+        None, description="repeatability of a marker along each axis in metres, such as 0.0002"
     )
     session: Annotated[str, Field(min_length=1)] | None = Field(
-        None, description="a label: recordings of one session share what a session shares"
+        None, description="a label: recordings of one session share per-session values, such as input offsets"
     )
-    tools: list[ToolTable] = Field([], description="tables [[tools]]: what may touch the robot, with name and shape")
+    tools: list[ToolTable] = Field([], description="tables [[tools]]: objects that may touch the robot, with name and shape")
 
 
 # Checks
@@ -157,7 +157,7 @@ def table_problems(table: RecordingTable, path: Path) -> Iterator[InputError]:
         )
     if table.T_robot_camera is not None and one is not None and one.T_robot_camera is not None:
         yield InputError(
-            "the pose stands twice", where=at_key(path, "camera", "T_robot_camera"), expected="T_robot_camera above [camera]"
+            "the pose is given twice", where=at_key(path, "camera", "T_robot_camera"), expected="T_robot_camera above [camera]"
         )
     for name in several:
         if not re.fullmatch(r'[^/\\,;"\s.][^/\\,;"\s]*', name):

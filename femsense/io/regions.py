@@ -1,7 +1,7 @@
 """Parts of a body that are made of another material: the tables [[regions]] of robot.toml.
 
-An element belongs to a region where its centroid at rest (of its four corners) lies in the box or in the sphere, or where the
-mesh file's cell data say so. Regions that overlap: the later one wins.
+An element belongs to a region if its centroid at rest (of its four corners) is in the box or sphere, or if the mesh file's cell data have
+the value. Of overlapping regions the last one counts.
 """
 
 from __future__ import annotations

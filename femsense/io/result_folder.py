@@ -19,10 +19,10 @@ from femsense.io.own_files import FileKind, check_files
 
 @contextmanager
 def results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
-    """Yield an empty folder; what the block writes there moves into `folder` at its end, `marker` last.
+    """Yield an empty folder; the files that the block writes there are moved into `folder` at the end, `marker` last.
 
-    A new folder appears in one step. In one that is there, the old marker goes first, so that a folder with a marker is always
-    complete; its other files stay.
+    A new folder appears in one step. In an existing folder the old marker is removed first, so that a folder with a marker is always
+    complete; other files are kept.
     """
     root = Path(folder).expanduser().absolute()
     if not root.exists():
@@ -43,14 +43,14 @@ def check_folder(root: Path, not_beside: Sequence[str], kinds: Mapping[str, File
     foreign = next((name for name in not_beside if (root / name).is_file()), None)
     if foreign is not None:
         raise InputError(
-            "the results would mix with what stands there",
+            "the results would mix with the existing files",
             where=root,
             found=foreign,
             expected="a folder of their own",
             hint="another -o",
         )
     if root.exists() and not root.is_dir():
-        raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
+        raise InputError("a file exists where the folder should be written", where=root, expected="a folder", hint="another -o")
     check_target(root, folder=True)
     check_files(root, kinds)
 
@@ -65,7 +65,7 @@ def read_document(file: Path, expected: str) -> dict[str, Any]:
 
 
 def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]:
-    """Return a JSON object; `expected` says what the file should be. Raises InputError."""
+    """Return a JSON object; `expected` describes the file in messages. Raises InputError."""
     try:
         document = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -75,7 +75,9 @@ def read_object(file: Path, expected: str = "one JSON object") -> dict[str, Any]
             where=file,
             found=error.strerror,
             expected=expected,
-            hint="if a command was to make it, the summary.csv of that says why it has not" if missing else None,
+            hint="run the command that writes it first; of many recordings, its summary.csv states why this one has none"
+            if missing
+            else None,
         ) from None
     except ValueError as error:
         raise InputError("not valid JSON", where=file, found=error, expected=expected) from None
@@ -105,7 +107,7 @@ def numbers_of(document: Mapping[str, Any], key: str, file: Path) -> dict[str, f
 
 
 def number_of(value: Any) -> float:
-    """Return a number of JSON, where null stands for one that is not finite."""
+    """Return a number of JSON; null means not finite."""
     return float("nan") if value is None else float(value)
 
 

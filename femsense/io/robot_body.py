@@ -41,7 +41,7 @@ SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
 FAR_CABLE = 0.25
 """A cable point farther outside than this times the mesh's diagonal is an error."""
 FAR_MARKER = 1.0
-"""The same for a marker, which may stand on a stalk."""
+"""The same for a marker, which may be on a stalk."""
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
 INSIDE = 2
@@ -296,7 +296,7 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
 
 
 def _check_gravity(table: RobotTable, path: Path) -> None:
-    """Warn of gravity in another unit. Raises InputError where it is that of no place."""
+    """Warn of gravity in another unit. Raises InputError for an impossible gravity."""
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:
         raise InputError(
             "more than ten times gravity",

@@ -1,4 +1,4 @@
-"""The tables of robot.toml, and what is wrong with them before the mesh is read."""
+"""The tables of robot.toml, and their checks before the mesh is read."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ POINT = "three numbers in metres [x, y, z]"
 
 
 class MeshTable(Schema):
-    file: Annotated[str, Field(min_length=1, description="the mesh file beside robot.toml")]
+    file: Annotated[str, Field(min_length=1, description="the mesh file next to robot.toml")]
     unit: LengthUnit = Field(description='unit = "m", "cm" or "mm": the unit of the coordinates in the mesh file')
     element: Literal["tet4", "tet10"] = Field(description='element = "tet4" or "tet10"')
     T_robot_mesh: Matrix | None = Field(None, description="4 rows of 4 numbers: a rotation and a translation in metres")
 
 
 class MaterialTable(Schema):
-    name: str | None = Field(None, description="a silicone of femsense.materials; what the other keys say goes before it")
+    name: str | None = Field(None, description="a silicone of femsense.io.materials; other keys override its values")
     young_modulus_pa: float = Field(gt=0, description="Young's modulus in pascal, > 0, such as 150e3 for soft silicone")
     poisson_ratio: float = Field(gt=-1, lt=0.5, description="Poisson's ratio, −1 < ν < 0.5, such as 0.45 or 0.49 for silicone")
     density_kg_m3: float = Field(gt=0, description="density in kg/m³, > 0, such as 1070 for silicone")
@@ -40,7 +40,7 @@ class MaterialTable(Schema):
     @model_validator(mode="before")
     @classmethod
     def _named(cls, table: Any) -> Any:
-        """Take what a named silicone says for the keys that the table leaves out."""
+        """Fill the missing keys of the table with the values of a named silicone."""
         if not isinstance(table, dict) or not isinstance(table.get("name"), str):
             return table
         try:
@@ -106,7 +106,7 @@ class AppearanceTable(Schema):
 
 
 class CorrectionTable(Schema):
-    file: Annotated[str, Field(min_length=1, description="the file of the correction beside robot.toml")]
+    file: Annotated[str, Field(min_length=1, description="the file of the correction next to robot.toml")]
 
 
 class RobotTable(Schema):

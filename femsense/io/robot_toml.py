@@ -1,4 +1,4 @@
-"""robot.toml ↔ Robot: the declared robot, checked with errors that say what is wrong where."""
+"""robot.toml ↔ Robot: the declared robot, with checks whose errors name file and key."""
 
 from __future__ import annotations
 
@@ -32,14 +32,19 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
     """Load a robot.
 
     Arguments:
-        path_or_name: a folder with robot.toml, that file, or a NAME of the project's `meshes/`.
-        effects: apply the `[[effects]]` that the file lists; False gives the plain model.
+        path_or_name: a folder with robot.toml, that file, or the name of a robot of the package (`robot_names`).
+        effects: apply the `[[effects]]` of the file; False gives the plain model.
 
     Returns:
-        the robot; its mesh in metres in the robot frame.
+        the robot, with its mesh in metres in the robot frame.
 
     Raises:
-        InputError: with file, key, what was found and what was expected.
+        InputError: with file, key, found and expected value.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> robot.name, robot.body.cable_names
+        ('finger', ('flexor',))
     """
     path = find_robot(path_or_name)
     document = read_toml(path)
@@ -63,7 +68,7 @@ def find_robot(path_or_name: str | Path) -> Path:
         if str(path_or_name) in known and known[str(path_or_name)].resolve() != path.resolve():
             warnings.warn(
                 (
-                    f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name that comes along is "
+                    f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name in the package is "
                     f"{known[str(path_or_name)]}"
                 ),
                 stacklevel=3,
@@ -72,7 +77,7 @@ def find_robot(path_or_name: str | Path) -> Path:
     if str(path_or_name) in known:
         if path.exists():
             warnings.warn(
-                f"{path_or_name}: the robot that comes along is used; the folder {path.absolute()} has no robot.toml",
+                f"{path_or_name}: the robot of the package is used; the folder {path.absolute()} has no robot.toml",
                 stacklevel=3,
             )
         return known[str(path_or_name)] / "robot.toml"
@@ -122,18 +127,18 @@ def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Ro
 def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write robot.toml and a copy of the mesh file, so that the folder loads back to the same robot.
 
-    A robot that was loaded is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
+    A loaded robot is written as it was declared; changes made in Python since then must be given as `effects`. Its correction is written too.
 
     Arguments:
         robot: the robot.
-        folder: made where it is missing; its other files stay.
+        folder: created if missing; its other files are kept.
         effects: the `[[effects]]` to write; by default those that the robot declares.
 
     Returns:
         the path of robot.toml.
 
     Raises:
-        InputError: where the robot was made in Python and holds what robot.toml cannot say without effects.
+        InputError: the robot was made in Python and has properties that robot.toml can only express by effects.
     """
     target = Path(folder)
     document = robot_document(robot, effects=effects)

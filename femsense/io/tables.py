@@ -1,4 +1,4 @@
-"""Reading TOML and CSV with errors that say file, place, what was found and what was expected."""
+"""Reading of TOML and CSV; errors name file, place, found and expected value."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def at_key(path: Path, *location: int | str) -> str:
 
 
 def doubles(values: Sequence[object], what: str, path: Path, kind: str, key: str) -> Iterator[InputError]:
-    """Yield a problem for each value that a table before has too; None is no value.
+    """Yield a problem for each value that repeats one of an earlier table; None is ignored.
 
     Arguments:
         values: of one key of each of the tables `kind` of the file at `path`.
@@ -63,7 +63,7 @@ def doubles(values: Sequence[object], what: str, path: Path, kind: str, key: str
     for i, value in enumerate(values):
         if value is not None and value in values[:i]:
             yield InputError(
-                f"a {what} stands twice",
+                f"a {what} occurs twice",
                 where=at_key(path, kind, i, key),
                 found=repr(value),
                 expected=f"each {what} once",
@@ -164,7 +164,7 @@ def read_text(path: Path) -> str:
 
 
 def _known_binary(path: Path) -> str | None:
-    """Return what a file is that begins as no text does."""
+    """Return the kind of a binary file by its first bytes."""
     with path.open("rb") as stream:
         head = stream.read(16)
     starts = {
@@ -191,7 +191,7 @@ def validated(schema: type[T], document: Any, path: Path) -> T:
 
 
 def schema_problems(schema: type[Any], document: Any, path: Path) -> list[InputError]:
-    """Return what is wrong with a document, unknown keys first (a misspelt key also shows as a missing one)."""
+    """Return the problems of a document, unknown keys first (a misspelt key is also reported as a missing one)."""
     try:
         TypeAdapter(schema).validate_python(document)
     except ValidationError as error:
@@ -232,7 +232,7 @@ def _keys_at(schema: type[Any], location: Sequence[int | str]) -> Iterable[str]:
 
 
 def _description_at(schema: type[Any], location: Sequence[int | str]) -> str | None:
-    """Return what the schema says of the innermost described key of a place."""
+    """Return the schema's description of the innermost described key of a place."""
     description: str | None = None
     for i, part in enumerate(location):
         table = _annotation_at(schema, location[:i])
@@ -282,7 +282,7 @@ class Table:
         return len(self.cells)
 
     def place(self, row: int, column: str | None = None) -> str:
-        """Return where a cell stands, for messages."""
+        """Return the position of a cell, for messages."""
         return f"{self.path}, line {self.lines[row]}" + (f", column {column}" if column else "")
 
     def without(self, rows: BoolArray) -> Table:
@@ -399,7 +399,7 @@ def _check_header(
                 "unknown column", where=where, found=short(column), expected=", ".join(names), hint=did_you_mean(column, known)
             )
         if column in columns[:i]:
-            raise InputError("a column stands twice", where=where, found=column, expected="each column once")
+            raise InputError("a column occurs twice", where=where, found=column, expected="each column once")
     missing = [column for column in required if column not in columns]
     if missing:
         raise InputError("columns are missing", where=where, found=", ".join(columns), expected=", ".join(missing))

@@ -76,11 +76,11 @@ class Notation:
 
 
 def notation_of(cells: Iterable[str], *, default: str = ".") -> Notation:
-    """Return how some cells write numbers: a comma or point that cannot stand between thousands is a decimal one.
+    """Return the number notation of some cells: a comma or point that cannot separate thousands is a decimal mark.
 
     Arguments:
         cells: of a table's first lines.
-        default: the decimal mark where none of them tells it.
+        default: the decimal mark if the cells do not determine it.
     """
     votes, grouped, cells = {".": 0, ",": 0}, False, [cell.strip() for cell in cells]
     for cell in cells:
@@ -131,7 +131,7 @@ def plain_number(cell: str) -> float | None:
 
 
 def number_in(cell: str) -> float | None:
-    """Return the number in a cell; of a date and time the seconds since 1970 (UTC where no zone is named), of a time of day
+    """Return the number in a cell; of a date and time the seconds since 1970 (UTC without a time zone), of a time of day
     the seconds since midnight; None for all else."""
     number = plain_number(cell)
     if number is not None:
@@ -141,9 +141,9 @@ def number_in(cell: str) -> float | None:
 
 
 def moment_in(cell: str) -> float | None:
-    """Return the seconds of a date and time since 1970 (UTC where no zone is named), or of a time of day since midnight; else None.
+    """Return the seconds of a date and time since 1970 (UTC without a time zone), or of a time of day since midnight; else None.
 
-    Of 01/02/2024 the day stands first, unless that is no date; tables decide it for all their rows (`month_stands_first`).
+    In 01/02/2024 the day comes first, unless that is not a valid date; tables decide it for all their rows (`month_stands_first`).
     """
     text = cell.strip()
     if DAY.fullmatch(text):

@@ -27,7 +27,7 @@ LOOK_S = 1.0
 MOST_IDLE_DEATHS = 3
 """Number of deaths in a row, for each job at hand, of workers that had not begun: beyond it, workers cannot start at all."""
 LOG_LINES = 3
-"""Last lines of the log of a job that stand in the reason of a crash."""
+"""Number of last lines of a job's log in the reason of a crash."""
 OOM_SIGNAL = -9
 Work = Callable[[Job], Outcome]
 

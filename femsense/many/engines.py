@@ -1,6 +1,6 @@
 """Engines that run jobs. Each has the shape of `concurrent.futures.Executor`: in process, processes (pebble), or dask.
 
-`ENGINES` is their registry; `open_engine` opens the one that is asked for.
+`ENGINES` is their registry; `open_engine` opens one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Death:
     """A worker that died while it had a job."""
 
     exit_code: int | None
-    """Negative: the signal. None where nobody knows."""
+    """Negative: the signal. None if unknown."""
     count: int = 1
     """How many workers died before this was reported."""
 
@@ -81,8 +81,8 @@ class Engine(Protocol):
 def spread(engine: Engine, function: Callable[..., T], tasks: Iterable[tuple[Any, ...]]) -> Iterator[T]:
     """Yield function(*task) of each task, in order; an engine gets a few tasks ahead.
 
-    A task that loses its worker is run once more. Raises DataError where it loses that one, too, or where the scheduler is gone, and what the
-    function raises.
+    A task that loses its worker is run once more. Raises DataError if it loses that one too, or if the scheduler is gone, and the
+    exceptions of the function.
     """
     waiting, left = deque[tuple[tuple[Any, ...], Future[T]]](), iter(tasks)
 
@@ -157,9 +157,8 @@ class Processes:
 def processes(workers: int, memory: int | None = None) -> Iterator[Processes]:
     """Open a pool; each process may take `memory` [bytes].
 
-    Processes are spawned, since a fork would copy threads and locks of libraries in whatever state they are.
-
-    When the block ends by an error, such as Ctrl-C, what still runs is ended.
+    Processes are spawned, because a fork would copy the threads and locks of libraries in an arbitrary state. If the block ends by an
+    error, such as Ctrl-C, running processes are terminated.
     """
     from pebble import ProcessPool
 

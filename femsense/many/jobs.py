@@ -84,11 +84,11 @@ def parts_of(folder: Path) -> list[Path]:
 def names_of(paths: Sequence[Path]) -> list[str]:
     """Return one name for each path: its last part without an ending; where two are alike, with the folders above it.
 
-    Raises InputError where a path stands twice.
+    Raises InputError where a path occurs twice.
     """
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
-        raise InputError("the same path stands twice", where=twice[0], expected="each path once")
+        raise InputError("the same path occurs twice", where=twice[0], expected="each path once")
     parts = [(*path.parts[1:-1], path.name if path.is_dir() else path.stem) for path in paths]
     depth = 1
     names = [own[-1] for own in parts]

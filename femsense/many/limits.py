@@ -21,7 +21,7 @@ ONE_THREAD = {
         "FEMSENSE_WORKERS",
     )
 }
-"""Environment of a worker. Libraries read it when they are loaded, so that it has to stand before the process starts."""
+"""Environment of a worker. Libraries read it when they are loaded, so it must be set before the process starts."""
 SHARE = 0.9
 """Share of the machine's memory that all its workers together may take."""
 _OOM_COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")

@@ -58,7 +58,9 @@ def check_no_result(folder: Path) -> None:
     """Raise InputError where a folder holds one result: those of many would be mixed with it."""
     found = next((name for name in RESULTS if (folder / name).exists()), None)
     if found is not None:
-        raise InputError("a single result stands where those of many would", where=folder, found=found, hint="another -o")
+        raise InputError(
+            "the folder contains a single result, not those of several jobs", where=folder, found=found, hint="another -o"
+        )
 
 
 def write_summary(folder: Path, command: str, outcomes: Sequence[Outcome], folders: Mapping[str, Path]) -> None:

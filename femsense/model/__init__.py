@@ -1,1 +1,1 @@
-"""The robot, its recording, its effects, and what cameras see of them."""
+"""The robot, its recording, its effects, and their observation by cameras."""

@@ -23,7 +23,7 @@ def evaluate_robot(
 
     Arguments:
         robot: the robot.
-        scene: what was measured.
+        scene: the measurements.
         poses: `T_robot_camera` of each camera [m], shape (4, 4).
         initial: unknown initial inputs of the actuators; None if the recorded inputs are absolute.
         starts: states of nearby evaluations, used as warm starts and updated.

@@ -49,8 +49,8 @@ def _doubts_of_ratio(body: BodyModel) -> list[str]:
     if ratio <= RANGES.poisson_ratio:
         return []
     return [
-        f"material.poisson_ratio: {ratio:.7g} makes the equations nearly singular, and solves may fail; 0.49 and 0.4999 move a body of "
-        "rubber alike to a few per cent"
+        f"material.poisson_ratio: {ratio:.7g} makes the equations nearly singular, and solves may fail; 0.49 and 0.4999 differ by "
+        "a few per cent for a body of rubber"
     ]
 
 

@@ -22,7 +22,7 @@ def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
 
 
 def redo_depth(points: FloatArray, seen: Observation) -> FloatArray:
-    """Return what the camera measures of true camera points [m]; the inverse of `undo_depth` (corrections by fixed point)."""
+    """Return the measured camera points of true ones [m]; the inverse of `undo_depth` (corrections by fixed point)."""
     if seen.depth_scale == 1.0 and seen.depth_offset == 0.0 and not seen.corrections:
         return points
     for correct in reversed(seen.corrections):

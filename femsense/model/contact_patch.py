@@ -139,7 +139,7 @@ def closest_surface_point(
 
 
 def _faces(triangles: IntArray, *, quadratic: bool) -> IntArray:
-    """Return the faces that triangles of the boundary stand for (see `surface_triangles`), shape (f, 3) or (f, 6)."""
+    """Return the faces that triangles of the boundary represent (see `surface_triangles`), shape (f, 3) or (f, 6)."""
     if not quadratic:
         return triangles
     first, second, third = triangles[0::4], triangles[1::4], triangles[2::4]

@@ -74,7 +74,7 @@ def inputs_wanted(robot: Robot, recording: Recording, initial: FloatArray | None
 
 
 def creep_response(robot: Robot, recording: Recording) -> FloatArray:
-    """Return what drives the robot in each frame by what is wanted in each, shape (F, F)."""
+    """Return the matrix from commanded to effective inputs of all frames, shape (F, F)."""
     return _creep(np.eye(len(recording.time_s)), recording.time_s, robot.creep)
 
 

@@ -26,8 +26,8 @@ FINER_STEPS = 8
 
 
 LAST_STEP = 0.2
-"""Newton steps end when the last one was at most this share of the total displacement. The residual force is no criterion: a compliant
-motion can be far from equilibrium and leave little force."""
+"""Newton steps end when the last one was at most this share of the total displacement. The residual force is not a criterion, because it
+is small for a compliant motion far from equilibrium."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ EARLY = 3e-2
 
 
 def share_on_finer(body: BodyModel) -> None:
-    """Compute what the steps of all states on a finer mesh share, independent of the material; cached with the body's free map."""
+    """Compute the data common to the steps of all states on a finer mesh, independent of the material; cached with the body's free map."""
     prepare_roughly(body.free_map.pattern)
     rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
@@ -73,15 +73,13 @@ def finer_state(
 ) -> FloatArray | None:
     """Return the equilibrium on a finer mesh [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
-    The finer mesh holds the coarse state exactly, but what it softens are single elements,
-    so that two to four steps are needed, with elements that turn along each of them. None where the steps do not settle, or run
-    away: far off, forces look small again.
+    The finer mesh represents the coarse state exactly, but its refinement softens single elements, so that two to four steps with rotated
+    elements are needed. None if the steps do not converge or diverge: forces are small again far away.
 
-    Tried on the bar of `benchmarks/improve.py`, without use:
-    a preconditioner kept from the first step of a state takes as much time in further iterations as it saves, one of another
-    state takes several times as long, and `FinerOptions.enough` = 0.02 moves the error by a sixth. To begin where the finer mesh
-    lay beside another model saves a step of three, but elements that do not fit there may fold: the state was then missing, and
-    the error of the mesh a third too small in that frame.
+    Rejected on the bar of `benchmarks/improve.py`: a preconditioner kept from the first step of a state costs as much in further
+    iterations as it saves, one of another state several times as much, and `FinerOptions.enough` = 0.02 changes the error by a sixth.
+    Starting from the finer state of another model saves one step of three, but elements may invert there: the state was then missing, and
+    the mesh error of that frame a third too small.
 
     Arguments:
         driven: the coarse robot and its drive.
@@ -89,7 +87,7 @@ def finer_state(
         frame: index of the frame.
         base: the coarse state of that frame.
         ties: of the fine nodes to the coarse mesh.
-        options: how far the steps go.
+        options: stopping criteria.
     """
     how = options or FinerOptions()
     for pace in how.paces:
@@ -161,8 +159,7 @@ def stable(pattern: Pattern, values: FloatArray, *, tolerance: float, pays_from:
 
 
 def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
-    """Return a state with the tensions of its held cables that balance best at x,
-    what they leave of the nodal forces there [N], (n, 3), and its size [N]."""
+    """Return a state with the least-squares tensions of its held cables at x, the remaining nodal forces [N], (n, 3), and their norm [N]."""
     body, dofs = fine.robot.body, fine.robot.body.free_map.dofs
     force = balance.whole(fine, rubbed(fine, balance.frame, at, x), x)
     rest, held = force.ravel()[dofs], np.flatnonzero(at.held[: len(body.cables)])
@@ -178,7 +175,7 @@ def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray
 
 
 def _missing(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray) -> FloatArray:
-    """Return the shortening that each cable lacks at x [m], (a,): what is wanted less what it has and what it stretches by."""
+    """Return the missing shortening of each cable at x [m], (a,): prescribed minus actual shortening and stretch."""
     body = fine.robot.body
     stretch = np.array([at.tension[c.name] / c.stretch_stiffness for c in body.cables])
     return np.asarray(fine.drive.inputs[frame] - stretch - shortening(body, x))

@@ -1,6 +1,6 @@
-"""An empirical correction: how far markers are from the model, as a smooth function of the inputs. It is never a cause.
+"""An empirical correction of the difference between markers and model, as a smooth function of the inputs. It has no physical meaning.
 
-`femsense improve --correct` learns it (`loop/fit/correction.py`), `calibrate`, `estimate` and `reach` use it where they are asked to.
+`femsense improve --correct` fits it (`loop/fit/correction.py`); `calibrate`, `estimate` and `reach` apply it with `--correct`.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ class Correction:
         return int(self.basis.shape[1])
 
     def shifts(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return by how much markers are beyond the model, robot frame [m], shape (f, m, 3), for recorded inputs, shape (f, a); and one standard deviation
-        along each axis [m], shape (f,)."""
+        """Return measured minus modelled markers, robot frame [m], shape (f, m, 3), for recorded inputs, shape (f, a); and one standard
+        deviation along each axis [m], shape (f,)."""
         terms = kernel_of(self.kernel, self.length, inputs / self.ranges, self.states) @ self.basis
         variance = np.einsum("fq,qr,fr->f", terms, self.covariance, terms)
         return np.einsum("fq,qmc->fmc", terms, self.weights), np.sqrt(np.maximum(variance, 0.0))
 
     def of_rows(self, recording: Recording) -> tuple[FloatArray, FloatArray]:
-        """Return what it says of each marker observation of a recording, robot frame [m], shape (K, 3), and its standard deviation [m], shape (K,);
-        zero for markers that it does not know.
+        """Return the correction of each marker observation of a recording, robot frame [m], shape (K, 3), and its standard deviation [m],
+        shape (K,); zero for unknown markers.
 
         Raises:
             InputError: a recording that is driven otherwise.

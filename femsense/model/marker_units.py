@@ -20,7 +20,7 @@ SMALLEST, LARGEST = 0.02, 2.0
 FARTHEST = 10.0
 """Markers that span more [m] are no robot's: depth cameras see less far."""
 FEWEST = 3
-"""Fewer markers in a frame tell nothing of their distances."""
+"""Least number of markers in a frame."""
 
 
 def unit_hint(scale: float) -> str:
@@ -37,7 +37,7 @@ def check_marker_distances(robot: Robot, recording: Recording) -> None:
         recording: its markers' names are the robot's.
 
     Raises:
-        DataError: says how many times they are too large, and the unit that this hints at.
+        DataError: states the factor by which they are too large, and the likely unit.
     """
     r, number = recording, {name: i for i, name in enumerate(robot.marker_names)}
     rest = np.array([robot.marker_points[number[name]] for name in r.marker_names]).reshape(-1, 3)
@@ -51,7 +51,7 @@ def check_marker_distances(robot: Robot, recording: Recording) -> None:
 
 
 def check_marker_sizes(measured: Sequence[FloatArray] | FloatArray, known: Sequence[FloatArray] | FloatArray) -> None:
-    """Refuse markers [m], n times (k, 3), that are far from as large as those that a model makes of the same rows, n times (m, 3).
+    """Refuse markers [m], n arrays (k, 3), whose size differs much from that of the modelled markers of the same rows, n arrays (m, 3).
 
     Raises DataError, as `check_marker_distances`.
     """

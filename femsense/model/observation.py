@@ -150,7 +150,7 @@ def with_rest_markers(robot: Robot, scene: Scene) -> Scene:
 
 
 def placements(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
-    """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
+    """Return the marker positions at rest [m], shape (m, 3): measured in rest.csv, or as declared."""
     places = robot.marker_points.copy()
     if len(scene.rest_marker):
         places[scene.rest_marker] = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
@@ -163,8 +163,7 @@ def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
 
 
 def _tied_alike(robot: Robot, other: Robot) -> bool:
-    """Return whether the markers of two robots are tied to the same nodes in the same way,
-    as far as declared places and cameras say."""
+    """Return whether the markers of two robots are embedded equally, by their declared positions and cameras."""
     same_placements = robot.marker_points is other.marker_points and robot.observation == other.observation
     return same_placements and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
 
@@ -172,9 +171,8 @@ def _tied_alike(robot: Robot, other: Robot) -> bool:
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
     """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
 
-    They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it,
-    noise and all, and a fit would take that for a better model. Of crossings of a measured surface:
-    how far it lies outside of the model's points, along its normal, shape (k, 1).
+    They are compared in measured coordinates: correcting the measurements by a depth scale would shrink their noise too, which looks like
+    a better model. For intersections with a measured surface: its distance outside of the model's points along its normal, shape (k, 1).
     """
     frames, number = np.unique(scene.frame, return_inverse=True)
     each_frame = [model[k] for k in frames.tolist()]
@@ -187,7 +185,7 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
 
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
-    """Return how far the measured placements lie from the declared places [m], shape (r, 3)."""
+    """Return measured minus declared marker placements [m], shape (r, 3)."""
     return (placements(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
 
 
@@ -212,8 +210,7 @@ class SceneJet:
     states: dict[int, Equilibrium]
     """The equilibrium of each frame."""
     by_input: FloatArray
-    """d residual / d tension that pulls in its own frame, cut off at 0 or not, shape (k, c, a); (k, c,
-    0) where it was not asked."""
+    """d residual / d tension of the same frame, truncated at 0 or not, shape (k, c, a); (k, c, 0) if not requested."""
     pulled: BoolArray
     """Whether the derivatives count the tension of a frame as not cut off, shape (F, a)."""
 
@@ -248,12 +245,12 @@ def evaluate_scene(
 ) -> SceneJet:
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
-    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a
-    first move. `starts` holds states of earlier evaluations near by and is brought up to date; where the `solver` is rough,
-    a frame that Newton does not reach from there has no equilibrium. `known` are the states at this very point, as
-    far as it moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at
-    this very point serve derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the
-    tension of each frame (where the robot has a past, by that of all frames).
+    Each pose is moved about `pivot` by its six `moves`, shape (6 v,), and derivatives are with respect to these; without them, to a first
+    move. `starts` contains states of nearby evaluations and is updated; with a rough `solver`, a frame that Newton does not reach from
+    there has no equilibrium. `known` are the states at this point of parameter space; they are used if no derivative with respect to
+    parameters of the body is requested. `answers`, responses of an earlier evaluation at this point, are used for derivatives with
+    respect to other parameters, and updated. `vary_inputs` adds derivatives with respect to the tension of each frame (of all frames, for
+    a robot with history).
 
     Raises:
         DataError: a frame has no equilibrium.

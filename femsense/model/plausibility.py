@@ -193,8 +193,8 @@ def _is_absolute(pressure: FloatArray) -> bool:
 def _absolute(where: str, name: str, least: float, unit: str) -> str:
     other = "" if unit == "Pa" else f", and in {unit}"
     return (
-        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute{other}? Chambers take what is above "
-        f"the surroundings: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*{unit}_abs does)"
+        f"{where}: the pressure of chamber {name!r} never falls below {least:.6g} Pa: is it absolute{other}? Chambers take gauge "
+        f"pressures: subtract {ATMOSPHERE_PA:.0f} Pa (import --map NAME=chamber_{name}*{unit}_abs does)"
     )
 
 
@@ -308,7 +308,7 @@ def doubts_of_cloud_places(points: FloatArray, where: str) -> list[str]:
 
 
 def unit_question(distance: float) -> str:
-    """Return, as a question, what a distance that is too short would be [m] in other units."""
+    """Return a question with the values of a too short distance [m] in other units."""
     return (
         f"are they in metres? Ten times larger they would be {10 * distance:.3g} m away, a hundred times {100 * distance:.3g} m"
     )
@@ -387,7 +387,7 @@ def doubts_of_poses(robot: Robot, recording: Recording) -> list[str]:
 
 
 def _camera_in_body(robot: Robot, recording: Recording, T: FloatArray | None) -> list[str]:
-    """Return whether a camera stands within the body."""
+    """Return whether a camera is within the body."""
     if T is None or embed_points(robot.body.mesh, T[None, :3, 3]).outside[0] > 0.0:
         return []
     where = place_of(recording, "recording.toml", "T_robot_camera")
@@ -422,7 +422,7 @@ def warn_of(doubts: Iterable[str], *, stacklevel: int = 3) -> None:
 
 
 def place_of(recording: Recording, file: str, argument: str) -> str:
-    """Return where a part of a recording stands: in a file of its folder, or, made of arrays, in an argument of `from_arrays`."""
+    """Return the location of a part of a recording: a file of its folder, or an argument of `from_arrays`."""
     return str(recording.folder / file) if recording.folder else f"Recording.from_arrays, {argument}"
 
 

@@ -156,7 +156,9 @@ def _base_states(
         return _counted(solve, driven, k, start, options)
 
     if near:
-        with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not converge: then from rest
+        with contextlib.suppress(
+            *(() if fits else (DataError,))
+        ):  # from the previous state a body may not converge: then from rest
             states = list(_solve_with_history(driven, frames, near, again, rough) if past else each(again, frames))
             yield from (keep(k, state) for k, state in zip(frames, states))
             return

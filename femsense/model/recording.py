@@ -177,6 +177,11 @@ def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
     Arguments:
         recording: the recording.
         which: a mask, shape (F,), or indices 0 … F − 1.
+
+    Example:
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> fs.select_frames(recording, range(36, 40)).frame_count
+        4
     """
     mask = np.asarray(which)
     kept = np.flatnonzero(mask) if mask.dtype == np.bool_ else np.unique(mask.astype(np.int64))
@@ -364,7 +369,7 @@ def _check_parts(recording: Recording) -> None:
         times = f"{r.time_s[k : k + 2].tolist()} s from position {k} on"
         raise InputError("time does not increase", where="time_s", found=times, expected="finite, in order of time")
     if len(np.unique(r.frame_numbers)) != F:
-        raise InputError("a frame stands twice", where="frame_numbers", expected="each frame once")
+        raise InputError("a frame occurs twice", where="frame_numbers", expected="each frame once")
     lengths = {
         "sweep": (F if r.sweep is None else len(r.sweep), F),
         "cloud_files": (len(r.cloud_files), F),

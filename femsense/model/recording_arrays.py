@@ -36,6 +36,13 @@ def recording_from_arrays(
 
     Raises:
         InputError: no frame, shapes that do not fit, times that do not increase, values that are not finite.
+
+    Example:
+        >>> recording = fs.recording_from_arrays(
+        ...     [0.0, 0.1], inputs={"flexor": [0.0, 0.5]}, actuation="tension", markers={"tip": np.zeros((2, 3))}
+        ... )
+        >>> recording.frame_count
+        2
     """
     times = as_numbers(time_s, "time_s", expected="the time of each frame [s]").reshape(-1)
     frames = times.size

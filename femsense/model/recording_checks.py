@@ -80,16 +80,21 @@ def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[st
         lacking = [name for name in wanted if name not in given]
         extra = [name for name in given if name not in wanted]
         parts = [f"lacks {', '.join(lacking)}"] if lacking else []
-        parts += [f"has {', '.join(extra)} that the robot has not"] if extra else []
+        parts += [f"has {', '.join(extra)}, which the robot lacks"] if extra else []
         idle = "a cable that was slack" if kind == "cable" else "a chamber without pressure"
         column = f"{kind}_" if recording.folder else ""
+        renamed = (
+            f"rename the column of frames.csv, or import again with --map {extra[0]}={kind}_{(lacking or ['NAME'])[0]}"
+            if extra and recording.folder
+            else None
+        )
         logged = "; inputs that another program logged: femsense import --actuation LOG.csv" if recording.folder else ""
         raise InputError(
             f"other {kind}s than those of the robot {robot.name!r}: the recording {' and '.join(parts)}",
             where=place_of(recording, "frames.csv", "inputs" if kind == "cable" else "pressures"),
             found=", ".join(column + name for name in given) or f"no {kind}s",
             expected=", ".join(column + name for name in wanted) or f"no {kind}s",
-            hint=did_you_mean(extra[0], wanted) if extra else f"{idle} has zeros in all frames{logged}",
+            hint=(did_you_mean(extra[0], wanted) or renamed) if extra else f"{idle} has zeros in all frames{logged}",
         )
     return [given.index(name) for name in wanted]
 

@@ -68,7 +68,7 @@ class MarkerLook:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Robot:
-    """A robot: a body with markers, features and the effects that its model holds."""
+    """A robot: a finite-element body with cables and chambers, markers, candidate contact points, and the effects of its model."""
 
     name: str
     body: BodyModel

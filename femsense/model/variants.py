@@ -89,7 +89,7 @@ class Variants:
             self._write_alone(i)
         if not self.plain and not self.rubbing:
             return
-        if self.rubbing:  # twice: the second time with the bends as the first response leaves them
+        if self.rubbing:  # twice: the second pass uses the bend angles after the first response
             bends = {(i, k): self._bends(i, self.bases[k].positions) for i in self.rubbing for k in self.bases}
             self._rub(bends)
             for k, factor, found in each(self._bent, self._groups(self.bases)):

@@ -61,7 +61,7 @@ def _spread(c: Calibration) -> tuple[list[Any], list[Any]]:
 
 def _input(values: dict[str, float], std: dict[str, float | None], name: str, unit: str) -> str:
     text = words.with_std(values.get(name), std.get(name), unit)
-    return f"{text} (the data say nothing of it)" if name in std and std[name] is None and text != words.NOTHING else text
+    return f"{text} (not determined by the data)" if name in std and std[name] is None and text != words.NOTHING else text
 
 
 def _history_panel(c: Calibration) -> Markup | None:

@@ -149,7 +149,7 @@ def _contact_rows(run: Run, facts: dict[str, Any]) -> list[list[str]]:
 def _strongest_rows(contact: ContactForce | None) -> list[list[str]]:
     if contact is None:
         return []
-    size = f"{contact.force_n:.3f} ± {contact.std_n:.3f} N in frame {contact.frame}"
+    size = f"{contact.force_n:.3f} ± {contact.std_n:.3f} N (1 σ) in frame {contact.frame}"
     rows = [["largest force", f"{size}, at {_millimetres(contact.position_m)}"]]
     return rows + ([["of it", part]] if (part := known_part(contact)) else [])
 
@@ -185,7 +185,7 @@ def _millimetres(point: Any) -> str:
 
 def _std(value: float | None, scale: float, unit: str) -> str:
     if value is None:
-        return " (the data say nothing of it)"
+        return " (not determined by the data)"
     return f" ± {scale * value:.2g} {unit}" if value > 0 else ""
 
 

@@ -12,7 +12,7 @@ NOTHING = "–"
 VERDICTS = {
     FOUND: "the data name what the model lacks",
     NONE: "the model explains the data to their noise",
-    UNEXPLAINED: "a residual is left that no effect explains",
+    UNEXPLAINED: "a residual remains that no effect explains",
 }
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), "1": (1.0, "")}

@@ -40,7 +40,7 @@ def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
     target = root / "report.html" if path is None else Path(path).expanduser()
     if target.is_dir():
         raise InputError(
-            "a folder stands where the file should be written",
+            "a folder exists where the file should be written",
             where=target,
             expected="the name of a file",
             hint=str(target / "report.html"),

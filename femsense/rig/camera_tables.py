@@ -143,7 +143,7 @@ class ViewTable(Schema):
     def _one_pose(self) -> ViewTable:
         looks = self.eye_m is not None and self.target_m is not None
         if looks == (self.T_robot_camera is not None):
-            raise ValueError("a camera stands either by eye_m and target_m or by T_robot_camera")
+            raise ValueError("the pose of a camera is given either by eye_m and target_m or by T_robot_camera")
         return self
 
     @model_validator(mode="after")

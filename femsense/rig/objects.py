@@ -171,7 +171,7 @@ def _solid(part: tuple[str, FloatArray, float]) -> Any:
 def _mesh(file: Path, unit: str) -> Surface:
     """Return a mesh with its lowest point at the origin."""
     if not file.is_file():
-        raise InputError("no such mesh", where=f"objects: {file}", expected="a closed surface beside the script")
+        raise InputError("no such mesh", where=f"objects: {file}", expected="a closed surface next to the script")
     points, triangles = read_surface(file)
     points = points / PER_METRE[unit]
     return freeze(points - points[points[:, 2].argmin()]), freeze(triangles, np.int64)

@@ -95,8 +95,8 @@ def _warn_of_floor(script: ScriptTable, robot: Robot, positions: FloatArray, whe
     depth = 0.0 if height is None else _below(robot, positions, height)
     if depth > CUT:
         warnings.warn(
-            f"{where}: the floor cuts {robot.name}: {when} it reaches {1e3 * depth:.1f} mm below scene.floor_z_m = {height:g}, "
-            f"and the camera does not see that part; a floor below {np.floor(1e3 * positions[:, 2].min()) / 1e3:.3f} m is free of it",
+            f"{where}: the floor intersects {robot.name}: {when} the body reaches {1e3 * depth:.1f} mm below scene.floor_z_m = {height:g}, "
+            f"and the camera does not see that part. Set scene.floor_z_m below {np.floor(1e3 * positions[:, 2].min()) / 1e3:.3f}",
             stacklevel=4,
         )
 

@@ -178,7 +178,7 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
     labels = [sweep.label for sweep in script.sweeps]
     for i, label in enumerate(labels):
         if label in labels[:i]:
-            raise script_problem("a label stands twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
+            raise script_problem("a label occurs twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
     named = [("contacts", i, table.sweep) for i, table in enumerate(script.contacts)]
     named += [("loads", i, table.sweep) for i, table in enumerate(script.loads)]
     for kind, i, label in named:
@@ -196,7 +196,7 @@ def _check_objects(script: ScriptTable, where: Path) -> None:
     names = [item.name for item in script.objects]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise script_problem("a name stands twice", where, ("objects", i, "name"), repr(name), "each object its own name")
+            raise script_problem("a name occurs twice", where, ("objects", i, "name"), repr(name), "each object its own name")
     for i, table in enumerate(script.contacts):
         if table.object is not None and table.object not in names:
             hint = did_you_mean(table.object, names)

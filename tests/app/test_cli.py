@@ -163,7 +163,7 @@ def test_version(run: Any) -> None:
         (["inspect", "--nonsense", "x"], "No such option: --nonsense"),
         (["estimate", "a", "b", "-o", "c", "--at", "1,2"], "'1,2' is not a place: three numbers in metres are"),
         (["estimate", "a", "b", "-o", "c", "--at", "x,y,z"], "'x,y,z' is not a place"),
-        (["estimate", "a", "b", "-o", "c", "--push"], "--push is of the places of --at, and none is given"),
+        (["estimate", "a", "b", "-o", "c", "--push"], "--push applies to the points of --at, and none is given"),
         (["view", "x", "--port", "-1"], "'--port': Input should be greater than or equal to 0"),
     ],
 )
@@ -259,11 +259,11 @@ def test_warnings_of_libraries_that_mean_nothing_to_users_are_not_shown(run: Any
             "robot.toml: wrong unit\n  found:    inch",
         ),
         (DataError("too few markers"), 1, "femsense: too few markers\n"),
-        (ImportError("libGL.so.1: cannot open shared object file", name="open3d"), 2, "femsense doctor says what is missing"),
+        (ImportError("libGL.so.1: cannot open shared object file", name="open3d"), 2, "femsense doctor lists what is missing"),
         (PermissionError(13, "Permission denied", "/place"), 2, "femsense: /place: Permission denied\n"),
         (RuntimeError("two\nlines"), 2, "internal error: RuntimeError: two lines; the details are in "),
         (KeyError("x"), 2, "internal error: KeyError: 'x'"),
-        (KeyboardInterrupt(), 130, "femsense: stopped; nothing half-written is left, and the same command goes on\n"),
+        (KeyboardInterrupt(), 130, "femsense: stopped without half-written files; the same command continues\n"),
     ],
 )
 def test_every_error_is_a_message_and_an_exit_status(
@@ -369,12 +369,12 @@ def test_a_second_run_computes_nothing(run: Any, robot: Path, recording: Path, t
     first = run(*arguments)
     before = (tmp_path / "run" / "run.json").read_bytes()
     again = run(*arguments)
-    assert "holds this result already" in again.err and again.out == first.out and again.status == 0
+    assert "contains this result already" in again.err and again.out == first.out and again.status == 0
     assert (tmp_path / "run" / "run.json").read_bytes() == before
-    assert "holds this result already" not in run(*arguments, "--again").err
+    assert "contains this result already" not in run(*arguments, "--again").err
     assert (tmp_path / "run" / "run.json").read_bytes() != before
     (tmp_path / "run" / "contacts.csv").unlink()
-    assert "holds this result already" not in run(*arguments).err and (tmp_path / "run" / "contacts.csv").is_file()
+    assert "contains this result already" not in run(*arguments).err and (tmp_path / "run" / "contacts.csv").is_file()
 
 
 def test_data_that_allow_no_result_are_status_1(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
@@ -425,7 +425,7 @@ def test_unknown_effects_are_refused_with_a_hint(run: Any, robot: Path, recordin
 
 def test_what_would_be_ignored_is_refused(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
     for options, text in (
-        (("--plan",), "recordings are not asked with --plan"),
+        (("--plan",), "--plan takes no recordings"),
         (("-o", tmp_path / "out", "--validation", recording), "a recording is fitted and judged on"),
         (("-o", tmp_path / "out", recording), "the same recording is given twice"),
         (("-o", tmp_path / "out", "--reference", recording), "the same recording is given twice"),
@@ -521,7 +521,7 @@ def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recor
         shutil.rmtree(tmp_path / "run", ignore_errors=True)
     assert caught, said
     assert process.returncode == 130
-    assert said.endswith("femsense: stopped; nothing half-written is left, and the same command goes on\n")
+    assert said.endswith("femsense: stopped without half-written files; the same command continues\n")
     assert not (tmp_path / "run").exists() and not half_written()
 
 

@@ -93,7 +93,7 @@ def test_columns_are_aligned() -> None:
 def test_texts_name_what_matters(run: Run) -> None:
     text = run_text(run)
     assert "2 of 3" in text and "2 in 2 frames" in text and "0.500 N declared, 0.490 N sensed (-2.0 %)" in text
-    assert "no result, frame 0" in text and "1.000 ± 0.100 N in frame 1" in text
+    assert "no result, frame 0" in text and "1.000 ± 0.100 N (1 σ) in frame 1" in text
     text = loop_text(saved_loop(LOOP))
     assert (
         text.startswith("verdict: effects (the cables rub)")
@@ -161,7 +161,7 @@ def test_the_closing_table_and_the_picture(run: Run, tmp_path: Path) -> None:
     for words in (
         "error of force (median)  0.25 N          –",
         "2 of 3",
-        "what it lacks in truth:\n  cable_friction  coefficient 0.2",
+        "effects of the truth:\n  cable_friction  coefficient 0.2",
         f"femsense view {tmp_path / 'run'}",
     ):
         assert words in text, text

@@ -113,7 +113,7 @@ def test_a_pipe_is_no_capture_and_a_recording_not_its_own(
     assert answer(capsys, "import", table, *words)[0] == 0
     for source in (tmp_path / "out", tmp_path / "out/markers.csv"):
         status, document = answer(capsys, "import", source, *words, "--again")
-        assert status == 2 and "would replace what it is made from" in document["error"]
+        assert status == 2 and "would replace its own " in document["error"]
 
 
 def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,7 +121,7 @@ def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys
     (tmp_path / "mine/notes.txt").write_text("precious")
     for extra in ([], ["--again"]):
         status, document = answer(capsys, "import", table, "-o", tmp_path / "mine", "--unit", "mm", "--inputs", "tension", *extra)
-        assert status == 2 and "stands there already" in document["error"]
+        assert status == 2 and "exists and is not an import" in document["error"]
     assert (tmp_path / "mine/notes.txt").read_text() == "precious"
     status, _ = answer(capsys, "import", table, "-o", table, "--unit", "mm", "--inputs", "tension")
     assert status == 2 and table.read_text() == ROWS

@@ -99,7 +99,7 @@ def test_from_scripts_to_forces_with_one_table_and_a_second_run_that_does_nothin
     said = run(
         "estimate", robot, recordings, "-c", lab / "cal", "--at", "0.1,0.015,0.015", "-o", lab / "again", *IN_PROCESS, "--json"
     )
-    assert said.status == 1 and "summary.csv of that says why" in said.json["jobs"][1]["reason"]
+    assert said.status == 1 and "summary.csv states why" in said.json["jobs"][1]["reason"]
 
 
 def test_processes_make_the_same_bytes(run: Any, lab: Path) -> None:
@@ -149,7 +149,7 @@ def test_captures_are_imported_by_a_pattern(run: Any, tmp_path: Path) -> None:
     [
         (("estimate", "robot", "recordings"), "Missing option '-o' / '--output'"),
         (("estimate", "--jobs", "recordings/*", "-o", "out"), "ROBOT: no robot"),
-        (("estimate", "robot", "recordings/a", "--jobs", "recordings/*", "-o", "out"), "--jobs says what the jobs are about"),
+        (("estimate", "robot", "recordings/a", "--jobs", "recordings/*", "-o", "out"), "--jobs declares the jobs"),
         (("estimate", "robot", "--jobs", "none*", "-o", "out"), "nothing matches this pattern"),
         (("estimate", "robot", "recordings", "-o", "out", "--memory", "0"), "not an amount of memory"),
         (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "of more than 8 recordings"),
@@ -184,7 +184,7 @@ def test_a_table_with_an_error_says_where(run: Any, lab: Path, table: str, messa
 
 def test_results_of_many_are_not_mixed_into_one(run: Any, lab: Path) -> None:
     said = run("calibrate", lab / "robot", lab / "recordings", "-o", lab / "recordings/a", *IN_PROCESS)
-    assert said.status == 2 and "a single result stands where those of many would" in said.err
+    assert said.status == 2 and "the folder contains a single result, not those of several jobs" in said.err
     assert not (lab / "recordings/a/many.json").exists()
 
 

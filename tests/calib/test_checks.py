@@ -96,7 +96,7 @@ def test_labels_swapped_in_one_frame_are_put_right(robot: Robot) -> None:
     xyz = seen(robot)
     clean = calibrate(robot, recorded(robot, xyz))
     xyz[2] = xyz[2][[0, 4, 2, 3, 1, 5]]
-    with pytest.warns(UserWarning, match=r"frame 2: m1, m4 \(labels are swapped, put right\)"):
+    with pytest.warns(UserWarning, match=r"frame 2: m1, m4 \(labels were swapped, and are corrected\)"):
         found = calibrate(robot, recorded(robot, xyz))
     np.testing.assert_allclose(found.T_robot_camera, clean.T_robot_camera, atol=1e-9)
 
@@ -172,7 +172,7 @@ def test_recordings_that_went_wrong(name: str, text: str) -> None:
 
 
 @pytest.mark.skipif(not TRIALS.is_dir(), reason="the trials are not here")
-@pytest.mark.parametrize(("name", "text"), [("v_zeros", "mid in frame 2, mid in frame 5"), ("v_swap2", "put right")])
+@pytest.mark.parametrize(("name", "text"), [("v_zeros", "mid in frame 2, mid in frame 5"), ("v_swap2", "are corrected")])
 def test_recordings_that_are_put_right(name: str, text: str) -> None:
     body = load_robot(TRIALS / "base")
     clean = calibrate(body, load_recording(TRIALS / "recm"))
@@ -188,9 +188,9 @@ def test_a_lost_marker_written_as_zeros(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="left out: tip in frame 1"):
         r = load_recording(write_small_recording(tmp_path / "a", markers_csv=rows))
     assert r.marker_frame.tolist() == [0, 2]
-    with pytest.warns(UserWarning, match="-1, -1, -1 is how a lost marker is written"):
+    with pytest.warns(UserWarning, match="-1, -1, -1 is a lost marker"):
         load_recording(write_small_recording(tmp_path / "c", markers_csv=rows.replace("0,0,0", "-1,-1,-1")))
-    with pytest.warns(UserWarning, match="9999, 9999, 9999 is how a lost marker is written"):
+    with pytest.warns(UserWarning, match="9999, 9999, 9999 is a lost marker"):
         load_recording(write_small_recording(tmp_path / "d", markers_csv=rows.replace("0,0,0", "9999,9999,9999")))
     with pytest.raises(DataError, match="0, 0, 0 in every row of side"), contextlib.suppress(UserWarning):
         load_recording(write_small_recording(tmp_path / "b", markers_csv=rows + "0,side,0,0,0\n"))

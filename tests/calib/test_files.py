@@ -83,7 +83,7 @@ def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
 
 
 def test_a_calibration_is_not_written_at_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a folder stands"):
+    with pytest.raises(InputError, match="a folder exists"):
         write_calibration(make_calibration(), tmp_path)
 
 

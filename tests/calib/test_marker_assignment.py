@@ -102,7 +102,7 @@ def test_a_layout_with_a_symmetry_is_refused() -> None:
     recording, _ = record(np.zeros((2, 4)), noise=2e-4)
     bare, _ = nameless(recording, np.arange(12))
     weightless = arm(gravity=(0.0, 0.0, 0.0))
-    with pytest.raises(DataError, match=r"two poses fit them alike: .* Name the markers"):
+    with pytest.raises(DataError, match=r"two poses fit them equally well: .* Name the markers"):
         calibrate(weightless, bare)
 
 

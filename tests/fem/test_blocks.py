@@ -58,5 +58,5 @@ def test_a_rounded_square_goes_from_the_square_to_the_disc() -> None:
 def test_what_cannot_be_built() -> None:
     with pytest.raises(InputError, match="levels along y: must rise"):
         block_mesh([[0, 1], [1, 0], [0, 1]])
-    with pytest.raises(InputError, match="no cell is left"):
+    with pytest.raises(InputError, match="no cell remains"):
         block_mesh(LEVELS, keep=lambda centre: np.zeros(len(centre), dtype=bool))

@@ -198,10 +198,10 @@ def test_an_own_folder_with_the_name_of_a_robot_that_comes_along(tmp_path: Path,
     monkeypatch.chdir(tmp_path)
     name = sorted(robot_names())[0]
     write_block_robot(tmp_path / name)
-    with pytest.warns(UserWarning, match="is used; the robot of that name that comes along"):
+    with pytest.warns(UserWarning, match="is used; the robot of that name in the package"):
         assert find_robot(name) == Path(name) / "robot.toml"
     (tmp_path / name / "robot.toml").unlink()
-    with pytest.warns(UserWarning, match=r"comes along is used; the folder .* has no robot\.toml"):
+    with pytest.warns(UserWarning, match=r"of the package is used; the folder .* has no robot\.toml"):
         assert find_robot(name) == robot_names()[name] / "robot.toml"
 
 
@@ -210,7 +210,7 @@ def test_a_doubled_element_weighs_once(tmp_path: Path) -> None:
     folder = write_block_robot(tmp_path)
     mesh = meshio.Mesh(np.asarray(block.nodes) * 1e3, [("tetra", np.vstack([block.tets, block.tets[::2]]))])
     mesh.write(folder / "block.vtu")
-    with pytest.warns(UserWarning, match="48 of 144 tetrahedra stand there twice"):
+    with pytest.warns(UserWarning, match="48 of 144 tetrahedra occur twice"):
         body = load_robot(folder).body
     assert body.stencil.volumes.sum() == pytest.approx(0.1 * 0.03 * 0.03)
 
@@ -443,11 +443,11 @@ BAD_TABLES: list[tuple[dict[str, Any], str, list[str]]] = [
     ({"cables__0__path_m": []}, "cables[0].path_m", ["at least 1 item"]),
     ({"cables__1__path_m": [[0.1, "a", 0]]}, "cables[1].path_m[0][1]", ["valid number", "'a'", "far end first"]),
     ({"cables__0__pull_point_m": None}, "cables[0].pull_point_m", ["a required key is missing", "metres"]),
-    ({"cables__1__name": "top"}, "cables[1].name", ["a name stands twice", "cables[0] has it too"]),
+    ({"cables__1__name": "top"}, "cables[1].name", ["a name occurs twice", "cables[0] has it too"]),
     ({"cables__1__name": "a,b"}, "cables[1].name", ["'a,b'", "without commas"]),
     ({"cables__0__min_tension_n": 9.0}, "cables[0].min_tension_n", ["above the largest", "min 9.0 N, max 5.0 N"]),
     ({"cables__1__exit_direction": [0, 0, 0]}, "cables[1].exit_direction", ["has no length"]),
-    ({"markers__2__name": "tip"}, "markers[2].name", ["a name stands twice"]),
+    ({"markers__2__name": "tip"}, "markers[2].name", ["a name occurs twice"]),
     ({"markers__0__position_m": [1e3, 0, 0]}, "markers[0].position_m", ["marker 'tip' is far from the body", "millimetres"]),
     ({"features__count": 0}, "features.count", ["greater than or equal to 1"]),
     ({"features__count": True}, "features.count", ["valid integer"]),

@@ -73,7 +73,7 @@ def test_a_loop_replaces_no_mesh_and_not_the_robot_it_is_made_from(tmp_path: Pat
 
 def test_a_loop_is_not_written_at_a_file(tmp_path: Path, robot: Robot) -> None:
     (tmp_path / "file").write_text("x", encoding="utf-8")
-    with pytest.raises(InputError, match="a file stands"):
+    with pytest.raises(InputError, match="a file exists"):
         write_loop(make_loop(robot), tmp_path / "file")
 
 

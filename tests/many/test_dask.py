@@ -54,7 +54,7 @@ def test_a_scheduler_that_dies_ends_the_run_and_keeps_what_is_done(tmp_path: Pat
             time.sleep(0.05)
         with open_engine(None, str(file), None) as engine:
             ends = scheduler.kill
-            with pytest.raises(DataError, match="same command goes on"):
+            with pytest.raises(DataError, match="same command continues"):
                 run_jobs([job(tmp_path, "a", "write")], work, engine, progress=lambda now: ends())
     finally:
         scheduler.kill()

@@ -45,7 +45,7 @@ def test_names_are_as_short_as_they_can_be(tmp_path: Path) -> None:
     assert names_of(paths[1:]) == ["push", "run.2"]
     assert names_of(paths) == ["monday-push", "tuesday-push", "tuesday-run.2"]
     assert names_of([tmp_path / "a.bag", tmp_path / "b.bag"]) == ["a", "b"]
-    with pytest.raises(InputError, match="the same path stands twice"):
+    with pytest.raises(InputError, match="the same path occurs twice"):
         names_of([paths[0], paths[0]])
 
 

@@ -532,7 +532,7 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "Recovered 100 %",
         "1.90 mm before, 0.170 mm after",
         "1. Residual on the robot",
-        "the black one says which way the camera looks",
+        "the black one is the direction of the camera",
         "Single frames of the fitted data",
         "2. What the residual goes with",
         "The pattern holds 81 % of the squared residual before",
@@ -566,7 +566,7 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "Initial input of top – 0.310 ± 0.020 N 0.400 ± 0.030 N 0.300 N",
         "stiffness: scale 1.00 – 0.800 ± 0.010 1.010 ± 0.012",
         "7. Tests, and what is left",
-        "neighbouring states are alike p = 0.0020 p = 0.31",
+        "the residuals of neighbouring states are correlated p = 0.0020 p = 0.31",
         "Any structure (1 %, Holm) yes no",
         "F = 31, p = 1.0 × 10⁻⁹ (40, 12 degrees of freedom; repeats differ by 0.200 mm) not testable",
         "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm",
@@ -675,7 +675,7 @@ def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
     [
         ("effects", "The data name what the model lacks."),
         ("none", "The model explains the data to their noise."),
-        ("unexplained", "A residual is left that no effect explains."),
+        ("unexplained", "A residual remains that no effect explains."),
     ],
 )
 def test_a_loop_of_the_verdict_alone_shows_just_that(tmp_path: Path, verdict: str, sentence: str) -> None:
@@ -872,7 +872,7 @@ def test_a_calibration_shows_pose_inputs_markers_and_history(tmp_path: Path) -> 
         "(180.000 ± 0.057, 0.000 ± 0.057, 0.000 ± 0.057) °",
         "(0, 0, −1.00)",
         "top 0.311 ± 0.020 N 1.250 ± 0.080 mm",
-        "side 0.200 N (the data say nothing of it)",
+        "side 0.200 N (not determined by the data)",
         "0–2, 5",
     )
     assert len(page.all("img")) == 2
@@ -961,7 +961,7 @@ def test_a_path_that_is_no_folder_and_a_file_that_is_one(tmp_path: Path) -> None
     with pytest.raises(InputError, match="not a folder") as error:
         write_report(folder / "calibration.json")
     assert error.value.hint == f"femsense report {folder}"
-    with pytest.raises(InputError, match="a folder stands where the file should be written"):
+    with pytest.raises(InputError, match="a folder exists where the file should be written"):
         write_report(folder, tmp_path)
 
 

@@ -55,10 +55,13 @@ def test_a_script_where_all_is_in_its_place_says_nothing(robot: Robot) -> None:
 
 def test_a_floor_that_cuts_the_robot_is_reported_with_its_depth(robot: Robot) -> None:
     (text,) = said(script(scene={"floor_z_m": 0.015}), robot)
-    assert "the floor cuts block: at rest it reaches 15.0 mm below scene.floor_z_m = 0.015" in text and "0.000 m is free" in text
+    assert (
+        "the floor intersects block: at rest the body reaches 15.0 mm below scene.floor_z_m = 0.015" in text
+        and "below 0.000" in text
+    )
     assert said(script(scene={"floor_z_m": -0.001}), robot) == []
     sagging = said(script(scene={"floor_z_m": -0.0015}), robot, run=True)  # free at rest, and cut when its own weight bends it
-    assert any("in frame 0 it reaches" in text for text in sagging)
+    assert any("in frame 0 the body reaches" in text for text in sagging)
 
 
 def test_a_contact_off_the_surface_is_reported_with_the_distance_and_the_nearest_place(robot: Robot) -> None:

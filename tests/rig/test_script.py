@@ -54,7 +54,7 @@ def test_gravity_of_a_sweep(robot: Any) -> None:
     [
         ({"camera": None}, ["script: either a table [camera]", "found:    format, "]),
         ({"sweeps__0__lable": "x"}, ["script: sweeps[0].lable", "unknown key", "did you mean 'label'"]),
-        ({"sweeps__1__label": "a"}, ["script: sweeps[1].label", "stands twice", "'a'"]),
+        ({"sweeps__1__label": "a"}, ["script: sweeps[1].label", "occurs twice", "'a'"]),
         ({"contacts__0__sweep": "bb"}, ["script: contacts[0].sweep", "no such sweep", "did you mean 'b'"]),
         ({"contacts__0__force_n": [0.1]}, ["script: contacts[0].force_n", "1 values", "3 values"]),
         ({"contacts__0__force_n": -1.0}, ["script: contacts[0].force_n", "greater than or equal to 0"]),

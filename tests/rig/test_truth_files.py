@@ -46,7 +46,7 @@ def test_files_beside_are_never_deleted(recording: Path, name: str) -> None:
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
     robot = load_robot(write_block_robot(recording.parent / "robot"))
-    with pytest.raises(InputError, match=r"files stand there that would be deleted\n  found:    " + name):
+    with pytest.raises(InputError, match=r"other files in the folder would be deleted\n  found:    " + name):
         simulate(robot, CLOUDS, recording)
     assert mine.read_text() == "mine"
 

@@ -1,8 +1,7 @@
 """The discretisation error of a robot: motions and sensed forces on it against those on finer spaces of the same body.
 
 The same loads act on the declared mesh, on quadratic elements and on a mesh with each element split into eight.
-The clamp stays the piece of the body that the declared mesh clamps, and loads are the same pieces of the surface,
-so that the space alone differs.
+Clamp and loads cover the same parts of the body in all of them, so that only the finite-element space differs.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Reference:
 
 
 def reference_of(answers: Sequence[Answer]) -> Reference:
-    """Return the limit of finer meshes where two of the same element are known, else the finest quadratic answer."""
+    """Return the extrapolated limit of finer meshes if two with the same element are known, else the result of the finest quadratic one."""
     pairs = [(a, b) for a in answers for b in answers if b.is_space("tet10", a.refinements + 1) and a.element == "tet10"]
     if pairs:
         coarse, fine = pairs[-1]

@@ -36,7 +36,7 @@ PATCH = 0.06
 
 
 class LoadKind(StrEnum):
-    """What a load is."""
+    """Kind of a load."""
 
     GRAVITY = "gravity"
     CABLE = "cable"

@@ -38,7 +38,7 @@ class ManyJobs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Served:
-    """What a command serves until it ends by itself or by Ctrl-C."""
+    """A server of a command, which runs until it ends by itself or by Ctrl-C."""
 
     wait: Callable[[], None]
     end: Callable[[], None]
@@ -55,7 +55,7 @@ class Answer:
     """For people."""
     exit_status: int = 0
     then: Served | None = None
-    """What goes on after the answer was printed."""
+    """The server that runs after the answer was printed."""
     many: ManyJobs | None = None
     """Jobs whose outcomes replace this answer."""
 

@@ -1,4 +1,4 @@
-"""What makes robots and recordings: `import`, `mesh`, `simulate`."""
+"""Commands that make robots and recordings: `import`, `mesh`, `simulate`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def import_(
     output: Annotated[Path, option("-o --output", "RECORDING", "The folder to write.")],
     options: Options,
     driven: InputOptions,
-    again: Annotated[bool, option("--again", help="Import even where RECORDING holds an import.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat an import into RECORDING.")] = False,
 ) -> Answer:
-    """Make a recording of what other programs recorded."""
+    """Convert a recording of another program."""
     from femsense.app.import_command import import_into, import_text
 
     with progress_bar("import") as progress:
@@ -40,11 +40,11 @@ def mesh(
     surface: Annotated[
         Path, argument("SURFACE", "Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).")
     ],
-    output: Annotated[Path, option("-o --output", "ROBOT", "The robot's folder; its robot.toml is kept where there is one.")],
+    output: Annotated[Path, option("-o --output", "ROBOT", "Folder of the robot; an existing robot.toml is kept.")],
     options: MeshOptions,
-    again: Annotated[bool, option("--again", help="Fill even where ROBOT holds this mesh already.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat the meshing even if ROBOT contains its result.")] = False,
 ) -> Answer:
-    """Fill a surface with tetrahedra; start a robot."""
+    """Fill a surface with tetrahedra and write a robot folder."""
     with progress_bar("mesh") as progress:
         if surface.suffix.lower() == ".toml":
             from femsense.io.meshing.robot_from_line import line_into, line_text
@@ -64,14 +64,14 @@ def mesh(
 def simulate(
     context: typer.Context,
     robot: RobotPath,
-    scripts: Annotated[list[Path], argument("SCRIPT…", "What the virtual rig does (TOML); several are many jobs.")],
+    scripts: Annotated[list[Path], argument("SCRIPT…", "Script of the virtual rig (TOML); several paths are several jobs.")],
     output: Annotated[
         Path | None, option("-o --output", "RECORDING", "The recording to write; with --plan a folder for the map of forces.")
     ] = None,
-    plan: Annotated[bool, option("--plan", help="Say what this experiment could show; record nothing.")] = False,
+    plan: Annotated[bool, option("--plan", help="Predict what this experiment can show, without recording.")] = False,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
 ) -> Answer:
-    """Record on the virtual rig, with the truth beside it."""
+    """Simulate a recording with its ground truth on the virtual rig."""
     from femsense.app.commands import script_plan, simulate_into
 
     if plan:

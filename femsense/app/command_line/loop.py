@@ -20,15 +20,17 @@ from femsense.io.importers.options import Inputs
 def improve(
     context: typer.Context,
     robot: RobotPath,
-    recordings: Annotated[list[Path] | None, argument("RECORDING", "What the effects are found on.")] = None,
+    recordings: Annotated[list[Path] | None, argument("RECORDING", "Recordings in which effects are searched.")] = None,
     output: Annotated[Path | None, option("-o --output", "OUT", "The folder to write; with --plan a script (TOML).")] = None,
-    validation: Annotated[list[Path] | None, option("--validation", "RECORDING …", "What they are tested on.")] = None,
+    validation: Annotated[
+        list[Path] | None, option("--validation", "RECORDING …", "Recordings on which they are tested.")
+    ] = None,
     reference: Annotated[
         list[Path] | None,
         option(
             "--reference",
             "RECORDING …",
-            "The same inputs without what is asked for (a weight, say): what the model misses there is taken off.",
+            "A recording of the same inputs without the load in question (a weight, say); its residual is subtracted.",
         ),
     ] = None,
     effects: Annotated[list[str] | None, option("--effects", "NAME,…", "Try these effects only.")] = None,
@@ -41,33 +43,33 @@ def improve(
         option(
             "--from",
             "auto|markers|clouds|both",
-            "What is used of a recording; auto: its markers, or its clouds where it has none.",
+            "Measurements to use; auto: markers, or clouds without markers.",
         ),
     ] = "auto",
     correct: Annotated[
-        bool, option("--correct", help="Also learn an empirical correction of what is left, judged on held-out data: no cause.")
+        bool, option("--correct", help="Also fit an empirical correction of the remaining residual, tested on held-out data.")
     ] = False,
-    again: Annotated[bool, option("--again", help="Compute even where OUT holds this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat the computation even if OUT contains its result.")] = False,
     workers: Annotated[
         int | None,
         option(
             "--workers",
             "N",
-            "Threads, and processes that many recordings are spread over; 0: this process; by default one a core.",
+            "Number of threads, and of processes for many recordings; 0: this process; default: one per core.",
             min=0,
         ),
     ] = None,
     plan: Annotated[
         bool, option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
     ] = False,
-    given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: what is recorded already.")] = None,
+    given: Annotated[Path | None, option("--given", "RECORDING", "With --plan: existing recordings.")] = None,
     noise: Annotated[float, option("--noise", "MM", "With --plan: noise of each coordinate of a marker.", min=0.0)] = 0.2,
-    frames: Annotated[int, option("--frames", "N", "With --plan: not more new frames than this.", min=1)] = 60,
-    actuation: Annotated[Inputs, option("--actuation", help="With --plan: what drives the cables.")] = Inputs.tension,
+    frames: Annotated[int, option("--frames", "N", "With --plan: largest number of new frames.", min=1)] = 60,
+    actuation: Annotated[Inputs, option("--actuation", help="With --plan: quantity of the cable inputs.")] = Inputs.tension,
     dask: Dask = None,
     memory: Memory = None,
 ) -> Answer:
-    """Find what the model lacks and write the better robot."""
+    """Find the effects that the model lacks and write the improved robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.io.recording_folder import load_recording
@@ -79,11 +81,11 @@ def improve(
     set_workers(workers or None)
     if plan and recordings:
         raise InputError(
-            "recordings are not asked with --plan",
+            "--plan takes no recordings",
             where="--plan",
             found=str(recordings[0]),
             expected="ROBOT alone",
-            hint="--given RECORDING plans beside one that exists",
+            hint="--given RECORDING plans in addition to an existing one",
         )
     if plan:
         with progress_bar("plan") as progress:

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
 FREE = ("", "*")
-"""A coordinate that is written so is left free."""
+"""Text of a free coordinate."""
 
 
 def option(flags: str, metavar: str | None = None, help: str = "", **limits: Any) -> Any:
-    """Return an option of a command, for `Annotated`: its flags with blanks between, what it takes, and what it does."""
+    """Return an option of a command, for `Annotated`: its flags separated by blanks, its placeholder, and its description."""
     return typer.Option(*flags.split(), metavar=metavar, help=help, **limits)
 
 
@@ -45,8 +45,10 @@ def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -
     return type_(**{field.name: values[field.name] for field in fields(type_) if field.name in values} | others)
 
 
-RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot that comes along.")]
-Recordings = Annotated[list[Path], argument("RECORDING…", "A folder with recording.toml; several, or a pattern, are many jobs.")]
+RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot of the package.")]
+Recordings = Annotated[
+    list[Path], argument("RECORDING…", "A folder with recording.toml; several folders, or a pattern, are several jobs.")
+]
 
 
 RunPath = Annotated[Path, argument("RUN", "A folder that femsense estimate wrote.")]
@@ -79,7 +81,7 @@ def repeat_options(words: list[str]) -> list[str]:
 
 
 def missing(context: typer.Context, name: str) -> TyperException:
-    """Return the error of a parameter that is missing: what --plan or --jobs can do without."""
+    """Return the error for a missing parameter that --plan or --jobs does not need."""
     parameter = next(p for p in context.command.params if p.name == name)
     is_argument = parameter.param_type_name == "argument"
     names = [str(parameter.metavar).rstrip("…")] if is_argument else parameter.opts
@@ -89,7 +91,7 @@ def missing(context: typer.Context, name: str) -> TyperException:
 
 
 def three_numbers(text: str, *, free: bool = False) -> tuple[float, float, float] | None:
-    """Return the numbers of X,Y,Z; None where the text is another one.
+    """Return the numbers of X,Y,Z; None for other text.
 
     Arguments:
         text: of the command line.
@@ -114,7 +116,7 @@ def places(texts: Sequence[str]) -> list[tuple[float, float, float]] | None:
 
 
 def split_names(texts: Sequence[str] | None) -> list[str] | None:
-    """Return names that stand between commas or in options of their own; None where there is no such option."""
+    """Return names separated by commas or given in several options; None without such an option."""
     names = [name.strip() for text in texts or [] for name in text.split(",") if name.strip()]
     if texts and not names:
         raise InputError(

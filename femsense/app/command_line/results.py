@@ -1,4 +1,4 @@
-"""What shows results: `export`, `view`, `stream`, `report`."""
+"""Commands that show results: `export`, `view`, `stream`, `report`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ def export(
 @command()
 def view(
     run: Annotated[Path | None, argument("RUN", "A folder that femsense estimate wrote.")] = None,
-    stream: Annotated[str | None, option("--stream", "URL", "Show what streams there instead: http:// or mqtt://.")] = None,
+    stream: Annotated[
+        str | None, option("--stream", "URL", "Show the stream at this address instead: http:// or mqtt://.")
+    ] = None,
     live: Annotated[Path | None, option("--live", "SESSION", "Show the session that is recorded there now.")] = None,
     port: Annotated[int, option("--port", help="0 takes a free one.", min=0, max=65535)] = 0,
     browser: Annotated[bool, option("--browser/--no-browser", help="Open the default browser.")] = True,
@@ -176,7 +178,10 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
 @command(Several.EACH)
 def report(
-    folders: Annotated[list[Path], argument("DIR…", "A folder of results; several, or one of many jobs, are many jobs.")],
+    folders: Annotated[
+        list[Path],
+        argument("DIR…", "A folder of results; several folders, or one with the results of several jobs, are several jobs."),
+    ],
 ) -> Answer:
     """Write the figures of results as one HTML file."""
     from femsense.report import write_report

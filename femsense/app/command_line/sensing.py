@@ -14,7 +14,7 @@ from femsense.app.command_line.parameters import Recordings, RobotPath, filled, 
 from femsense.app.command_line.several import Several
 from femsense.app.live_options import LiveOptions
 
-USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
+USE_CORRECTION = "Use the empirical correction of femsense improve --correct, which applies to markers."
 
 
 class SensingMethod(StrEnum):
@@ -62,20 +62,24 @@ def estimate(
     output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
     calibration: Annotated[
         Path | None,
-        option("-c --calibration", "FILE", "Of femsense calibrate, or its folder of many; made first where not given."),
+        option(
+            "-c --calibration",
+            "FILE",
+            "Result of femsense calibrate, or its folder for several recordings; by default it is computed first.",
+        ),
     ] = None,
-    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Where forces act, in metres on the body at rest.")] = None,
+    at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Contact point, in metres on the body at rest.")] = None,
     method: Annotated[
         SensingMethod,
         option("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
     ] = SensingMethod.rays,
-    friction: Annotated[float, option("--friction", "MU", "The cone about the normal in which contact forces lie.")] = 1.0,
+    friction: Annotated[float, option("--friction", "MU", "Coefficient of the friction cone of contact forces.")] = 1.0,
     push: Annotated[
-        bool, option("--push", help="What acts at the places of --at pushes, within the cone; else it may pull, too.")
+        bool, option("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
     ] = False,
-    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Average forces over so long; they lag by as much.")] = 0.0,
+    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0,
     correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
-    again: Annotated[bool, option("--again", help="Compute even where RUN holds this result already.")] = False,
+    again: Annotated[bool, option("--again", help="Repeat the computation even if RUN contains its result.")] = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into
@@ -87,7 +91,7 @@ def estimate(
 
     (recording,) = recordings
     if push and not at:
-        raise typer.BadParameter("--push is of the places of --at, and none is given; what is found pushes anyway")
+        raise typer.BadParameter("--push applies to the points of --at, and none is given; contacts that are found push anyway")
     options = filled(SensingOptions, locals(), method=method.value)
     if smooth_s > 0:
         say(f"forces are averaged over {smooth_s:g} s and lag by as much")
@@ -136,7 +140,7 @@ def live(
 def reach(
     robot: RobotPath,
     target: Annotated[list[str], option("--target", "MARKER=X,Y,Z …", "Where a marker is wanted, in metres, robot frame.")],
-    control: Annotated[str, option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
+    control: Annotated[str, option("--control", help="Quantity of the cable commands: tension or displacement.")] = "tension",
     force: Annotated[list[str] | None, option("--force", "X,Y,Z=FX,FY,FZ …", "Known contact forces.")] = None,
     calibration: Annotated[Path | None, option("-c --calibration", "FILE", "Commands count from its initial inputs.")] = None,
     output: Annotated[Path | None, option("-o --output", "FILE", "A JSON file to write.")] = None,

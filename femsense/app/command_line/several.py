@@ -24,16 +24,16 @@ class Several(Enum):
     EACH = "each"
     """Each is a job."""
     TOGETHER = "together"
-    """All are one joint job, which has its own use for workers; `--jobs` alone asks for more."""
+    """All recordings are one joint job, which uses the workers itself; only `--jobs` makes several."""
 
 
 Jobs = Annotated[
     str | None,
-    option("--jobs", "TABLE|GLOB", "Many jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
+    option("--jobs", "TABLE|GLOB", "Several jobs: a table (CSV, Parquet) with robot, recording, options by name; or a pattern."),
 ]
-Workers = Annotated[int | None, option("--workers", "N", "Many jobs: so many processes; by default one a core.", min=0)]
-Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Many jobs: on workers of dask; see femsense docs many.")]
-Memory = Annotated[float | None, option("--memory", "GB", "Many jobs: what a worker may take at most.")]
+Workers = Annotated[int | None, option("--workers", "N", "Several jobs: number of processes; default: one per core.", min=0)]
+Dask = Annotated[str | None, option("--dask", "ADDRESS|local|FILE", "Several jobs: on workers of dask; see femsense docs many.")]
+Memory = Annotated[float | None, option("--memory", "GB", "Several jobs: memory limit of a worker.")]
 MANY = {"jobs": Jobs, "workers": Workers, "dask": Dask, "memory": Memory}
 """Options of commands that take many jobs."""
 
@@ -57,7 +57,7 @@ def several(context: typer.Context, of: Several) -> Answer | None:
     if not asked:
         return None
     if given["jobs"] is not None and units:
-        raise typer.BadParameter(f"--jobs says what the jobs are about, and {units[0]} stands on the command line too")
+        raise typer.BadParameter(f"--jobs declares the jobs, and {units[0]} stands on the command line too")
     if given["jobs"] is None and not units:
         raise missing(context, about)
     if "output" in given and (given["output"] is None or _source(context, "output") != "COMMANDLINE"):
@@ -100,7 +100,7 @@ def spread_over(count: int, most: int, workers: int | None, dask: str | None, me
     from femsense.many.limits import memory_share
 
     if count <= most and (dask is not None or memory is not None):
-        raise typer.BadParameter(f"--dask and --memory are of many jobs, or of more than {most} recordings")
+        raise typer.BadParameter(f"--dask and --memory apply to several jobs, or to more than {most} recordings")
     if count <= most or (workers == 0 and dask is None):
         yield None
         return

@@ -14,7 +14,7 @@ from femsense.app.command_line.parameters import argument, option
 def demo(
     output: Annotated[Path, option("-o --output", "DIR", "Where the results go.")] = Path("femsense-demo"),
 ) -> Answer:
-    """Run the whole chain on a recording that comes along."""
+    """Run the whole chain on a recording of the package."""
     from femsense.app.demo.demo import demo_text, run_demo
 
     with progress_bar("demo") as progress:
@@ -28,7 +28,7 @@ def inspect(
     accuracy: Annotated[bool, option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")] = False,
     robot: Annotated[str | None, option("--robot", "ROBOT", "Compare a recording with this robot.")] = None,
 ) -> Answer:
-    """Say what a file or folder is and what is wrong with it."""
+    """Describe and check a file or folder."""
     from femsense.app.inspect import describe, inspect_accuracy, inspect_path
 
     if accuracy:

@@ -1,1 +1,1 @@
-"""The demo: the whole chain on a recording that comes along."""
+"""The demo: the whole chain on a recording of the package."""

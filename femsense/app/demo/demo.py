@@ -27,7 +27,7 @@ ROBOT = "four-leg"
 
 @dataclass(frozen=True, slots=True)
 class DemoSteps:
-    """What the chain is made of."""
+    """The steps of the chain."""
 
     estimate: Callable[..., Run] = estimate_into
     improve: Callable[..., dict[str, Any]] = improve_into
@@ -42,7 +42,7 @@ def run_demo(
 ) -> dict[str, Any]:
     """Estimate with the declared robot, improve it, estimate again; export the result and measure both against the truth.
 
-    Steps that the folder holds already are not done again.
+    Steps whose results are in the folder are not repeated.
 
     Arguments:
         folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.
@@ -64,7 +64,7 @@ def run_demo(
     check_files(out, DEMO)
     say(f"1/4  forces with the robot as it is declared → {out / 'declared'}")
     before = how.estimate(out / "declared", ROBOT, recording, say=say, progress=progress)
-    say(f"2/4  what does its model lack? → {out / 'loop'}")
+    say(f"2/4  which effects does the model lack? → {out / 'loop'}")
     loop = how.improve(out / "loop", ROBOT, [recording], say=say, progress=progress)
     say(f"3/4  forces with the improved robot → {out / 'run'}")
     after = how.estimate(out / "run", out / "loop", recording, say=say, progress=progress)
@@ -133,7 +133,7 @@ def demo_text(document: Mapping[str, Any]) -> str:
     found = [effect_text(effect) for effect in saved_loop({"effects": loop.get("effects") or []}).effects]
     lines += [f"  {line}" for text in found for line in text.splitlines()] or ["  nothing that these data show"]
     true = [[effect["name"], _entry(effect)] for effect in document["truth"]["effects"]]
-    lines += ["", "what it lacks in truth:", columns(true)] if true else []
+    lines += ["", "effects of the truth:", columns(true)] if true else []
     places = [["see it", f"femsense view {out / 'run'}"], ["mesh", str(out / "robot.glb")], ["picture", str(out / "picture.png")]]
     if document.get("report"):
         places.append(["report", str(document["report"])])

@@ -1,4 +1,4 @@
-"""The picture of the demo: the robot with its forces, the forces over time, and what the improved model changed."""
+"""The picture of the demo: the robot with its forces, the forces over time, and the changes by the improved model."""
 
 from __future__ import annotations
 

@@ -36,12 +36,12 @@ def inspect_script(file: Path, report: Report, problems: Problems) -> None:
 
 
 def inspect_line(file: Path, report: Report, problems: Problems) -> None:
-    """Report what the description of a body along a line holds."""
+    """Report the contents of a description of a body along a line."""
     report.update(line_report(file))
 
 
 def inspect_unfinished(folder: Path, report: Report, problems: Problems) -> None:
-    """Report the work that a stopped command left."""
+    """Report the unfinished work of a stopped command."""
     report["holds"] = f"{(folder / UNFINISHED).stat().st_size / 1e6:.0f} MB of work that is done"
     problems.append(
         InputError("a command was stopped here", where=folder, hint="run the same command again: it goes on where it stopped")
@@ -121,7 +121,7 @@ def inspect_table(file: Path, report: Report, problems: Problems) -> None:
 
 
 def inspect_capture(path: Path, report: Report, problems: Problems) -> None:
-    """Ask the importer what is in it; frames are not read here."""
+    """Report the contents that the importer identifies; frames are not read."""
     from femsense.io.importers.guess import contents
 
     report["bytes"] = path.stat().st_size if path.is_file() else None
@@ -131,7 +131,7 @@ def inspect_capture(path: Path, report: Report, problems: Problems) -> None:
 
 
 def inspect_cad(file: Path, report: Report, problems: Problems) -> None:
-    """Report what the text of a CAD file says; its shapes are not read."""
+    """Report the header of a CAD file; its shapes are not read."""
     data = file.read_bytes()
     report["bytes"] = len(data)
     if file.suffix.lower() not in (".step", ".stp"):

@@ -57,16 +57,16 @@ def _warn_of_gaps(robot: Robot, file: Path) -> None:
     texts = []
     guessed = guessed_tables(file.read_text(encoding="utf-8-sig"))
     if guessed:
-        texts.append(f"still marked GUESSED: {', '.join(guessed)}. Check each against the real robot, then remove the word")
+        texts.append(f"still marked GUESSED: {', '.join(guessed)}. Compare each with the real robot, then delete the word")
     if not robot.body.cables and not robot.body.chambers:
         texts.append(
-            "neither [[cables]] nor [[chambers]]: nothing that is recorded moves this robot. Calibration then knows it at rest alone, "
-            "and improve has no inputs to compare with"
+            "neither [[cables]] nor [[chambers]]: no recorded input moves this robot. calibrate then uses the rest state only, "
+            "and improve cannot compare inputs"
         )
     if not robot.marker_names:
         texts.append(
-            "no [[markers]]: the camera's pose can come from clouds alone, of frames in which nothing touches "
-            "(femsense docs calibration), and there are no forces without clouds"
+            "no [[markers]]: the camera pose must come from clouds of contact-free frames (femsense docs calibrate), "
+            "and frames without a cloud give no forces"
         )
     for text in texts:
         warnings.warn(f"{file.name}: {text}", stacklevel=3)

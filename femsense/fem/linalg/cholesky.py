@@ -1,9 +1,9 @@
 # mypy: allow-untyped-decorators
 """Sparse Cholesky of stiffness matrices: multifrontal, supernodal, in single or double precision.
 
-The analysis (elimination tree, supernodes, where every entry goes) depends on the sparsity pattern alone and is kept. Dense
-work goes to the BLAS that SciPy brings. Right-hand sides with few entries, as points and cables have, only visit the part of
-the tree above them: that is what makes `gram` (B'K⁻¹B without K⁻¹B) cheap. References: Liu 1992 (multifrontal method),
+The analysis (elimination tree, supernodes, positions of all entries) depends on the sparsity pattern only and is reused. Dense work uses
+the BLAS of SciPy. Right-hand sides with few entries, such as those of points and cables, only visit the part of the tree above them,
+which makes `gram` (B'K⁻¹B without K⁻¹B) cheap. References: Liu 1992 (multifrontal method),
 Ashcraft & Grimes 1989 (relaxed supernodes), Gilbert 1994 (the reach of a sparse right-hand side).
 """
 
@@ -27,8 +27,8 @@ from femsense.fem.linalg.symbolic import Analysis
 FEW = 4
 """Right-hand sides that are solved one by one where the matrix has no blocks; more go through BLAS together."""
 BESIDE = 40
-"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 to 16 of a bar it
-took twice as long in a trial."""
+"""Largest number of right-hand sides that are solved in groups of SIDES; for more, BLAS is faster. For 10 to 16 right-hand sides of a bar
+it took twice as long in a trial."""
 
 
 # --- numbers -------------------------------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def _addresses(kind: str) -> IntArray:
 
 
 def _constants(kind: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[Any]]:
-    """Return what BLAS is pointed at: letters L N T R, room for integers, and −1, 1, 0."""
+    """Return the constants that BLAS reads by address: letters L N T R, memory for integers, and −1, 1, 0."""
     return np.frombuffer(b"LNTR", np.uint8), np.zeros(4, np.int32), np.array([-1.0, 1.0, 0.0], kind)
 
 

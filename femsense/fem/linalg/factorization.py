@@ -1,11 +1,10 @@
 """Factor once, solve many: the sparse symmetric systems of the body.
 
-A stiffness that is positive definite goes to `femsense.fem.linalg.cholesky`, with its analysis kept for a sparsity pattern.
-One that is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere.
-Where the factor would not fit into memory, conjugate gradients take its place (see `femsense.fem.linalg.iterative`).
-FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there.
-FEMSENSE_MEMORY_GB says how much memory there is for factors,
-where the machine's own figure is not the one to go by (a container, a shared machine).
+A positive definite stiffness is factorised by `femsense.fem.linalg.cholesky`, with one analysis per sparsity pattern; an indefinite one
+by PARDISO of the MKL (pypardiso) if installed, else by SuperLU of SciPy. If the factor does not fit into memory, conjugate gradients
+replace it (see `femsense.fem.linalg.iterative`).
+FEMSENSE_SOLVER overrides the choice: `direct` or `iterative`; `pardiso` or `superlu` for all matrices.
+FEMSENSE_MEMORY_GB sets the memory for factors, if the figure of the machine does not apply (a container, a shared machine).
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from femsense.fem.linalg.iterative import Level, Levels, UnsettledError, iterati
 from femsense.fem.linalg.symbolic import Analysis, analyse
 
 ITERATIVE_FROM = 100_000
-"""Unknowns from which on the memory of a direct factor is looked at.
+"""Number of unknowns from which on the memory of a direct factor is checked.
 Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/results/speed.md, `python benchmarks/body.py
-iterative`), so that memory alone switches."""
+iterative`), so memory is the only criterion."""
 ITERATIVE_LEAST = 60
 """Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
 MEMORY_SHARE = 0.6
@@ -61,20 +60,20 @@ class Pattern:
     levels_made: list[Levels] = field(default_factory=list)
     """The levels of the iterative solver, once they were needed."""
     fits: list[bool] = field(default_factory=list)
-    """Whether a direct factor fits into memory, once that was asked."""
+    """Whether a direct factor fits into memory; None until it was checked."""
 
     @property
     def size(self) -> int:
         return len(self.indptr) - 1
 
     def analysis(self) -> Analysis:
-        """Return the analysis for Cholesky, made when it is first asked for."""
+        """Return the analysis for Cholesky, made at the first call."""
         if not self.analyses:
             self.analyses.append(analyse(self.indptr, self.indices))
         return self.analyses[0]
 
     def levels(self) -> Levels:
-        """Return the levels of the iterative solver, made when they are first asked for."""
+        """Return the levels of the iterative solver, made at the first call."""
         if not self.levels_made:
             assert self.grid is not None
             self.levels_made.append(make_levels(self.indptr, self.indices, self.grid))
@@ -222,8 +221,7 @@ def direct_bytes(pattern: Pattern) -> int:
 
 
 def available_memory() -> float:
-    """Return the memory for factors [bytes]: what FEMSENSE_MEMORY_GB says, else what is free on the machine;
-    inf where it is unknown.
+    """Return the memory for factors [bytes]: FEMSENSE_MEMORY_GB, else the free memory of the machine; inf if unknown.
 
     Raises:
         InputError: FEMSENSE_MEMORY_GB is not a number ≥ 0.

@@ -35,7 +35,7 @@ from femsense.fem.linalg.sweeps import (
 from femsense.fem.linalg.symbolic import Analysis, analyse
 
 TOLERANCE = 1e-10
-"""Share of the preconditioned residual √(rᵀM⁻¹r) that a solution may leave."""
+"""Relative tolerance of the preconditioned residual √(rᵀM⁻¹r)."""
 PROBE = 1e-5
 """The same of the random right-hand side with which a matrix is tested for being definite."""
 MOST = 300
@@ -50,7 +50,7 @@ class UnsettledError(Exception):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Level:
-    """What the coarse space needs to know of the free nodes, in the order of the matrix."""
+    """Data of the free nodes for the coarse space, in the order of the matrix."""
 
     points: FloatArray
     """Where they are at rest [m], shape (p, 3)."""
@@ -64,7 +64,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Levels:
-    """What the preconditioners of every matrix of one pattern share."""
+    """Data common to the preconditioners of all matrices of one pattern."""
 
     rows: ShortArray
     """Nodes coupled with each node, in CSR: indptr, shape (p + 1,)."""
@@ -198,7 +198,7 @@ class Iterative:
         return np.asarray(columns.T @ self.solve(columns.toarray()))
 
     def is_definite(self) -> bool:
-        """Return whether conjugate gradients on a random right-hand side meet positive curvature alone.
+        """Return whether conjugate gradients on a random right-hand side meet positive curvature only.
 
         Their curvatures are the pivots of Lanczos' matrix, one of which is negative as soon as it has a negative eigenvalue;
         and what has a share of the right-hand side is not left out before they converge. Raises UnsettledError.
@@ -217,7 +217,7 @@ class Iterative:
             part, share = self._conjugate(left, wanted, MOST)
             total += self.iterations
             if part is None:
-                raise FemsenseError("the stiffness is not positive definite: FEMSENSE_SOLVER=direct says more")
+                raise FemsenseError("the stiffness is not positive definite: FEMSENSE_SOLVER=direct gives details")
             x += part
             if share <= wanted:
                 self.iterations = total
@@ -228,7 +228,7 @@ class Iterative:
         raise FemsenseError(f"conjugate gradients did not converge in {RESTARTS * MOST} iterations: FEMSENSE_SOLVER=direct")
 
     def _conjugate(self, b: FloatArray, tolerance: float, most: int) -> tuple[FloatArray | None, float]:
-        """Return the solution and the share of √(rᵀM⁻¹r) that it leaves; None where curvature is negative."""
+        """Return the solution and its relative residual √(rᵀM⁻¹r); None for negative curvature."""
         levels = self._levels
         x, r, q = np.zeros(self.size), b.copy(), np.empty(self.size)
         z = self._precondition(r)

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Orders of elimination with little fill, and what they cost."""
+"""Elimination orders with little fill, and their cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solves with a stiffness to what is asked of them and no more: from a factor in single precision, or by conjugate gradients."""
+"""Solves with a stiffness to a given tolerance: from a factor in single precision with refinement, or by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ REFINED, MOST_REFINED = 1e-6, 4
 """Share of a solution that the next correction may still bring;
 corrections at most before the factor is made in double precision."""
 NEAR_ENOUGH = 3e-2
-"""A factor of a state near by serves where the first correction of what it makes of the loads that are asked is smaller than this
-share."""
+"""A factor of a nearby state is used if the first relative correction of its solution is smaller than this."""
 ROUGH = 1e-3
 """Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes
 moved a fit by two percent."""
@@ -76,7 +75,7 @@ class Refined:
 
 
 def _share(more: FloatArray, answer: FloatArray) -> float:
-    """Return the largest share that corrections are of what they correct, column by column."""
+    """Return the largest ratio of the norms of correction and solution over the columns."""
     sizes = np.abs(answer).max(axis=0)
     return float((np.abs(more).max(axis=0) / np.where(sizes > 0, sizes, 1.0)).max(initial=0.0))
 
@@ -96,7 +95,7 @@ def refined(
 
 
 def prepare_roughly(pattern: Pattern) -> None:
-    """Make what `roughly` needs of a pattern whatever its values: it is kept with the pattern."""
+    """Make the data of a pattern that `roughly` needs for any values; they are kept with the pattern."""
     if pattern.size < ROUGH_FROM or pattern.grid is None:
         pattern.analysis()
     else:

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators, allow-untyped-calls
-"""What all functions that are written as LLVM code have in common: numbers, registers, pointers, masks, fetching ahead."""
+"""Common parts of functions written as LLVM code: numbers, registers, pointers, masks, prefetching."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def kind_of(like: Any) -> tuple[str, Any, int]:
 
 
 def function_named(module: Any, name: str, count: int) -> tuple[Any, bool]:
-    """Return the function of a name with so many integers as arguments, and whether it is there already."""
+    """Return the function of a name with the given number of integer arguments, and whether it exists already."""
     if name in module.globals:
         return module.globals[name], True
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [INTEGER] * count), name)
@@ -84,7 +84,7 @@ def number(value: int) -> Any:
 
 
 def pointer_at(builder: Any, address: Any, offset: Any, kind: Any) -> Any:
-    """Return a pointer to what begins `offset` bytes after an address."""
+    """Return a pointer `offset` bytes after an address."""
     return builder.inttoptr(builder.add(address, offset), kind.as_pointer())
 
 

@@ -3,8 +3,8 @@
 written as LLVM code for the processor at hand.
 
 A tile is up to three registers of rows times six columns. Reading beyond the last row or column of a matrix is harmless (what is
-read there reaches no result). Registers are written whole, what stands beyond the last row with its old value:
-a store with a mask takes a dozen cycles where there is no AVX-512. The memory must reach PADDING entries beyond its end,
+read there reaches no result). Registers are written whole, with the old values beyond the last row: a masked store takes a dozen cycles
+without AVX-512. The memory must reach PADDING entries beyond its end,
 and nobody else may write there.
 """
 
@@ -128,7 +128,7 @@ def _tile_rows(module: Any, name: str, like: Any, solves: bool) -> Any:
 
 
 def _tile(module: Any, name: str, like: Any, registers: int, solves: bool) -> Any:
-    """Return the function of one tile with so many registers of rows."""
+    """Return the function of one tile with the given number of registers of rows."""
     letter, kind, lanes = kind_of(like)
     function, known = function_named(module, f"femsense_{name}_{letter}{registers}", 9 if solves else 8)
     if known:

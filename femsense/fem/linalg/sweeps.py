@@ -17,7 +17,7 @@ ShortArray = npt.NDArray[np.int32]
 
 @njit(cache=True)
 def grouped(rows: ShortArray, columns: ShortArray) -> IntArray:
-    """Return aggregates: nodes whose neighbours are all free, with them; what is left joins a neighbour's aggregate."""
+    """Return aggregates: nodes whose neighbours are all unassigned, with these; remaining nodes join a neighbour's aggregate."""
     count = len(rows) - 1
     group = np.full(count, -1, np.int64)
     number = 0
@@ -73,7 +73,7 @@ def sweep_forward(
     x: SingleArray,
     left: SingleArray,
 ) -> None:
-    """Write x after a forward sweep from zero for K x = r, and what is left of r: −U x, with U the part above the diagonal."""
+    """Write x after a forward sweep from zero for K x = r, and the remaining residual −U x, with U the part above the diagonal."""
     near = np.empty(3 * np.diff(rows).max(), np.float32)
     for upper in range(2):
         for i in range(len(rows) - 1):

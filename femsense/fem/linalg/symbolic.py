@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""The symbolic factorisation: what the factors of all matrices of one pattern share."""
+"""The symbolic factorisation, common to all matrices of one pattern."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def _layout(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Analysis:
-    """What the factorisation of every matrix of one pattern shares. Nodes are `unit` unknowns each."""
+    """Data common to the factorisations of all matrices of one pattern. Each node has `unit` unknowns."""
 
     unit: int
     order: IntArray
@@ -281,8 +281,7 @@ class Analysis:
     owner: IntArray
     """Supernode of each unknown in the order of elimination, shape (f,)."""
     idle: dict[tuple[str, int], list[npt.NDArray[Any]]]
-    """Memory of what is gone, by kind and number of entries, taken again by what is new:
-    pages that are fresh from the system take longer than a factor."""
+    """Released memory by kind and number of entries, for reuse: fresh pages of the system take longer than a factor."""
     columns: dict[tuple[str, int], npt.NDArray[Any]]
     """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
 

@@ -90,7 +90,9 @@ class Expansion:
         self._stretches: list[tuple[FloatArray, FloatArray]] = []  # of the last equilibria that were learnt
         self.length = ALIKE * body.reach
         self._loads: FloatArray | None = None  # dead loads of the last series
-        self._answers: FloatArray | None = None  # to what is unbalanced at the start and to each cable, shape (a + 1, f)
+        self._answers: FloatArray | None = (
+            None  # responses to the residual at the expansion point and to each cable, shape (a + 1, f)
+        )
 
     def learn(self, x: FloatArray) -> None:
         """Keep the stretches of an equilibrium x: their stress serves the stiffness of starts to come."""

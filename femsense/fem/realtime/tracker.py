@@ -74,7 +74,7 @@ class Tracked:
 
 
 class Tracker:
-    """A body without friction and held cables whose tensions and nodal forces change by little from frame to frame."""
+    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame; without friction and without held cables."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class Tracker:
         self._trust = 1.0
         self._loads = np.zeros_like(body.mesh.nodes)
         self._terms: list[FloatArray] = []  # of the last series
-        self._growth = 0.0  # third term over second and first [1/m], the largest of late
+        self._growth = 0.0  # largest recent ratio of the third term to second and first [1/m]
         self._grown = False  # whether one is known from the start at hand
         self._learns = False  # whether the next sound state is to be learnt
         self._columns: dict[bytes, sp.csc_matrix] = {}
@@ -209,10 +209,10 @@ class Tracker:
             if begins and not self._begin(begins[-1], T):
                 return None
             x, first, error = self._summed(T, loads, last, 1 if anew and not begins else 3)
-            if count > 0 and np.isfinite(expected):  # the first term is how far the series before has missed
+            if count > 0 and np.isfinite(expected):  # the first term is the error of the previous series
                 self._trust = max(0.9 * self._trust, 1.0, 1.2 * self._trust * first / expected)
             motion = _largest(x - last)
-            # a start from farther off would flatter its terms
+            # an expansion point farther away would make the terms look too small
             trusted = first <= max(CLOSE * motion, self._floor) if begins else not anew
             if error <= self._allowed(motion) and trusted:
                 self._smooth = carried is not None and _largest(x - carried) <= NEAR * motion

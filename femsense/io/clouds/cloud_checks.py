@@ -1,4 +1,4 @@
-"""Whether the clouds of a recording can be what a camera saw of a robot: their unit, their frame, what their files say of the sensor."""
+"""Checks of the clouds of a recording: unit, coordinate frame, and the sensor pose in their files."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 
 CLOUDS_READ = 3
-"""So many clouds of a recording are looked at."""
+"""Number of clouds of a recording that are checked."""
 NEAR_BODY = 0.25
 """Points are near a body within its box, grown by this times its diagonal."""
 FEWEST_NEAR = 20
-"""A reading of a pose that brings so many points there is named."""
+"""Number of points near the robot from which an alternative reading of a pose is proposed."""
 OTHER_UNIT = 5.0
-"""Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
+"""Ratio of the distances of clouds and markers of a frame above which their units differ."""
 
 
 def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[int, int, PointCloud]]:
@@ -40,7 +40,7 @@ def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[
 
 
 def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[str]:
-    """Return what is wrong with the extents of a recording's clouds, against its markers and the robot."""
+    """Return the problems of the extents of a recording's clouds, compared with its markers and the robot."""
     clouds = some_clouds(recording)
     where = f"{recording.folder / 'clouds' if recording.folder else 'clouds'}"
     if not clouds:
@@ -71,7 +71,7 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
 
 
 def cloud_doubts(recording: Recording) -> list[str]:
-    """Return what of a recording's clouds is hardly meant: poses of the sensor in their files, points behind the camera or on it."""
+    """Return suspicious properties of a recording's clouds: sensor poses in their files, points behind or at the camera."""
     full = [(k, v, cloud) for k, v, cloud in some_clouds(recording) if len(cloud)]
     if not full:
         return []
@@ -83,7 +83,7 @@ def cloud_doubts(recording: Recording) -> list[str]:
 
 
 def doubts_of_cloud_poses(robot: Robot, recording: Recording) -> list[str]:
-    """Return given poses of cameras that leave no point near the robot, with the reading of the pose that brings them there."""
+    """Return the declared camera poses without points near the robot, each with the alternative reading that places points there."""
     low, high = robot.body.mesh.nodes.min(axis=0), robot.body.mesh.nodes.max(axis=0)
     margin = NEAR_BODY * float(np.linalg.norm(high - low))
     found = []

@@ -38,9 +38,9 @@ def read_cloud(path: str | Path) -> PointCloud:
 
 
 def viewpoint_doubt(path: str | Path) -> str | None:
-    """Return what is wrong with a PCD or PLY file that says that its sensor did not stand at the origin of its points; else None.
+    """Return a warning for a PCD or PLY file whose header has a sensor pose other than the origin; else None.
 
-    The points are read as they stand: programs disagree about whether that pose is already applied.
+    The points are read unchanged, because programs disagree about whether that pose is already applied.
     """
     file = Path(path)
     readers = {".pcd": pcd_viewpoint, ".ply": ply_viewpoint}
@@ -97,7 +97,7 @@ def cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], where: str | Pat
         where: the file, for messages.
 
     Raises:
-        InputError: no x, y or z, or colours that are not understood.
+        InputError: no x, y or z, or colours in an unknown layout.
     """
     missing = [name for name in "xyz" if name not in fields]
     if missing:

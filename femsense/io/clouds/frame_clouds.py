@@ -1,4 +1,4 @@
-"""The cloud of a frame, from a PLY, PCD or XYZ file or from a depth image; nothing is read before it is asked for."""
+"""The cloud of a frame, from a PLY, PCD or XYZ file or from a depth image, read on demand."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 FOLDERS = {"clouds": (".ply", ".pcd", ".xyz"), "depth": (".png",), "color": (".png", ".jpg", ".jpeg")}
-"""Folders of a recording and the endings of what is read there."""
+"""Folders of a recording → suffixes of the files that are read there."""
 BESIDE = (".txt", ".md", ".json", ".toml", ".csv", ".yaml", ".yml")
-"""Endings of notes that may lie beside clouds and images."""
+"""Suffixes of other files that are allowed next to clouds and images."""
 
 
 def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool = True) -> PointCloud | None:
@@ -34,10 +34,10 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool
         recording: the recording.
         k: index of the frame.
         view: index of the camera.
-        mixed: whether pixels count that saw two surfaces at once (see `without_mixed_pixels`, and for files `without_mixed_points`).
+        mixed: keep pixels that mix two surfaces (see `without_mixed_pixels`, and for files `without_mixed_points`).
 
     Raises:
-        InputError: a file that is broken, or of another size than the camera table says.
+        InputError: a broken file, or one whose size differs from the camera table.
     """
     file = recording.cloud_files[k][view]
     if file is None:

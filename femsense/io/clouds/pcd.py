@@ -1,8 +1,7 @@
 """PCD files with all their fields (labels too), read by pypcd4: ascii, binary and binary_compressed.
 
-pypcd4 is strict about headers and spaces, and takes fields of several values apart.
-What older writers leave out is filled in before it reads (VERSION, COUNT, WIDTH and HEIGHT),
-and such fields are put together after it.
+pypcd4 is strict about headers and spaces, and splits fields of several values. Entries that older writers omit (VERSION, COUNT, WIDTH and
+HEIGHT) are added before reading, and such fields are joined afterwards.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ MOST_OF_A_LINE = 65536
 def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     """Return the columns of a PCD file by name, each of shape (n,), or (n, count) where a field holds several values.
 
-    Nothing is left out or converted: points without depth are NaN, `rgba` is a packed integer, `label` stays.
+    Values are not filtered or converted: points without depth are NaN, `rgba` is a packed integer, `label` is kept.
 
     Raises:
-        InputError: no such file, a broken header, fewer data than it promises.
+        InputError: no such file, a broken header, fewer data than it declares.
     """
     from pypcd4 import PointCloud
 
@@ -57,8 +56,8 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
 
 
 def pcd_viewpoint(path: str | Path) -> FloatArray | None:
-    """Return where the header says that the sensor stood, T_cloud_sensor, shape (4, 4), translation in the file's unit;
-    None where it is the origin of the cloud. Raises InputError."""
+    """Return the sensor pose of the header, T_cloud_sensor, shape (4, 4), translation in the file's unit; None for the origin of the
+    cloud. Raises InputError."""
     from scipy.spatial.transform import Rotation
 
     file = Path(path)
@@ -67,7 +66,7 @@ def pcd_viewpoint(path: str | Path) -> FloatArray | None:
     try:
         x, y, z, qw, qx, qy, qz = (float(word) for word in words)
         T = make_pose(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), [x, y, z])
-    except ValueError:  # not seven numbers, or a quaternion of zeros: it says nothing
+    except ValueError:  # not seven numbers, or a zero quaternion: no pose
         return None
     return None if np.allclose(T, np.eye(4), atol=1e-9) else T
 
@@ -90,7 +89,7 @@ def _check_points(words: dict[str, list[str]], file: Path) -> None:
 
 
 PADDING = "#$%&~~"
-"""What pypcd4 puts before the name of a field `_`, which is padding."""
+"""Prefix that pypcd4 adds to fields named `_`, which are padding."""
 
 
 def _split(data: bytes, file: Path) -> tuple[dict[str, list[str]], bytes]:

@@ -114,7 +114,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
 
 
 def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
-    """Return the storage, the elements, and what comes after the header."""
+    """Return the storage format, the elements, and the data after the header."""
     end = data.find(b"end_header")
     line_end = data.find(b"\n", end)
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
@@ -136,7 +136,7 @@ def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
                 continue
             case _:
                 raise InputError(
-                    "a line of the PLY header that says nothing", where=file, found=line, expected="format, element, property"
+                    "an unknown line in the PLY header", where=file, found=line, expected="format, element, property"
                 )
     if storage not in _ORDERS:
         raise InputError("unknown storage", where=file, found=f"format {storage}", expected=", ".join(_ORDERS))

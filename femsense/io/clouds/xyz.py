@@ -1,5 +1,5 @@
-"""Text files of points (.xyz): x y z in a line, then perhaps a normal or a colour; blanks, commas, semicolons or tabs between, and beside
-semicolons, tabs or blanks decimal commas."""
+"""Text files of points (.xyz): x y z in each line, optionally followed by a normal or a colour; separated by blanks, commas, semicolons
+or tabs, except for commas also with decimal commas."""
 
 from __future__ import annotations
 

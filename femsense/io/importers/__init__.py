@@ -1,1 +1,1 @@
-"""What other programs record, as frames: one file a format. `guess` finds the format, `writer` makes the recording."""
+"""Importers of recordings of other programs, one module per format. `guess` identifies the format, `writer` writes the recording."""

@@ -61,7 +61,7 @@ def open_c3d(path: Path, options: Options) -> Source:
     """Return a C3D file as a source.
 
     Raises:
-        InputError: no C3D file, no points, shorter than it says and without a whole frame, a unit that nobody says.
+        InputError: not a C3D file, no points, truncated before the first whole frame, or no unit.
     """
     header = read_c3d_header(path)
     if not header.points:
@@ -85,7 +85,7 @@ def open_c3d(path: Path, options: Options) -> Source:
     notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
     notes += header.disagreements
     left_out = [name for name in header.labels if name in header.outputs]
-    notes += [f"results of a model, which are no places, are left out: {', '.join(left_out)}"] if left_out else []
+    notes += [f"model outputs, which are not positions, are left out: {', '.join(left_out)}"] if left_out else []
     tracks = tracks_of(header.labels)
     return capture_source(
         path,
@@ -162,7 +162,7 @@ def _outputs(parameters: Parameters) -> frozenset[str]:
 
 
 def _disagreements(parameters: Parameters, points: int, rate: float, frames: int) -> tuple[str, ...]:
-    """Return where the header and the parameters of a file say different things: the header counts what is stored."""
+    """Return the differences between the header and the parameters of a file; the header describes the stored data."""
     used = int(_scalar(parameters.get(("POINT", "USED")), points))
     other_rate = _scalar(parameters.get(("POINT", "RATE")), rate)
     labels, names = len([name for name in _texts(parameters, "LABELS") if name]), parameters.get(("POINT", "LABELS"))
@@ -303,7 +303,7 @@ def _labels(parameters: Parameters, points: int) -> tuple[str, ...]:
 
 
 def _frame_count(parameters: Parameters, header: int) -> int:
-    """Return the number of frames: beyond 65535 the header cannot say it."""
+    """Return the number of frames; above 65535 it does not fit into the header."""
     start, end = parameters.get(("TRIAL", "ACTUAL_START_FIELD")), parameters.get(("TRIAL", "ACTUAL_END_FIELD"))
     if start is None or end is None or len(start) < 2 or len(end) < 2:
         long = _scalar(parameters.get(("POINT", "LONG_FRAMES")), 0.0)

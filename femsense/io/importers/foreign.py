@@ -1,4 +1,4 @@
-"""Captures in formats that only their camera's own program reads, and what that program exports that `femsense import` reads."""
+"""Formats that only the camera's own program reads, each with the export that `femsense import` reads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXPORTS = {
         "a video has no depth: export depth images or clouds from the program that recorded it, not the picture that it shows"
     ),
 }
-"""Endings → what it is and how it is exported; `{name}` stands for the file."""
+"""Suffixes → description and export command; `{name}` is the file."""
 
 
 def export_hint(path: Path) -> str | None:

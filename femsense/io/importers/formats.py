@@ -39,7 +39,7 @@ def format_of(path: Path) -> Format | None:
 
 
 def contents_of(one: Format, path: Path) -> dict[str, Any]:
-    """Return what a capture holds, without reading its frames. Raises InputError: it is broken or empty."""
+    """Return the contents of a capture, without reading its frames. Raises InputError if it is broken or empty."""
     if one.list is not None:
         return {"format": one.name, **one.list(path)}
     source = one.open(path, Options(rate=1.0, unit="m"))

@@ -47,9 +47,9 @@ class Frame:
     time: float
     """[s] on the source's clock."""
     picture: Callable[[], Images | PointCloud] | None = None
-    """Decodes the images or the cloud [m, camera frame] when it is asked for; raises InputError where they are broken."""
+    """Decodes the images or the cloud [m, camera frame] on demand; raises InputError if they are broken."""
     markers: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
-    """Name → place [m], shape (3,); hidden ones are left out."""
+    """Name → position [m], shape (3,), without hidden markers."""
     unlabelled: npt.ArrayLike = ()
     """Places of markers of unknown name [m], shape (k, 3)."""
     inputs: Mapping[str, float] = field(default_factory=dict)
@@ -57,7 +57,7 @@ class Frame:
     loads: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]] = ()
     """Place [m] and force [N], robot frame, each of shape (3,)."""
     views: Mapping[str, Frame] = field(default_factory=dict)
-    """Camera → what it alone gave at this moment; where there is one, picture and markers stand here and not above."""
+    """Camera → its own data at this time; with several cameras, images and markers are here and not in the fields above."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,7 +72,7 @@ class Source:
     camera: Camera | None = None
     """Where pictures are depth images."""
     actuation: str | None = None
-    """"tension" or "displacement"; None where the source does not say."""
+    """"tension" or "displacement"; None if the source does not declare it."""
     actuation_by_unit: bool = False
     """Whether units of the file give the actuation, so that another one is an error."""
     count: int | None = None
@@ -80,13 +80,13 @@ class Source:
     notes: Sequence[str] = ()
     """Assumptions and losses that the user should know."""
     T_robot_camera: FloatArray | None = None
-    """Shape (4, 4), translation [m], where the source says it."""
+    """Shape (4, 4), translation [m]; None if the source does not declare it."""
     views: Mapping[str, Source] = field(default_factory=dict)
     """Camera → its own source, where several look; see `several.joined`."""
     free: Sequence[tuple[float, float]] = ()
     """See `Options.free`."""
     names: Mapping[str, Sequence[Becomes]] = field(default_factory=dict)
-    """Name that `--map` may take → what it may become; see `mapping.check_names`."""
+    """Name that `--map` accepts → its allowed targets; see `mapping.check_names`."""
     format: str = ""
     """A name of `formats.FORMATS`, given by `Format.opened`."""
 
@@ -141,7 +141,7 @@ def is_kept_as_image(camera: Camera) -> bool:
     """Whether a depth image of a camera is kept as an image.
 
     The "inverse" model of the RealSense SDK is not the inverse of OpenCV's polynomial (20 mm apart at 1 m with its usual coefficients):
-    such images become clouds, which nobody can misread.
+    such images become clouds, which are unambiguous.
     """
     return not np.any(camera.distortion != 0.0) or camera.distortion_model != "inverse_brown_conrady"
 
@@ -151,9 +151,9 @@ def unit_of(options: Options, declared: str | None, where: str | Path | None, ex
 
     Arguments:
         options: of the user.
-        declared: the unit that the file names; None where it names none.
+        declared: the unit in the file; None without one.
         where: the file, for the message.
-        extent: size of what was recorded in the file's unit, for the message.
+        extent: size of the scene in the file's unit, for the message.
 
     Raises:
         InputError: neither gives the unit.

@@ -27,14 +27,14 @@ UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is
 
 
 def open_source(path: str | Path, options: Options | None = None) -> Source:
-    """Return what a file or a folder holds, ready to be read frame by frame.
+    """Return the contents of a file or folder as a source that is read frame by frame.
 
     Arguments:
         path: the file or folder.
-        options: what a person says about it.
+        options: of the user.
 
     Raises:
-        InputError: nothing there, no format that is known, or a choice that a person must make: what can be chosen is named.
+        InputError: no such file, an unknown format, or a choice that the user must make; the message lists the options.
     """
     said = options or Options()
     check_targets(said.columns)
@@ -55,10 +55,10 @@ def _opened(path: str | Path, said: Options) -> Source:
         raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
     one = _format(source, said)
     if said.base is not None and not one.transforms:
-        raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
+        raise InputError("coordinate frames exist in bags only", where=f"--base {said.base}", found=source)
     if said.depth_unit is not None and not one.whole_depths:
         raise InputError(
-            "a unit of depth images is said of what has none, or one of its own",
+            "--depth-unit for a source without depth images, or with a unit of its own",
             where=f"--depth-unit {said.depth_unit:g}",
             found=one.name,
             expected=", ".join(name for name, other in FORMATS.items() if other.whole_depths),
@@ -67,7 +67,7 @@ def _opened(path: str | Path, said: Options) -> Source:
 
 
 def _format(source: Path, said: Options) -> Format:
-    """Return the format that a person says, else the one that the source has. Raises InputError."""
+    """Return the format of the options, else the identified one. Raises InputError."""
     one = FORMATS.get(said.format) if said.format else format_of(source)
     if one is not None:
         return one
@@ -93,14 +93,15 @@ def _hint_of_many(folder: Path) -> str | None:
 
 
 def open_sources(paths: Sequence[str | Path], options: Options | None = None) -> Source:
-    """Return what one or several captures hold; of several each is a camera (or a motion capture) of one recording.
+    """Return the contents of one or several captures as one source; each of several is a camera or a motion capture of the same
+    recording.
 
     Arguments:
         paths: files or folders; NAME=PATH names the camera.
-        options: what a person says about all of them; a topic that one bag does not hold is another's.
+        options: of the user, for all of them; a topic may be in any of the bags.
 
     Raises:
-        InputError: as `open_source`; names that stand twice; clocks that do not overlap, also by time of recording.
+        InputError: as `open_source`; duplicate names; clocks that do not overlap, not even by recording time.
     """
     said = options or Options()
     if len(paths) > FEW_CAMERAS and not any("=" in str(path) for path in paths):
@@ -125,9 +126,7 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
     check_targets(said.columns)
     names = [name or other for (name, _), other in zip(given, guessed)]
     if len(set(names)) < len(names):
-        raise InputError(
-            "a name of a camera stands twice", where="SOURCE", found=", ".join(names), expected="NAME=PATH with names"
-        )
+        raise InputError("a camera name occurs twice", where="SOURCE", found=", ".join(names), expected="NAME=PATH with names")
     files = [path for _, path in given]
     try:
         source = joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
@@ -159,7 +158,7 @@ def _one_of(path: Path, options: Options) -> Source:
     source = _opened(path, options)
     if source.views:
         raise InputError(
-            "a capture with several cameras beside others", where=path, found=", ".join(source.views), expected="one"
+            "a capture with several cameras together with others", where=path, found=", ".join(source.views), expected="one"
         )
     return source
 
@@ -179,9 +178,9 @@ def guess_format(path: Path) -> str | None:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """Return what a capture holds, without reading its frames: for `femsense inspect`.
+    """Return the contents of a capture for `femsense inspect`, without reading its frames.
 
     Raises:
-        InputError: it is broken, empty, or nothing that is known.
+        InputError: it is broken, empty, or of an unknown format.
     """
     return contents_of(_format(path, Options()), path)

@@ -15,7 +15,7 @@ from femsense.core.arrays import FloatArray
 from femsense.io.files import plain
 
 JOURNAL = ".import-journal"
-"""Name of the file in the unfinished folder; its first line says what the import is made from."""
+"""Name of the file in the unfinished folder; its first line identifies the source and the options."""
 
 
 class Picture(StrEnum):
@@ -48,13 +48,13 @@ class Entry:
     loads: list[list[float]]
     """Six numbers each: place [m], force [N]."""
     seen: Mapping[str, Seen]
-    """Camera → what it gave; the name is empty where there is one camera."""
+    """Camera → its data; the name is empty for a single camera."""
     number: int = 0
     """Its pictures carry it as their name."""
 
     @property
     def center(self) -> list[float] | None:
-        """Mean of what the first camera sees [m], to follow motion."""
+        """Mean position of the first camera's points [m], as a measure of motion."""
         return next((seen.center for seen in self.seen.values()), None)
 
 

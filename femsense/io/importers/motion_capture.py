@@ -17,7 +17,7 @@ from femsense.io.importers.options import Options
 from femsense.io.importers.tables.mapping import Becomes
 
 NAMELESS = "*"
-"""Labels of tracks that nobody named begin so (Vicon Nexus)."""
+"""Prefix of the labels of unnamed tracks (Vicon Nexus)."""
 LOOKED_AT = 500
 """Number of first rows whose extent is compared with that of a scene."""
 
@@ -27,7 +27,7 @@ class Track:
     """One marker over time."""
 
     name: str
-    """"" where the program could not tell which marker it is."""
+    """"" for an unidentified marker."""
     label: str
     """The name in the file, with the subject."""
 
@@ -130,7 +130,7 @@ def _extent(places: FloatArray) -> float:
 
 
 def _numbered(names: Sequence[str]) -> list[str]:
-    """Return names of which each stands once: the second tip is tip_2."""
+    """Return unique names: the second tip becomes tip_2."""
     before = [names[:k].count(name) for k, name in enumerate(names)]
     return [f"{name}_{count + 1}" if name and count else name for name, count in zip(names, before)]
 

@@ -34,7 +34,7 @@ class Clock(StrEnum):
 
 
 class Inputs(StrEnum):
-    """What the cables' values are."""
+    """The quantity of the cable inputs."""
 
     tension = "tension"
     displacement = "displacement"
@@ -51,11 +51,13 @@ class Zero(StrEnum):
 class InputOptions:
     """Options of the inputs of a recording."""
 
-    inputs: Annotated[Inputs | None, Flag("--inputs", help="What the cables' values are.")] = None
+    inputs: Annotated[Inputs | None, Flag("--inputs", help="Quantity of the cable inputs.")] = None
     """None: as declared by the source."""
-    zero: Annotated[Zero | None, Flag("--zero", help="What they count from.")] = None
+    zero: Annotated[Zero | None, Flag("--zero", help="Their zero.")] = None
     actuation: Annotated[Path | None, Flag("--actuation", "FILE", "A CSV file with the inputs over time.")] = None
-    offset: Annotated[float | None, Flag("--offset", "S", "The frames' time minus that file's; else from motion.")] = None
+    offset: Annotated[
+        float | None, Flag("--offset", "S", "Time of the frames minus time of that file; default: from the motion.")
+    ] = None
     """None: found from the motion."""
 
 
@@ -100,35 +102,46 @@ def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Options:
-    """Options of a source; the defaults leave all to the file."""
+    """Options of a source; by default everything is taken from the file."""
 
-    format: Annotated[str | None, Flag("--format", "NAME", "If the guess is wrong; see femsense docs importing.")] = None
-    topics: Annotated[Sequence[str], Flag("--topic", "NAME", "What to take, where there is a choice.", read=tuple)] = ()
+    format: Annotated[str | None, Flag("--format", "NAME", "Format, if it is not identified; see femsense docs importing.")] = (
+        None
+    )
+    topics: Annotated[
+        Sequence[str], Flag("--topic", "NAME", "Topics of a bag, or markers of a motion capture, to import.", read=tuple)
+    ] = ()
     """Topics, streams, tracks or names."""
     columns: Annotated[
         Mapping[str, str],
-        Flag("--map", "NAME=TARGET", "Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.", read=columns_named),
+        Flag(
+            "--map",
+            "NAME=TARGET",
+            "Meaning of a name of the source: motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.",
+            read=columns_named,
+        ),
     ] = field(default_factory=dict)
     """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02;
     may end in *FACTOR."""
-    unit: Annotated[str | None, Flag("--unit", "m|cm|mm|in|ft", "Of lengths.")] = None
+    unit: Annotated[str | None, Flag("--unit", "m|cm|mm|in|ft", "Unit of lengths.")] = None
     """One of UNITS."""
-    up: Annotated[Axis | None, Flag("--up", None, "The vertical axis; it is turned to z.")] = None
+    up: Annotated[Axis | None, Flag("--up", None, "Vertical axis of the source; it is rotated to z.")] = None
     clock: Annotated[Clock, Flag("--clock", None, "Which time stamps of a bag.")] = Clock.AUTO
-    rate: Annotated[float | None, Flag("--rate", "HZ", "Where the source has no times.")] = None
+    rate: Annotated[float | None, Flag("--rate", "HZ", "Frame rate of a source without times.")] = None
     """Frames a second."""
-    base: Annotated[str | None, Flag("--base", "FRAME", "Frame of a bag's transforms that is the robot's.")] = None
+    base: Annotated[str | None, Flag("--base", "FRAME", "Robot frame in the static transforms of a bag.")] = None
     """Coordinate frame of the static transforms: poses of cameras are taken from them."""
     shifts: Annotated[
         Mapping[str, float], Flag("--shift", "CAMERA=S", "Seconds to add to a camera's times.", read=shifts_named)
     ] = field(default_factory=dict)
     """Camera → seconds, where clocks differ."""
-    depth_unit: Annotated[float | None, Flag("--depth-unit", "M", "Metres in one unit of depth images, if it is another.")] = None
-    every: Annotated[int, Flag("--every", "N", "Take one of so many frames.", min=1)] = 1
+    depth_unit: Annotated[
+        float | None, Flag("--depth-unit", "M", "Metres per unit of integer depth images, if not that of the source.")
+    ] = None
+    every: Annotated[int, Flag("--every", "N", "Import every N-th frame.", min=1)] = 1
     free: Annotated[
         Sequence[tuple[float, float]],
-        Flag("--free", "FROM:TO", "Seconds after the first frame; nothing touches the robot.", read=free_named),
+        Flag("--free", "FROM:TO", "Contact-free interval, in seconds after the first frame.", read=free_named),
     ] = ()
     """From and to [s]."""
     log_names: Sequence[str] = ()
-    """Columns of a log of actuation beside it, for messages."""
+    """Columns of a separate actuation log, for messages."""

@@ -31,7 +31,7 @@ class Wanted:
     """Options of the user about the inputs."""
 
     actuation: str | None = None
-    """"tension" or "displacement", where the source does not say."""
+    """"tension" or "displacement", if the source does not declare it."""
     zero: str | None = None
     """"absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero."""
     log: ActuationLog | None = None
@@ -83,7 +83,7 @@ def _input_columns(journal: Journal) -> list[str]:
 def _known_inputs(
     source: Source, part: Path, journal: Journal, columns: list[str], applied: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """Return the inputs of all frames, shape (frames, columns); those where one is not known are left out, with a warning.
+    """Return the inputs of all frames, shape (frames, columns); frames with an unknown input are removed with a warning.
 
     Raises:
         InputError: none are left.
@@ -129,7 +129,7 @@ def actuation_of(source: Source, columns: list[str], said: str | None) -> str:
         raise another_kind(source.path, str(said), str(source.actuation))
     if kind is None and cables:
         raise InputError(
-            "what the cables' values are is not known",
+            "the quantity of the cable inputs is not known",
             where=source.path,
             found=", ".join(cables[:6]),
             expected="--inputs tension (newtons) or --inputs displacement (metres, > 0 shortens)",
@@ -139,9 +139,7 @@ def actuation_of(source: Source, columns: list[str], said: str | None) -> str:
 
 
 def another_kind(path: Path, said: str, by_unit: str) -> InputError:
-    return InputError(
-        "the units of the cables' columns say something else", where=f"{path}, --inputs {said}", found=by_unit, expected=said
-    )
+    return InputError("the units of the cables' columns disagree", where=f"{path}, --inputs {said}", found=by_unit, expected=said)
 
 
 def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:

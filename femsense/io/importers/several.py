@@ -32,10 +32,10 @@ class Match:
 
 
 def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Source:
-    """Return several sources as one whose frames hold what each gave at that moment.
+    """Return several sources as one whose frames contain the data of each at that time.
 
-    The frames are those of the first source with pictures; of the others each takes the nearest in time,
-    at most half a step of the first away. Inputs and loads come from the first source that has them.
+    The frames are those of the first source with images; of each other source the nearest in time is used, at most half a frame away.
+    Inputs and loads come from the first source that has them.
 
     Arguments:
         sources: camera → its source.
@@ -43,7 +43,7 @@ def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Sourc
         options: `shifts` are added to a camera's times.
 
     Raises:
-        InputError: a shift for a camera that is not there, or clocks that do not overlap.
+        InputError: a shift for an unknown camera, or clocks that do not overlap.
     """
     unknown = [name for name in options.shifts if name not in sources]
     if unknown:
@@ -70,7 +70,7 @@ def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Sourc
 
 
 def camera_names(labels: list[str]) -> list[str]:
-    """Return names for cameras from what tells their paths or topics apart; cam1, cam2, … where that is no name."""
+    """Return camera names: the differing part of their paths or topics; cam1, cam2, … if that is not a valid name."""
     parts = [[part for part in re.split(r"[/\\]", label) if part] for label in labels]
     for column in zip(*parts):
         names = [re.sub(r"[\s.,;\"]+", "_", Path(part).stem) for part in column]
@@ -91,7 +91,7 @@ def _rising(frames: Iterator[Frame]) -> Iterator[Frame]:
 def _times(source: Source) -> FloatArray:
     """Return the times of a source's frames [s]; no picture is decoded."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # told when the frames are written
+        warnings.simplefilter("ignore")  # reported when the frames are written
         return np.fromiter((frame.time for frame in _rising(source.frames())), dtype=np.float64)
 
 

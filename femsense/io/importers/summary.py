@@ -20,7 +20,7 @@ JUMP = 5.0
 
 
 def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict[str, Any]:
-    """Return what was found, with units in the names; warns of swapped labels and of lost frames."""
+    """Return the summary of an import, with units in the keys; warns of swapped labels and of lost frames."""
     times = journal.times()
     step = np.diff(times)
     usual = float(np.median(step)) if len(step) else None
@@ -62,7 +62,7 @@ def _pictures(journal: Journal) -> dict[str, int | None]:
 
 
 def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:
-    """Return for each of several cameras what it gave."""
+    """Return the summary of each of several cameras."""
     pictures, markers = dict.fromkeys(source.views, 0), dict.fromkeys(source.views, 0)
     for entry in journal.entries():
         for name, seen in entry.seen.items() if source.views else ():

@@ -50,32 +50,31 @@ def write_recording(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write the frames of a source as a recording, or go on where an earlier import of the same was stopped.
+    """Write the frames of a source as a recording, or resume an interrupted import of the same source.
 
     Arguments:
         source: what an importer found.
         folder: the final place.
-        identity: what the import is made from: only an unfinished folder of the same is continued.
-        actuation: "tension" or "displacement", where the source does not say.
+        identity: source and options; only an unfinished import with the same identity is resumed.
+        actuation: "tension" or "displacement", if the source does not declare it.
         zero: "absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero.
-        log: inputs on a clock of their own.
-        offset: source time minus the log's time [s]; None finds it from the motion.
-        replace: an earlier import at this place goes when the new one is whole; other files in its folder stay.
-        progress: called with (frames done, frames in all).
+        log: inputs with their own clock.
+        offset: source time minus the log's time [s]; None estimates it from the motion.
+        replace: replace an earlier import once the new one is complete; other files in its folder are kept.
+        progress: called with (frames done, total number of frames).
 
     Returns:
         what was found and written, as in import.json.
 
     Raises:
-        InputError: no frames, none of the pictures readable, columns whose meaning nobody said, tables that were changed since,
-            another import at work there.
+        InputError: no frames, no readable image, columns without a meaning, tables that were changed since, another import writing there.
     """
     if replace:
         check_unchanged(followed(folder))
     if log is not None:
         if actuation and log.actuation not in (None, actuation):
             raise another_kind(log.path, actuation, str(log.actuation))
-        actuation_of(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
+        actuation_of(source, list(log.columns), actuation or log.actuation)  # before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
     made = [parent for parent in final.parents if not parent.exists()]
@@ -98,7 +97,7 @@ def _write_and_name(
     replace: bool,
     progress: Progress | None,
 ) -> dict[str, Any]:
-    """Write the unfinished folder and give it its name; what is refused leaves nothing, what is stopped is gone on with."""
+    """Write the unfinished folder and rename it. A refused import is removed, an interrupted one can be resumed."""
     try:
         _prepare(part, identity)
         with Journal(part, identity) as journal:
@@ -117,10 +116,10 @@ def _write_and_name(
 
 
 def _accepted(path: Path, part: Path, final: Path, found: Mapping[str, Any]) -> dict[str, str]:
-    """Load what was written as the other commands will, and warn of what it can hardly hold.
+    """Load the recording as the other commands do, and warn of implausible values.
 
     Raises:
-        InputError: they would refuse it; the message names the source, and the place that the finished folder would have.
+        InputError: the other commands would refuse it; the message names the source and the final folder.
     """
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -149,7 +148,7 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
     lost = counts["out_of_order"]
     if lost:
         first = f"the first is number {counts['first_back']} in the file"
-        hint = "stamps that were rounded stand still; a clock that was set back begins anew: export the times with all digits"
+        hint = "repeated time stamps were rounded, or a clock was set back: export the times with all digits"
         if lost > kept:
             raise InputError(
                 "the time does not go on",
@@ -158,16 +157,16 @@ def _check_counts(source: Source, counts: Mapping[str, int], kept: int) -> None:
                 expected="frames in order of time",
                 hint=hint,
             )
-        text = f"{lost} of {lost + kept} frames are dropped, since the time stands still or goes back, {first}"
+        text = f"{lost} of {lost + kept} frames are dropped, since the time repeats or goes back, {first}"
         warnings.warn(f"{source.path}: {text}; {hint}", stacklevel=4)
     if source.count is not None and abs(lost + kept - source.count) > max(1, source.count // 100):
         warnings.warn(f"{source.path}: {source.count} frames are announced, {lost + kept} were read", stacklevel=4)
 
 
 def _give_name(part: Path, final: Path, replace: bool) -> None:
-    """Rename the finished folder. Raises InputError where something stands there that is not to be replaced."""
+    """Rename the finished folder. Raises InputError if the final name exists and must not be replaced."""
     if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
-        raise InputError("something stands there already", where=final, expected="a new place for the recording")
+        raise InputError("the folder exists and is not an import", where=final, expected="a new folder for the recording")
     if not final.exists():
         part.rename(final)
         return
@@ -182,7 +181,7 @@ def _give_name(part: Path, final: Path, replace: bool) -> None:
 
 
 def check_unchanged(folder: Path) -> None:
-    """Refuse to replace an import whose tables somebody changed since, or added to. Raises InputError."""
+    """Refuse to replace an import whose tables were changed or extended since. Raises InputError."""
     if not (folder / RECORD).is_file():
         return
     written = json.loads((folder / RECORD).read_text(encoding="utf-8")).get("tables", {})
@@ -205,7 +204,7 @@ def _prepare(part: Path, identity: Mapping[str, Any]) -> None:
 
 
 def _write_frames(source: Source, part: Path, journal: Journal, progress: Progress | None) -> dict[str, int]:
-    """Write what comes after the frames that the journal holds; return the count of frames that were left out."""
+    """Write the frames after those of the journal; return the number of skipped frames."""
     done = journal.done or 0
     last = -np.inf if not done else float(journal.times()[-1])
     number, counts = done, {"out_of_order": 0, "resumed": done, "first_back": 0}
@@ -222,7 +221,7 @@ def _write_frames(source: Source, part: Path, journal: Journal, progress: Progre
 
 
 def _after(frames: Iterator[Frame], done: int, counts: dict[str, int]) -> Iterator[Frame]:
-    """Yield what comes after the first `done` frames that time goes on in; nothing of those is decoded."""
+    """Yield the frames after the first `done` ones with increasing times; those are not decoded."""
     last, passed = -np.inf, 0
     while passed < done:
         frame = next(frames, None)
@@ -244,7 +243,7 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
 
 
 def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int) -> Seen:
-    """Write what one camera gives in a frame; its name, if there are several, is that of its folders."""
+    """Write the data of one camera in a frame; with several cameras its name is that of its folders."""
     kind, center = Picture.NONE, None
     if frame.picture is not None:
         try:

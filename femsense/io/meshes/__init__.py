@@ -1,1 +1,1 @@
-"""Mesh files of other programs, as points, cells and what the file says of each cell."""
+"""Mesh files of other programs: points, cells and cell data."""

@@ -47,7 +47,7 @@ class _Mesh:
 
 
 def read_abaqus(path: Path, where: str) -> MeshContent:
-    """Return the mesh of an Abaqus input file. Raises InputError with what is not understood."""
+    """Return the mesh of an Abaqus input file. Raises InputError for unsupported content."""
     whole, parts = _Mesh(), dict[str, _Mesh]()
     instances: list[tuple[str, _Mesh, FloatArray]] = []
     target, in_assembly = whole, False
@@ -170,7 +170,7 @@ def _add(target: _Mesh, keyword: str, options: dict[str, str], lines: list[str],
 def _chosen(
     whole: _Mesh, parts: dict[str, _Mesh], instances: list[tuple[str, _Mesh, FloatArray]], where: str
 ) -> tuple[_Mesh, FloatArray]:
-    """Return the one body and where it stands. Raises InputError where there are several."""
+    """Return the single body and its transformation. Raises InputError if there are several."""
     bodies = [(name, mesh, T) for name, mesh, T in instances if mesh.solid]
     if not instances:
         bodies = [(name, mesh, np.eye(4)) for name, mesh in parts.items() if mesh.solid]

@@ -29,9 +29,9 @@ def indices_of(wanted: IntArray, numbers: IntArray, where: str | Path) -> IntArr
     """Return the indices of nodes by their numbers in the file, of the shape of `wanted`.
 
     Arguments:
-        wanted: numbers that elements name.
+        wanted: node numbers of the elements.
         numbers: of the nodes, each once, in any order, shape (n,).
-        where: what a message names.
+        where: for messages.
 
     Raises:
         InputError: a number that no node has.
@@ -82,8 +82,8 @@ def _joined_data(tables: list[dict[str, npt.NDArray[np.generic]]]) -> dict[str, 
 
 
 def distinct_cells(cells: IntArray) -> tuple[IntArray, IntArray]:
-    """Return which cells are kept when each set of corners stands once, shape (k,), and for every cell its kept one,
-    shape (m,)."""
+    """Return the cells that remain after duplicates (equal sets of corners) are removed, shape (k,), and for every cell its remaining
+    one, shape (m,)."""
     keys = np.sort(cells[:, :4], axis=1)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     kept = np.sort(first)

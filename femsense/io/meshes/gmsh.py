@@ -78,7 +78,7 @@ class _Stream:
         return [int(value) for value in self.rows(1, kinds)[0]]
 
     def line(self) -> int:
-        """Return the whole number of a line of text, which counts what follows in the older formats."""
+        """Return the integer in a line of text; in the older formats it is the number of entries that follow."""
         if not self._binary:
             return self.one("i")[0]
         end = self._body.index(b"\n", self._at)
@@ -92,12 +92,12 @@ Part = TypeVar("Part", FloatArray, bytes)
 
 def _whole(part: Part, size: int) -> Part:
     if len(part) < size:
-        raise ValueError("the file ends before what it announces")
+        raise ValueError("the file ends before the announced number of entries")
     return part
 
 
 def read_gmsh(path: Path, where: str) -> MeshContent:
-    """Return the content of a Gmsh mesh. Raises InputError with what is not understood."""
+    """Return the content of a Gmsh mesh. Raises InputError for unsupported content."""
     data = path.read_bytes()
     if b"\r\n" in data[:200] and b"\0" not in data[:200]:
         data = data.replace(b"\r\n", b"\n")
@@ -176,7 +176,7 @@ def _elements_of_lines(body: bytes, *, fixed: int | None) -> list[Block]:
 
     Arguments:
         body: the section.
-        fixed: so many words stand between type and nodes, the first is the group; None: the third word counts the groups.
+        fixed: number of words between type and nodes, of which the first is the group; None: the third word is the number of groups.
     """
     lines = body.split(b"\n")
     count, lines = int(lines[0]), [line for line in lines[1:] if line.strip()]
@@ -241,7 +241,7 @@ def _content(numbers: IntArray, points: FloatArray, blocks: Sequence[Block], whe
     known = np.sort(numbers)
     if (np.diff(known) == 0).any():
         raise InputError(
-            "a node stands twice", where=where, found=f"node {int(known[:-1][np.diff(known) == 0][0])}", expected="each node once"
+            "a node occurs twice", where=where, found=f"node {int(known[:-1][np.diff(known) == 0][0])}", expected="each node once"
         )
     cells: dict[str, list[IntArray]] = {}
     tags: dict[str, list[IntArray]] = {}

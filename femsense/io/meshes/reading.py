@@ -1,4 +1,4 @@
-"""Mesh files of any format that is known: read whole, or refused with what was found."""
+"""Mesh files of any known format, read completely or refused with a reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NASTRAN = (".bdf", ".nas", ".fem")
 
 
 def file_format(path: Path) -> str | None:
-    """Return meshio's name of a mesh file's format from its content; None where only the ending says it."""
+    """Return meshio's name of the format from the file's content; None if only the suffix determines it."""
     with path.open("rb") as stream:
         head = stream.read(512).lstrip()
     starts = (
@@ -37,7 +37,7 @@ def file_format(path: Path) -> str | None:
 
 
 def read_content(path: Path, where: str) -> MeshContent:
-    """Return what a mesh file holds, points checked to be finite and in space. Raises InputError."""
+    """Return the content of a mesh file; points must be finite and three-dimensional. Raises InputError."""
     try:
         content = _read(path, where)
     except InputError:
@@ -84,7 +84,7 @@ def _read(path: Path, where: str) -> MeshContent:
         with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
             return joined([_through_meshio(file, kind) for file in split_pieces(path, Path(folder))])
     if path.suffix.lower() in NASTRAN and b"BEGIN BULK" not in (data := path.read_bytes()):
-        with tempfile.TemporaryDirectory(prefix="femsense-") as place:  # Gmsh leaves the line out, and meshio asks for it
+        with tempfile.TemporaryDirectory(prefix="femsense-") as place:  # Gmsh omits the line, and meshio requires it
             whole = Path(place, path.name)
             whole.write_bytes(b"BEGIN BULK\n" + data)
             return _through_meshio(whole, kind)
@@ -109,7 +109,7 @@ def _has_decimal_commas(path: Path) -> bool:
 
 
 def reason(error: BaseException) -> str:
-    """Return what a reader's exception says, in one short line."""
+    """Return the message of a reader's exception in one short line."""
     text = str(error).strip().splitlines()
     return (
         f"{type(error).__name__}: {text[0][:120]}"

@@ -15,10 +15,10 @@ ENDINGS = (".node", ".ele")
 
 
 def read_tetgen(path: Path, where: str) -> MeshContent:
-    """Return the mesh of a .node and an .ele file beside each other; either names both.
+    """Return the mesh of a .node file and the .ele file next to it; `path` is either of them.
 
     Raises:
-        InputError: one of them is missing, shorter or longer than its first line says, or no table of numbers.
+        InputError: one of them is missing, shorter or longer than its first line declares, or not a table of numbers.
     """
     node_file, ele_file = path.with_suffix(".node"), path.with_suffix(".ele")
     for file in (node_file, ele_file):
@@ -66,6 +66,6 @@ def _table(file: Path) -> tuple[list[float], FloatArray]:
         ) from None
     if len(table) != head[0]:
         raise InputError(
-            "the file does not hold what it announces", where=file, found=f"{len(table)} rows", expected=f"{head[0]:.0f} rows"
+            "the content disagrees with its header", where=file, found=f"{len(table)} rows", expected=f"{head[0]:.0f} rows"
         )
     return head, table

@@ -11,7 +11,7 @@ PIECE = re.compile(rb"<Piece\b(?:[^>]*/>|.*?</Piece\s*>)", re.DOTALL)
 
 
 def pieces_of(data: bytes) -> list[bytes]:
-    """Return the content of a .vtu file as files of one piece each; offsets into appended data stay what they are."""
+    """Return the content of a .vtu file as files of one piece each; offsets into appended data are unchanged."""
     end = data.find(b"<AppendedData")
     head, rest = (data, b"") if end < 0 else (data[:end], data[end:])
     found = list(PIECE.finditer(head))

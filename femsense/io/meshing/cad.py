@@ -14,7 +14,7 @@ from femsense.io.meshing.child_process import ProgramFailed, ProgramTimeout, run
 CAD_READ = (".step", ".stp", ".iges", ".igs", ".brep")
 INSTALL = 'pip install "femsense[cad]"'
 PER_CIRCLE = 24
-"""Edges around a full circle: the chord leaves it by 0.9 % of the radius."""
+"""Edges around a full circle: the chord deviates by 0.9 % of the radius."""
 SECONDS = 300.0
 """Gmsh is stopped after this time."""
 GMSH = """
@@ -50,7 +50,7 @@ def read_cad(path: Path, unit: str) -> tuple[FloatArray, IntArray]:
     """Return points, shape (n, 3), in a unit ("m", "cm", "mm"), and triangles, shape (t, 3), of the faces of a CAD file.
 
     Raises:
-        InputError: what Gmsh cannot read or mesh. MissingDependency: without gmsh.
+        InputError: Gmsh cannot read or mesh the file. MissingDependency: without gmsh.
     """
     if importlib.util.find_spec("gmsh") is None:
         raise MissingDependency(f"a CAD file becomes triangles through gmsh: {INSTALL}")

@@ -1,7 +1,5 @@
-"""Tetrahedra straight from the faces of a CAD file, by Gmsh: the body is exact and closed, so that nothing has to be mended.
-
-fTetWild, which fills what was mended, took 110 to 230 s of processor time for parts that this fills in seconds
-(`python benchmarks/meshing.py`).
+"""Tetrahedra from the faces of a CAD file by Gmsh: the body is exact and closed and needs no repair. fTetWild took 110 to 230 s of
+processor time for parts that Gmsh fills in seconds (`python benchmarks/meshing.py`).
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from femsense.io.meshing.surface import ClosedSurface
 from femsense.io.meshing.tetrahedra import compact
 
 OF_WALL = 1 / 6
-"""The mesh leaves the faces by no more than this share of the mean thickness of the body's walls, 2 V / A."""
+"""Largest distance between mesh and faces as a fraction of the mean wall thickness 2 V / A."""
 SECONDS = 120.0
 """Gmsh is stopped after this time, and fTetWild has its turn."""
 GMSH = """
@@ -57,7 +55,7 @@ gmsh.option.setNumber("Mesh.MeshSizeMax", 1e22)
 def size(dimension, tag, x, y, z, wanted):
     if wanted > 1e20:
         return edge
-    radius = around * wanted / (2 * np.pi)  # an edge L leaves a circle of radius r by L^2 / 8 r; some are longer
+    radius = around * wanted / (2 * np.pi)  # an edge L deviates from a circle of radius r by L^2 / 8 r; some edges are longer
     return min(edge, max(wanted, np.sqrt(4 * radius * tolerance)))
 gmsh.model.mesh.setSizeCallback(size)
 gmsh.model.mesh.generate(3)
@@ -80,16 +78,14 @@ def fill_cad(
     progress: Progress | None = None,
     program: str = GMSH,
 ) -> Filled | None:
-    """Return the one solid of a CAD file filled with tetrahedra; None where that is a case for `filling.fill`.
-
-    It is, where the file holds several solids or none, where Gmsh fails or makes more tetrahedra than are wanted, and where repairs
-    or a part are asked for.
+    """Return the single solid of a CAD file filled with tetrahedra; None if `filling.fill` must be used instead: for several solids or
+    none, if Gmsh fails or exceeds the number of tetrahedra, and with the options for repairs or a part.
 
     Arguments:
         path: of the STEP, IGES or BREP file.
         points, triangles: its faces as `read_cad` gives them, in `options.unit`, shapes (n, 3) and (t, 3).
         options: size and unit.
-        progress: called with what is being done.
+        progress: called with a description of each step.
         program: Python that meshes the file and writes `made.npz` where it runs.
     """
     if options.close_holes or options.fill_cavities or options.part is not None:
@@ -117,8 +113,8 @@ def fill_cad(
     if options.size_mm is not None:
         return fewest
     note = (
-        f"{len(fewest.mesh.tets)} tetrahedra rather than {wanted}: walls and detail ask for them, and what follows takes longer; "
-        f"--max-tets {wanted} has it filled farther from the faces, which can take minutes"
+        f"{len(fewest.mesh.tets)} tetrahedra instead of {wanted}, because of thin walls or fine detail; all later computations take longer "
+        f"in proportion. --max-tets {wanted} allows a coarser mesh, less close to the faces; that can take minutes"
     )
     return replace(fewest, done=(*fewest.done, note))
 

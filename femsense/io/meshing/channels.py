@@ -22,7 +22,7 @@ STILL = 0.005
 """A path is fine enough where twice the points change the motion by less than this share of it [1].
 The tentacle of docs/guides/bodies.md moves by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
 GAP = 0.01
-"""A pull point that is not given lies so far before the channel [m], straight on."""
+"""Distance of the default pull point from the beginning of the channel, along its direction [m]."""
 BEND = 0.4
 """Paths are tried at a tension that moves the body by this share of its length [1],
 or at the largest one if that is smaller: beyond, bodies curl up and answer anything."""
@@ -50,7 +50,7 @@ class Channel:
 
     @property
     def need(self) -> tuple[object, ...]:
-        """What decides how many points the path needs: all but the name and where about the axis it begins."""
+        """The properties that determine the number of path points: all except the name and the start angle."""
         return self.start, self.end, self.distances, self.angles[1] - self.angles[0], self.max_tension, self.points
 
 
@@ -61,7 +61,7 @@ class Subdivision:
     name: str
     points: int
     change: float
-    """By how much twice the points change the motion, as a share of it [1]; nan where it was not tried."""
+    """Relative change of the motion with twice the number of points [1]; nan if not computed."""
     tension: float
     """At which it was tried [N]; nan where it was not."""
     moved: float
@@ -75,7 +75,7 @@ def channel_path(line: LineBody, channel: Channel, count: int) -> FloatArray:
 
 
 def pull_point(line: LineBody, channel: Channel) -> FloatArray:
-    """Return where a tendon leaves to its motor [m], shape (3,)."""
+    """Return the point at which a tendon leaves the body towards its motor [m], shape (3,)."""
     if channel.pull_point is not None:
         return channel.pull_point
     before = channel.start - GAP
@@ -92,12 +92,12 @@ def _channel_point(line: LineBody, channel: Channel, share: float) -> FloatArray
 def subdivided(
     body: BodyModel, line: LineBody, channel: Channel, *, tell: Callable[[str], None] = lambda text: None
 ) -> Subdivision:
-    """Return how many points a tendon's path needs: doubled until the equilibrium moves by less than STILL of the motion.
+    """Return the number of points of a tendon's path: doubled until the equilibrium changes by less than STILL of the motion.
 
     Arguments:
         body: without cables, with its weight.
         line, channel: where the tendon runs.
-        tell: told what is being tried.
+        tell: called with a description of each trial.
     """
     if channel.points is not None:
         return Subdivision(channel.name, channel.points, np.nan, np.nan, np.nan)
@@ -135,7 +135,7 @@ class _Pulled:
     rest: FloatArray
 
     def at(self, tension: float, count: int) -> FloatArray | None:
-        """Return the positions under a tension [N] with so many points; None where the body buckles between them or collapses."""
+        """Return the positions under a tension [N] with a number of points; None if the body buckles between them or collapses."""
         pulled = with_cables(self.body, self.line, [self.channel], [count])
         state = solve_equilibrium(pulled, tension={self.channel.name: tension})
         return state.positions if state.converged else None
@@ -161,7 +161,7 @@ def _farthest(a: FloatArray, b: FloatArray) -> float:
 
 
 def with_cables(body: BodyModel, line: LineBody, channels: Sequence[Channel], counts: Sequence[int]) -> BodyModel:
-    """Return a body with tendons in their channels, each subdivided into so many points."""
+    """Return a body with tendons in their channels, each subdivided into the given number of points."""
     cables = tuple(
         tie_cable(body.mesh, c.name, channel_path(line, c, n), pull_point(line, c), max_tension=c.max_tension)
         for c, n in zip(channels, counts)

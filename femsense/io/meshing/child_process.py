@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 GIVEN, MADE = "given.npz", "made.npz"
-"""Files of the program's folder: what it reads, what it writes."""
+"""Input and output file of the program, in its folder."""
 
 
 class ProgramTimeout(Exception):

@@ -22,35 +22,35 @@ from femsense.io.meshing.tetrahedra import FILL_SECONDS, Unfinished, tetrahedral
 from femsense.io.meshing.thinning import thinned
 
 MOST_TETS = 2000
-"""Wanted where nobody says how many …"""
+"""Default number of tetrahedra …"""
 ENOUGH_TETS = 8000
 """… and taken where a body with thin walls or fine detail cannot be filled with fewer."""
 SETTLED = 0.9
-"""Longer edges that leave more than this share of the tetrahedra will not bring fewer: walls and detail set their number."""
+"""If longer edges keep more than this fraction of the tetrahedra, walls and detail determine their number."""
 ASTRAY = 3.0
-"""A mesh so many times farther from the surface than it may be has lost a part of the body."""
+"""A mesh whose distance from the surface exceeds this multiple of the tolerance has lost a part of the body."""
 COARSER = 2.0
-"""After a filling that was stopped early, the mesh may leave the surface so many times farther, with edges so much longer."""
+"""Factor on tolerance and edge length after a filling that was stopped early."""
 ENVELOPE_OF_EDGE = 0.04
-"""The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
+"""Default tolerance as a fraction of an edge …"""
 LARGEST_ENVELOPE = 0.01
 """… and by this share of the diagonal at most."""
 TRIES = 5
 MOST_SECONDS = 600.0
 """All fillings together take no longer than this."""
 POOR = 0.05
-"""A worst radius ratio below this has the surface filled anew (fTetWild shuffles)."""
+"""Filling is repeated if the worst radius ratio is below this (fTetWild is randomised)."""
 LOOSE = 1e-3
-"""Tetrahedra that hang loose and hold less than this share of the volume are left out."""
+"""Disconnected tetrahedra with less than this fraction of the volume are removed."""
 Progress = Callable[..., None]
 
 
 class Lost(InputError):
-    """A filling that left a part of the body out."""
+    """A filling that lost a part of the body."""
 
 
 class Mesher(Protocol):
-    """What fills a closed surface: `tetrahedralise`, or another program's work with the same arguments."""
+    """A mesher of closed surfaces: `tetrahedralise`, or a function with the same arguments."""
 
     def __call__(
         self,
@@ -89,17 +89,17 @@ def fill(
     progress: Progress | None = None,
     mesher: Mesher = tetrahedralise,
 ) -> Filled:
-    """Mend a surface and fill it with tetrahedra of the wanted size.
+    """Repair a surface and fill it with tetrahedra of the given size.
 
     Arguments:
         points, triangles: of the file, in `options.unit`, shapes (n, 3) and (t, 3).
         options: size and repairs.
-        where: what a message names.
-        progress: called with what is being done.
-        mesher: what fills the mended surface.
+        where: for messages.
+        progress: called with a description of each step.
+        mesher: of the repaired surface.
 
     Raises:
-        InputError: see `repaired` and `tetrahedralise`; or no mesh that is small enough.
+        InputError: see `repaired` and `tetrahedralise`; or too many tetrahedra.
     """
     tell = progress or (lambda *_: None)
     tell("mending the surface")
@@ -116,13 +116,11 @@ def fill(
     surface = replace(surface, points=freeze(surface.points / PER_METRE[unit]))
     crossing = len(np.unique(crossing_triangles(surface.points, surface.triangles)))
     if crossing:
-        note = f"{crossing} triangles cross others: what lies inside any of them was filled"
+        note = f"{crossing} triangles intersect others; the union of their interiors was filled"
         surface = replace(surface, done=(*surface.done, note))
     walls = int((sides(surface.triangles)[2] > 2).sum())
     if walls:
-        note = (
-            f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
-        )
+        note = f"{walls} edges have more than two triangles (inner walls, or bodies that touch there); their interior was filled"
         surface = replace(surface, done=(*surface.done, note))
     return _of_wanted_size(surface, options, where, crosses=crossing + walls > 0, tell=tell, mesher=mesher)
 
@@ -130,7 +128,7 @@ def fill(
 def _of_wanted_size(
     surface: ClosedSurface, options: MeshOptions, where: str, *, crosses: bool, tell: Progress, mesher: Mesher
 ) -> Filled:
-    """Fill a mended surface, with longer edges until the number of tetrahedra fits, and anew where an element is flat."""
+    """Fill a repaired surface, with longer edges until the number of tetrahedra fits, and again if an element is flat."""
     wanted = options.most_tets or MOST_TETS
     edge, began, thin, rough = first_edge(surface, options), time.monotonic(), surface, 1.0
     fits: Filled | None = None
@@ -169,13 +167,13 @@ def _of_wanted_size(
 
 
 def _best(fits: Filled | None, fewest: Filled | None, options: MeshOptions, where: str) -> Filled:
-    """Return what has few enough tetrahedra, or where nobody said how many, what has as few as the body lets it. Raises InputError."""
+    """Return the mesh with few enough tetrahedra; by default also the smallest one possible up to ENOUGH_TETS. Raises InputError."""
     if fits is not None:
         return fits
     assert fewest is not None
     count, wanted = len(fewest.mesh.tets), options.most_tets or MOST_TETS
     if options.most_tets is None and count <= ENOUGH_TETS:
-        note = f"{count} tetrahedra rather than {wanted}: thin walls or fine detail ask for them, and what follows takes longer"
+        note = f"{count} tetrahedra instead of {wanted}, because of thin walls or fine detail; all later computations take longer in proportion"
         asked = options.size_mm is not None
         return fewest if asked else replace(fewest, done=(*fewest.done, note))
     hint = f"--max-tets {count}, or a larger --tolerance"
@@ -205,7 +203,7 @@ def _fill_once(
     seconds: float,
     mesher: Mesher,
 ) -> tuple[Filled, ClosedSurface]:
-    """Return what was filled, and the thinned surface that the next try goes on from."""
+    """Return the filled mesh, and the thinned surface for the next attempt."""
     diagonal = surface.diagonal
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, rough * LARGEST_ENVELOPE * diagonal)
@@ -234,15 +232,14 @@ def _fill_once(
 
 
 def _envelope(drifted: float, tolerance: float, diagonal: float, asked: bool) -> float:
-    """Return how far the mesh may leave the thinned surface [m]: what is left,
-    or the roughness where that is larger and nobody asked."""
+    """Return the tolerance between mesh and thinned surface [m]: the remaining one, or by default the roughness if that is larger."""
     if not asked and drifted > 0.5 * tolerance:
         return min(drifted, LARGEST_ENVELOPE * diagonal)
     return max(tolerance - drifted, 0.5 * tolerance)
 
 
 def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
-    """Return what is said where the surface is too rough to be followed within the tolerance [m]."""
+    """Return the note on a surface whose roughness exceeds the tolerance [m]."""
     if drifted <= 0.5 * tolerance:
         return ()
     return (
@@ -256,7 +253,7 @@ def deviation_of(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
     of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
     out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())
-    if crosses:  # what lies inside another shell has no counterpart
+    if crosses:  # triangles inside another shell have no counterpart
         return out
     return max(out, float(distance_to(mesh.nodes[skin], numbers.reshape(-1, 3), surface.points).max()))
 
@@ -284,4 +281,4 @@ def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
     nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
     kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))
     check_mesh(kept, where)
-    return kept, (f"{len(volume) - 1} loose crumbs were left out",)
+    return kept, (f"{len(volume) - 1} disconnected pieces of negligible volume were removed",)

@@ -17,9 +17,9 @@ from femsense.io.meshing.sweep import Kept, Layer, polar_triangles, sweep
 Levels = Callable[[float], FloatArray]
 TURN = 2.0 * np.pi
 FINEST, COARSEST = 0.8, 4.0
-"""Layers are not thinner and not thicker than so many radii [1]."""
+"""Smallest and largest thickness of a layer in radii [1]."""
 PER_FOLD = 6
-"""Layers of a fold at least: three lie on each of its flanks."""
+"""Least number of layers of a fold: three on each flank."""
 WIDEST = TURN / 8 * 1.001
 """A sector is not wider than this [rad]."""
 MOST_SECTORS = 24
@@ -27,7 +27,7 @@ MOST_SECTORS = 24
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cavity:
-    """A closed chamber along a part of the line: around the axis, or a sector of a ring beside it."""
+    """A closed chamber along a part of the line: around the axis, or a sector of a ring off the axis."""
 
     name: str
     start: float
@@ -37,11 +37,11 @@ class Cavity:
     inner: float
     """Its least distance from the axis [m]; 0: around the axis."""
     outer: float
-    """Its largest distance from the axis [m]; 0 where `wall` says it."""
+    """Its largest distance from the axis [m]; 0 if `wall` determines it."""
     angles: tuple[float, float]
     """From and to [rad]; not used around the axis."""
     wall: float = 0.0
-    """Thickness of what is left outside of it [m]; 0: `outer` holds."""
+    """Thickness of the wall outside of it [m]; 0 if `outer` determines it."""
     max_pressure: float = 40e3
     """[Pa]."""
 
@@ -58,7 +58,7 @@ class Cavity:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fold:
-    """Bellows: folds by which the outline stands back between `start` and `end`."""
+    """Bellows: folds that narrow the outline between `start` and `end`."""
 
     start: float
     """[m]."""
@@ -96,7 +96,7 @@ class LineBody:
 
     @property
     def around(self) -> list[Cavity]:
-        """Cavities beside the axis."""
+        """Cavities off the axis."""
         return [c for c in self.cavities if not c.is_central]
 
 
@@ -178,11 +178,11 @@ def mesh_line(line: LineBody, *, most_tets: int = 2000, along: float | None = No
 
     Arguments:
         line: the body.
-        most_tets: not more than about so many; layers get thicker for it.
+        most_tets: approximate largest number; it determines the thickness of the layers.
         along: thickness of a layer [m] instead.
 
     Raises:
-        InputError: chambers that leave the body or meet, more tetrahedra than wanted.
+        InputError: chambers that leave the body or meet, or too many tetrahedra.
     """
     angles = corner_angles(line)
     levels = ring_levels(line)
@@ -221,7 +221,7 @@ def corner_angles(line: LineBody) -> FloatArray:
         return np.arange(8) * TURN / 8
     if any(section.squareness for section in line.sections):
         raise InputError(
-            "chambers beside the axis need a round section",
+            "chambers off the axis need a round section",
             where="chambers",
             found="width_mm and height_mm",
             expected="radius_mm, or area_mm2 with second_moment_mm4",
@@ -263,7 +263,8 @@ def ring_levels(line: LineBody) -> Levels:
 
 
 def _level(line: LineBody, distance: float, cavities: Sequence[Cavity], along: float) -> float:
-    """Return where a bound of chambers is [1]: at its distance beside them, and between them at a share of the radius."""
+    """Return the radial position of a chamber boundary [1]: at its distance along the chambers, and at a fraction of the radius between
+    them."""
     if any(c.start <= along <= c.end for c in cavities):
         return distance / section_at(line, along).half_width
     knots = sorted(s for c in cavities for s in (c.start, c.end))
@@ -271,7 +272,7 @@ def _level(line: LineBody, distance: float, cavities: Sequence[Cavity], along: f
 
 
 def layer_places(line: LineBody, *, most_layers: float, along: float | None = None) -> FloatArray:
-    """Return the lengths along the line at which layers lie [m]: at all bounds, and between them as the radius asks."""
+    """Return the positions of the layers along the line [m]: at all boundaries, and between them according to the radius."""
     bounds = {0.0, line.length, *line.stations.tolist()}
     bounds |= {s for c in line.cavities for s in (c.start, c.end)} | {s for f in line.folds for s in (f.start, f.end)}
     marks = np.array(sorted(bounds))

@@ -65,7 +65,7 @@ class ChamberTable(Schema):
     from_mm: float = Field(ge=0, description="length along the line where it begins, in millimetres")
     to_mm: Length = Field(description="length along the line where it ends, in millimetres")
     radius_mm: Length | None = Field(None, description="radius of a round chamber in millimetres")
-    wall_mm: Length | None = Field(None, description="around the axis: thickness of what is left outside, in millimetres")
+    wall_mm: Length | None = Field(None, description="around the axis: thickness of the wall outside, in millimetres")
     distance_mm: Annotated[float, Field(ge=0)] = Field(
         0.0, description="of its middle from the axis in millimetres; 0: around it"
     )
@@ -127,7 +127,7 @@ class LineTable(Schema):
 
 
 def read_line(path: Path) -> LineTable:
-    """Return the checked tables of a description. Raises InputError with file, key, what was found and what was expected."""
+    """Return the checked tables of a description. Raises InputError with file, key, found and expected value."""
     return validated(LineTable, read_toml(path), path)
 
 
@@ -192,7 +192,7 @@ def cavity_of(chamber: ChamberTable) -> Cavity:
         inner, outer, half = chamber.distance_mm - reach, chamber.distance_mm + reach, reach / chamber.distance_mm
     if inner < 0.0:
         raise InputError(
-            "a chamber beside the axis reaches over it",
+            "a chamber off the axis crosses it",
             where=f"chamber {chamber.name}",
             found=f"distance_mm = {chamber.distance_mm:g}, radius_mm = {chamber.radius_mm:g}",
             expected="a smaller radius_mm, or distance_mm = 0 for a chamber around the axis",

@@ -1,4 +1,4 @@
-"""Cross-sections of a body along its centre line: what a drawing says of them, and their outline around the axis."""
+"""Cross-sections of a body along its centre line: their dimensions, and their outline around the axis."""
 
 from __future__ import annotations
 
@@ -80,8 +80,7 @@ def between(first: Section, second: Section, share: float) -> Section:
 def outline(section: Section, angles: FloatArray) -> FloatArray:
     """Return the corners of the outline [m], shape (n, 2), at angles [rad], shape (n,).
 
-    The polygon of a round section stands out so far that it has the area of the ellipse.
-    Its second moment is then off by 0.2 % with eight corners.
+    The polygon of a round section has the area of the ellipse. The error of its second moment is 0.2 % with eight corners.
     """
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     square = around / np.abs(around).max(axis=1, keepdims=True)

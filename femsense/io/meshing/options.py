@@ -1,4 +1,4 @@
-"""What a user asks of a mesh, in Python and on the command line."""
+"""Options of a mesh, in Python and on the command line."""
 
 from __future__ import annotations
 
@@ -18,20 +18,18 @@ class Element(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeshOptions:
-    """What a user asks of a mesh."""
+    """Options of a mesh."""
 
-    unit: Annotated[str | None, Flag("--unit", "m|cm|mm", "Unit of the surface file; required but for STEP, which says it.")] = (
-        None
-    )
-    size_mm: Annotated[float | None, Flag("--size", "MM", "Wanted edge length.")] = None
+    unit: Annotated[str | None, Flag("--unit", "m|cm|mm", "Unit of the surface file; required except for STEP.")] = None
+    size_mm: Annotated[float | None, Flag("--size", "MM", "Edge length of the tetrahedra.")] = None
     """By default from `most_tets`."""
     most_tets: Annotated[
-        int | None, Flag("--max-tets", "N", "Not more tetrahedra than this (2000; more for thin walls).", min=6)
+        int | None, Flag("--max-tets", "N", "Largest number of tetrahedra (2000; more for thin walls).", min=6)
     ] = None
-    """Where nobody says, MOST_TETS, or up to ENOUGH_TETS where the body needs them."""
-    tolerance_mm: Annotated[float | None, Flag("--tolerance", "MM", "How far the mesh may leave the surface.")] = None
+    """None: MOST_TETS, or up to ENOUGH_TETS if the body needs them."""
+    tolerance_mm: Annotated[float | None, Flag("--tolerance", "MM", "Largest distance between mesh and surface.")] = None
     """By default a share of the edge length."""
     element: Annotated[Element, Flag("--element", None, "For a new robot.toml.")] = Element.tet10
     close_holes: Annotated[bool, Flag("--close-holes", help="Close large holes too, by flat caps.")] = False
-    fill_cavities: Annotated[bool, Flag("--fill-cavities", help="Take inner shells as solid, not as chambers.")] = False
+    fill_cavities: Annotated[bool, Flag("--fill-cavities", help="Treat inner shells as solid, not as chambers.")] = False
     part: Annotated[int | None, Flag("--part", "N", "Which of several bodies; 1 is the largest.", min=1)] = None

@@ -1,4 +1,4 @@
-"""How good a mesh of tetrahedra is: angles, shapes, sizes, elements through the walls, and where the worst ones are."""
+"""Quality of a tetrahedral mesh: angles, shapes, sizes, elements per wall, and the position of the worst elements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.surface_queries import wall_thickness
 
 WORST = 5
-"""So many of the worst elements are named."""
+"""Number of the worst elements that are listed."""
 
 
 def mean_ratio(mesh: TetMesh) -> FloatArray:
@@ -97,15 +97,13 @@ def quality_text(report: dict[str, Any]) -> str:
         ("nodes", f"{report['nodes']} ({report['unknowns_tet4']} unknowns as tet4, {report['unknowns_tet10']} as tet10)"),
         ("volume", f"{report['volume_cm3']:.4g} cm³"),
         ("elements' volume", f"smallest {report['smallest_volume_mm3']:.3g}, median {report['median_volume_mm3']:.3g} mm³"),
-        ("edges", "{min:.3g} … {median:.3g} … {max:.3g} mm (least, median, largest)".format(**report["edge_mm"])),
+        ("edges", "{min:.3g} … {median:.3g} … {max:.3g} mm (minimum, median, maximum)".format(**report["edge_mm"])),
         ("dihedral angles", "{min:.3g}° … {median:.3g}° … {max:.4g}°".format(**report["dihedral_deg"])),
         ("radius ratio", "{min:.2f} … {median:.2f} … {max:.2f} (1 regular, 0 flat)".format(**report["radius_ratio"])),
         ("mean ratio", "{min:.2f} … {median:.2f} … {max:.2f}".format(**report["mean_ratio"])),
         (
-            "through the walls",
-            "{fifth_percentile:.2g} elements at the thinnest twentieth, {median:.2g} in the median".format(
-                **report["elements_through"]
-            ),
+            "elements per wall",
+            "{fifth_percentile:.2g} (5th percentile), {median:.2g} (median)".format(**report["elements_through"]),
         ),
     ]
     lines = [f"  {name:<19}{value}" for name, value in rows]

@@ -46,10 +46,10 @@ def line_into(
     Arguments:
         folder: of the robot; a robot.toml in it is replaced if it was made from such a description.
         source: the description (docs/guides/bodies.md).
-        most_tets: not more tetrahedra than about so many; along_mm: thickness of a layer instead [mm].
-        say: told in one line what happens beside.
-        again: make it even where the folder holds this result.
-        progress: told what is being done.
+        most_tets: approximate largest number of tetrahedra; along_mm: thickness of a layer instead [mm].
+        say: called with one-line notes.
+        again: repeat it even if the folder contains this result.
+        progress: called with a description of each step.
 
     Raises:
         InputError: a description that makes no body, or a folder that holds something else.
@@ -58,7 +58,7 @@ def line_into(
     inputs = {"line": path.name, "sha256": file_hash(path), "most_tets": most_tets, "along_mm": along_mm}
     known = _known(target)
     if known and not again and known["inputs"] == inputs and known["femsense"] == femsense.__version__:
-        say(f"{target} holds this robot already (--again makes it anew)")
+        say(f"{target} contains this robot already (--again repeats it)")
         return known
     table = read_line(path)
     line = line_of(table, path)
@@ -91,7 +91,7 @@ def line_into(
 def _known(target: Path) -> dict[str, Any] | None:
     """Return the report of a folder that was made from a line; None where it is new.
 
-    Raises InputError where something else stands there.
+    Raises InputError if the folder has other content.
     """
     import json
 
@@ -105,7 +105,7 @@ def _known(target: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     raise InputError(
-        "something else than a robot from such a description stands there",
+        "the folder contains something else than a robot from such a description",
         where=target,
         expected="a new folder",
         hint="another -o: robot.toml would be replaced",
@@ -130,17 +130,17 @@ def subdivisions(
     Arguments:
         document: the tables of robot.toml without cables.
         mesh, line, channels: of the body.
-        tell: called with what is being tried.
+        tell: called with a description of each trial.
     """
     if not channels:
         return ()
     with tempfile.TemporaryDirectory(prefix="femsense-") as trial, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the finished robot says them
+        warnings.simplefilter("ignore")  # reported with the finished robot
         write_mesh(mesh, Path(trial, MESH_FILE))
         write_toml(Path(trial, "robot.toml"), document)
         body = load_robot(trial).body
     known = dict[tuple[object, ...], Subdivision]()
-    for channel in channels:  # tendons that differ in their angle alone need as many
+    for channel in channels:  # tendons that differ only in their angle need the same number
         if channel.need not in known:
             known[channel.need] = subdivided(body, line, channel, tell=tell)
     return tuple(replace(known[channel.need], name=channel.name) for channel in channels)
@@ -182,7 +182,7 @@ def _point(point: FloatArray) -> list[float]:
 
 
 def line_report(path: Path) -> dict[str, Any]:
-    """Return what a description holds, as plain values. Raises InputError where it makes no body."""
+    """Return the contents of a description as plain values. Raises InputError if it does not describe a body."""
     table = read_line(path)
     line = line_of(table, path)
     channels = channels_of(table, line, path)

@@ -34,7 +34,7 @@ from femsense.io.robot_toml import load_robot
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 USUAL = (5e-3, 2.0)
-"""Bodies smaller or larger than this [m] make one ask whether the unit is right."""
+"""Bodies smaller or larger than this [m] suggest a wrong unit."""
 CAD_ENDINGS = (".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
 
 
@@ -50,32 +50,32 @@ def mesh_into(
 ) -> dict[str, Any]:
     """Fill a surface with tetrahedra and write them into a robot's folder; return the report that mesh.json holds.
 
-    A folder without robot.toml gets one to start from. One that has it keeps it, with the new mesh in place of the old one.
+    A folder without robot.toml gets a starter file. An existing robot.toml is kept, and the new mesh replaces the old one.
 
     Arguments:
         folder: of the robot.
         surface: STL, OBJ, PLY, OFF, STEP, IGES, BREP, or triangles in a format that meshio reads.
         options: unit, size and repairs.
-        say: told in one line what happens beside.
-        again: fill even where the folder holds this result.
-        progress: called with what is being done.
-        mesher: what fills the mended surface.
+        say: called with one-line notes.
+        again: repeat it even if the folder contains this result.
+        progress: called with a description of each step.
+        mesher: of the repaired surface.
 
     Raises:
-        InputError: a surface that cannot be filled, with what, where, found, expected and a hint; a robot.toml that the new mesh
-            does not fit, in which case nothing is written. MissingDependency: without pytetwild.
+        InputError: a surface that cannot be filled; a robot.toml that does not load with the new mesh, in which
+            case nothing is written. MissingDependency: without pytetwild.
     """
     source, target = Path(surface).expanduser(), Path(folder).expanduser()
     _check_target(target)
     said = length_unit(options.unit, allowed=PER_METRE) if options.unit else None
     options = options if said is None else replace(options, unit=said.name)
     if source.suffix.lower() in CAD_READ and options.unit is None:
-        options = replace(options, unit="mm")  # the file says its unit: it is read in this one
+        options = replace(options, unit="mm")  # the file declares its unit, and is converted to this one
     points, triangles = read_any_surface(source, unit=options.unit or "mm")
     check_unit(points, options.unit, source)
     inputs = {"surface": source.name, "sha256": file_hash(source), "options": asdict(options)}
     if not again and (known := _finished(target, inputs)):
-        say(f"{target} holds this mesh already (--again fills the surface anew)")
+        say(f"{target} contains this mesh already (--again repeats the meshing)")
         return known
     filled = fill_cad(source, points, triangles, options, progress=progress) if source.suffix.lower() in CAD_READ else None
     filled = filled or fill(points, triangles, options, where=str(source), progress=progress, mesher=mesher)
@@ -135,7 +135,7 @@ def check_unit(points: FloatArray, unit: str | None, path: Path) -> None:
     hint = f"--unit {best} makes it {1e3 * size / PER_METRE[best]:.4g} mm long" if best else "scale the surface"
     if unit is None:
         raise InputError(
-            "the unit of a surface file stands nowhere in it",
+            "a surface file does not contain its unit",
             where=path,
             found=f"extents of {text}",
             expected="--unit m, --unit cm or --unit mm",
@@ -166,7 +166,7 @@ def _length(metres: float) -> str:
 
 
 def mesh_report(filled: Filled, options: MeshOptions) -> dict[str, Any]:
-    """Return size, deviation, quality and what was done, as plain numbers."""
+    """Return size, surface error, quality and notes as plain values."""
     quality = quality_report(filled.mesh)
     return {
         "edge_wanted_mm": filled.edge_mm,
@@ -197,9 +197,9 @@ def mesh_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
     lines = [
         quality_text(report["quality"]),
-        f"  {'from the surface':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
+        f"  {'surface error':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
     ]
-    for title, texts in (("done to the surface", report["done"]), ("advice", report["advice"])):
+    for title, texts in (("notes", report["done"]), ("advice", report["advice"])):
         if texts:
             lines += ["", f"{title}:", *(f"  - {text}" for text in texts)]
     return "\n".join(lines)
@@ -213,7 +213,7 @@ def _check_target(target: Path) -> None:
         raise InputError("stands in the way", where=target, found="a file", expected="a folder", hint="another -o")
     if target.is_dir() and any(target.iterdir()) and not (target / "robot.toml").is_file():
         raise InputError(
-            "something else than a robot stands there",
+            "the folder contains something else than a robot",
             where=target,
             expected="a new folder, or one with robot.toml",
             hint="another -o",
@@ -297,7 +297,7 @@ def _with_mesh(text: str, toml: Path) -> tuple[str, str, str]:
 
 
 def starter_text(mesh: TetMesh, options: MeshOptions, name: str, source: str) -> str:
-    """Return a robot.toml for a mesh in metres that loads at once and says what to change."""
+    """Return a robot.toml for a mesh in metres that loads at once and marks the values to check."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     box = _lowest_slab(mesh)
     top = mesh.nodes[mesh.nodes[:, 2].argmax()]
@@ -331,7 +331,7 @@ def _chambers_text(mesh: TetMesh) -> str:
         f'# [[chambers]]\n# name = "chamber-{i + 1}"\n# seed_m = {_triple(seed)}\n# max_pressure_pa = 40e3\n'
         for i, seed in enumerate(seeds)
     ]
-    return "\n# YOURS: the cavities that were kept; with these lines one is a chamber under pressure.\n" + "".join(tables)
+    return "\n# YOURS: inner cavities. Uncommented, each table makes one a chamber under pressure.\n" + "".join(tables)
 
 
 def _triple(point: FloatArray | list[float]) -> str:

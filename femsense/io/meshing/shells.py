@@ -1,4 +1,4 @@
-"""The connected pieces of a surface: which lie inside which, which are cavities, which of several bodies is meant."""
+"""The connected components of a surface: their nesting, cavities, and the choice among several bodies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from femsense.core.errors import InputError
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to, neighbours, place_text, winding_number
 
 DUST = 1e-6
-"""A shell that encloses less than this share of the whole is left out."""
+"""A shell that encloses less than this fraction of the total volume is discarded."""
 TOUCHING = 1e-4
 """Shells closer than this, over the diagonal, are one body."""
 MOST_SHELLS = 3000
@@ -25,7 +25,7 @@ class Shells:
 
     of: IntArray  # the shell of each triangle, (t,)
     volume: FloatArray  # signed, (s,)
-    depth: IntArray  # how many other shells each one lies in, (s,)
+    depth: IntArray  # number of shells around each one, (s,)
     body: IntArray  # number of the body that each one belongs to, by falling volume, (s,)
 
 
@@ -46,7 +46,7 @@ def find_shells(points: FloatArray, triangles: IntArray, where: str, most: int) 
             where=where,
             found=f"{count} pieces of {len(triangles) / count:.1f} triangles on average",
             expected=f"a closed surface, or at most {most} shells",
-            hint="merge equal points and remove what is inside, in a mesh editor",
+            hint="merge equal points and remove inner parts in a mesh editor",
         )
     if count == 1:
         return Shells(of, volume, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
@@ -62,7 +62,7 @@ def find_shells(points: FloatArray, triangles: IntArray, where: str, most: int) 
         probes = corners[i][:: max(1, len(corners[i]) // 4)]
         inside[i, j] = bool((np.abs(winding_number(points[triangles[of == j]], probes)) > 0.5).all())
     depth = inside.sum(axis=1)
-    meets |= inside & (depth[:, None] % 2 == 1) & (depth[None] == depth[:, None] - 1)  # a cavity belongs to what holds it
+    meets |= inside & (depth[:, None] % 2 == 1) & (depth[None] == depth[:, None] - 1)  # a cavity belongs to the body around it
     body = sp.csgraph.connected_components(sp.csr_matrix(meets.astype(float)), directed=False)[1]
     size = np.zeros(body.max() + 1)
     np.add.at(size, body[depth % 2 == 0], np.abs(volume[depth % 2 == 0]))
@@ -113,7 +113,7 @@ def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list
     dust = size < DUST * size.max()
     if not dust.any():
         return triangles
-    done.append(f"{int(dust.sum())} shells that enclose next to nothing were left out")
+    done.append(f"{int(dust.sum())} shells of negligible volume were removed")
     return np.asarray(triangles[~dust[of]])
 
 

@@ -1,9 +1,8 @@
-"""Surfaces as CAD programs and scanners write them, made fit to be filled with tetrahedra, and what was done to them.
+"""Repair of surfaces from CAD programs and scanners for tetrahedral meshing, with a list of the repairs.
 
-The order is: weld, drop what repeats, turn neighbours the same way, close holes, find which shells lie inside which,
-choose the body. A shell inside another one is a cavity (a chamber), whichever way its triangles face.
-Shells that cross each other become one body:
-the filling takes what lies inside any of them.
+The order is: weld, drop duplicates, orient neighbours consistently, close holes, determine the nesting of the shells, choose the body. A
+shell inside another one is a cavity (a chamber), whichever way its triangles face. Shells that cross each other become one body: the
+filling takes the union of their interiors.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class ClosedSurface:
     cavities: int = 0
     """Shells that face inwards."""
     done: tuple[str, ...] = field(default=())
-    """What was done to the surface, in words."""
+    """The repairs, as sentences."""
 
     @property
     def diagonal(self) -> float:
@@ -46,7 +45,7 @@ class ClosedSurface:
 
     @property
     def volume(self) -> float:
-        """Enclosed volume, cavities taken off [unit³] (where shells cross, what they share counts twice)."""
+        """Enclosed volume without cavities [unit³]; the intersection of crossing shells counts twice."""
         return float(shell_volumes(self.points, self.triangles, np.zeros(len(self.triangles), dtype=np.int64))[0])
 
     @property
@@ -65,14 +64,14 @@ def repaired(
     unit: str = "units",
     most_shells: int = MOST_SHELLS,
 ) -> ClosedSurface:
-    """Return a closed surface that can be filled, and what had to be done for it.
+    """Return a closed surface that can be filled, and the repairs.
 
     Arguments:
         points, triangles: of the file, shapes (n, 3) and (t, 3).
-        where: what a message names.
+        where: for messages.
         close_holes: close holes of any size by flat fans, not only small ones.
-        fill_cavities: take inner shells as solid.
-        part: which of several separate bodies is meant, 1 the largest.
+        fill_cavities: treat inner shells as solid.
+        part: which of several separate bodies to use, 1 the largest.
         unit: of the points, for messages.
         most_shells: a surface in more pieces is refused.
 
@@ -158,10 +157,10 @@ def _weld(points: FloatArray, triangles: IntArray, distance: float) -> IntArray:
 
 
 def _turned_alike(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
-    """Turn triangles so that neighbours go round the same way.
+    """Orient triangles consistently.
 
-    Each triangle stands in a graph twice, as it is and turned; sides join what goes together.
-    The two halves of a surface with two sides are not connected, and the half that turns fewer triangles is taken.
+    Each triangle is in a graph twice, in both orientations; edges connect consistent neighbours. For an orientable surface the graph has
+    two components, of which the one that flips fewer triangles is used.
     """
     t = len(triangles)
     first, second, alike = neighbours(triangles)
@@ -233,9 +232,9 @@ def _closed(
 
 
 def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, where: str, done: list[str]) -> IntArray:
-    """Leave out sheets that hang on the rest: open edges that do not come round bound them.
+    """Remove sheets that are attached to the body: they are bounded by open edges that do not form closed loops.
 
-    Raises InputError where that is the most.
+    Raises InputError if that is most of the surface.
     """
     edges, labels = np.sort(directed_edges(triangles), axis=1), pieces(triangles)
     bounds = (edges[:, None] == np.sort(loose, axis=1)[None]).all(axis=2).any(axis=1)
@@ -252,7 +251,7 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
             expected="a closed surface",
             hint="mend it in a mesh editor",
         )
-    done.append(f"{len(np.unique(labels[hangs]))} sheets of {int(hangs.sum())} triangles that hang on the body were left out")
+    done.append(f"{len(np.unique(labels[hangs]))} sheets of {int(hangs.sum())} triangles attached to the body were removed")
     return triangles[~hangs]
 
 

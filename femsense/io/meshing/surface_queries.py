@@ -1,4 +1,4 @@
-"""What is asked of a surface of triangles: where it winds, what crosses, what is near, how thick its walls are."""
+"""Queries on triangle surfaces: winding numbers, intersections, distances, wall thickness."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.mesh import closest_in_triangle
 
 SIDES_AT_ONCE = 200_000
-"""So many sides of triangles are looked at together for where they go through others (memory)."""
+"""Number of triangle edges tested together for intersections (limits memory)."""
 
 
 def winding_number(corners: FloatArray, places: FloatArray) -> FloatArray:
@@ -30,9 +30,9 @@ def winding_number(corners: FloatArray, places: FloatArray) -> FloatArray:
 
 
 def crossing_triangles(points: FloatArray, triangles: IntArray) -> IntArray:
-    """Return pairs of triangles of which a side of the first goes through the second, shape (p, 2).
+    """Return pairs of triangles of which an edge of the first intersects the second, shape (p, 2).
 
-    Sides are rays into the triangles (Embree, single precision); what only touches does not count.
+    Edges are cast as rays (Embree, single precision); mere contact does not count.
     """
     import open3d as o3d
 
@@ -71,8 +71,7 @@ def nearest_on(points: FloatArray, triangles: IntArray, places: FloatArray) -> F
 
 
 def wall_thickness(points: FloatArray, triangles: IntArray, places: FloatArray, inward: FloatArray) -> FloatArray:
-    """Return how far it is from places just inside of the surface, along unit vectors, to the next wall, shape (p,);
-    inf: none."""
+    """Return the distance from points just inside of the surface along unit vectors to the next wall, shape (p,); inf without one."""
     import open3d as o3d
 
     centre, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())

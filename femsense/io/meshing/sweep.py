@@ -1,8 +1,8 @@
 """Tetrahedra of a body along a line: rings around an axis in layers, each cell a prism of three tetrahedra.
 
 A layer is a polar grid: a fan of triangles around the axis, then rings of quadrilaterals of two triangles.
-Cavities are cells that are left out. Prisms are split by the order of their nodes, turned over in every second layer, so that
-neighbours fit and no side is preferred.
+Cavities are omitted cells. Prisms are split by the order of their nodes, reversed in every second layer, so that neighbours match and the
+mesh has no preferred direction.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def sweep(layers: Sequence[Layer], angles: FloatArray, keep: Kept) -> tuple[TetM
         keep: (number of the slab between two layers, rings (c,), sectors (c,)) → which of these cells belong to the body, (c,).
 
     Raises:
-        InputError: no cell left, or cells that fold over.
+        InputError: no cells, or inverted ones.
     """
     grids = np.array([_grid(layer, angles) for layer in layers])
     triangles, rings, sectors = polar_triangles(len(layers[0].levels), len(angles))
@@ -55,7 +55,7 @@ def sweep(layers: Sequence[Layer], angles: FloatArray, keep: Kept) -> tuple[TetM
     ]
     used, numbers = np.unique(np.vstack(tets), return_inverse=True)
     if not len(used):
-        raise InputError("no cell is left", where="chambers", expected="cavities that leave something of the body")
+        raise InputError("no cell remains", where="chambers", expected="cavities that leave something of the body")
     mesh = oriented(TetMesh(grids.reshape(-1, 3)[used], numbers.reshape(-1, 4)))
     return mesh, used // each
 

@@ -1,4 +1,4 @@
-"""Closed surfaces filled with tetrahedra by fTetWild, which shuffles with a seed of its own: what was made once is kept."""
+"""Closed surfaces filled with tetrahedra by fTetWild. It is randomised without a seed, so results are stored and reused."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def tetrahedralise(
         points: shape (n, 3), any unit.
         triangles: shape (t, 3), outward; a cavity's surface points into the cavity.
         edge_fraction: wanted edge length over the diagonal of the bounding box [1].
-        envelope: how far the mesh may leave the surface, over that diagonal [1].
-        where: what a message names.
-        check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
-        seconds: it is stopped early after so long [s].
+        envelope: largest distance from the surface over that diagonal [1].
+        where: for messages.
+        check_volume: warn if the volume differs from that of the surface (which is allowed for crossing shells).
+        seconds: time after which it is stopped early [s].
         program: Python that fills the surface in `given.npz` and writes `made.npz` where it runs.
 
     Raises:
-        InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
+        InputError: no result, or not in time. MissingDependency: without pytetwild.
     """
     nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds, program)
     if not len(tets):
@@ -109,7 +109,7 @@ def tets_of_surface(file: Path, points: FloatArray, triangles: IntArray, where: 
 
 
 def kept_tets(surface: Path, points: FloatArray, triangles: IntArray) -> tuple[Path, Path]:
-    """Return where the tetrahedra of a surface file are kept: beside it, or in the cache where that cannot be written."""
+    """Return the file for the tetrahedra of a surface: next to it, or in the cache if its folder is not writable."""
     content = points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()
     name = f"{surface.stem}-{hashlib.sha256(content).hexdigest()[:16]}.tets.npz"
     return surface.with_name(name), cache_folder() / "tetrahedra" / name
@@ -132,7 +132,7 @@ def compact(points: FloatArray, tets: IntArray) -> TetMesh:
 
 
 def _keep(mesh: TetMesh, place: Path) -> bool:
-    """Write the mesh where none stands yet (two processes may come here at once); False where that is not possible."""
+    """Write the mesh unless the file exists (two processes may do so at once); False if that is not possible."""
     part = place.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{place.name}")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -174,7 +174,7 @@ def _run_ftetwild(
             found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
             expected="tetrahedra",
             hint=(
-                "surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or "
+                "nearly coincident surfaces and walls thinner than the tolerance take long: repair them, or "
                 "femsense mesh with another --tolerance or a larger --size"
             ),
         ) from None

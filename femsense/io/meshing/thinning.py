@@ -19,16 +19,16 @@ def thinned(
 ) -> tuple[ClosedSurface, float]:
     """Return a surface with fewer triangles that stays near, and how far it deviates [unit of the file].
 
-    Edges are drawn together where that costs least (quadric error metrics, Garland and Heckbert 1997, as Open3D has them). The
+    Edges are collapsed in the order of their quadric error (Garland and Heckbert 1997, implementation of Open3D). The
     number of triangles is halved as long as no point of one surface is farther than the tolerance from the other, and, however
-    far, until at most MOST_TRIANGLES are left (a scan whose noise is larger than the tolerance). Each surface is made from the
-    one before it, so that the whole costs about as much as one reduction.
+    far, until at most MOST_TRIANGLES are left (a scan whose noise is larger than the tolerance). Each surface is made from the previous
+    one, so that the total cost is about that of one reduction.
 
     Arguments:
         surface: closed.
         tolerance: allowed distance in the unit of the file.
-        start: what was returned for a smaller tolerance, to go on from.
-        enough: so many triangles are fine; fewer are not asked for.
+        start: result for a smaller tolerance, to continue from.
+        enough: number of triangles at which thinning stops.
     """
     kept = start or surface
     away = 0.0 if kept is surface else _deviation(surface, kept.points, kept.triangles)

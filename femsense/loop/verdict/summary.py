@@ -39,6 +39,8 @@ from femsense.model.effects.base import absent_elsewhere, placed
 
 DRAWS = 2000
 """Number of bootstrap draws for the interval of the held-out error, over sweeps, or over frames if there are fewer than LEAST_SWEEPS sweeps."""
+REMOVED = "accepted at one step, not part of the returned model"
+"""Verdict on an effect that a later step or the final tests removed."""
 
 # Effects
 
@@ -144,19 +146,21 @@ def untestable(first: Sequence[Candidate], names: Collection[str], thresholds: T
 
 
 def tried_effects(
-    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], thresholds: Thresholds
+    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], names: Collection[str], thresholds: Thresholds
 ) -> list[TriedEffect]:
-    """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
+    """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits.
+
+    `names` are the effects of the returned model; another one that a step accepted has the verdict REMOVED."""
     last = {c.effect.name: c for c in one_each(table)}
     screened = {c.effect.name for c in first}
     unscreened = {r.name: r for r in reversed(refits) if r.name not in screened}  # the mesh is tested without screening
     rows = [
-        TriedEffect(r.name, r.seed, r.dchi2, r.dbic, None, None, own := _refits_of(r.name, refits), _verdict_of(own))
+        TriedEffect(r.name, r.seed, r.dchi2, r.dbic, None, None, own := _refits_of(r.name, refits), _verdict_of(own, names))
         for r in unscreened.values()
     ]
     for c in one_each(first):
         joint, end = _refits_of(c.effect.name, refits), last.get(c.effect.name)
-        verdict = _verdict_of(joint) if joint else _why_not(c, end, thresholds)
+        verdict = _verdict_of(joint, names) if joint else _why_not(c, end, thresholds)
         rows.append(TriedEffect(c.effect.name, c.seed, c.gain, c.score, c.retained, end.score if end else None, joint, verdict))
     return rows
 
@@ -165,10 +169,11 @@ def _refits_of(name: str, refits: Sequence[RefitRecord]) -> tuple[RefitRecord, .
     return tuple(r for r in refits if r.name == name)
 
 
-def _verdict_of(joint: Sequence[RefitRecord]) -> str:
+def _verdict_of(joint: Sequence[RefitRecord], names: Collection[str]) -> str:
     """Return the best verdict of an effect's joint refits, else the last one."""
     said = [r.verdict for r in joint]
-    return next((v for v in (NAMED, PASSES) if v in said), said[-1])
+    best = next((v for v in (NAMED, PASSES) if v in said), said[-1])
+    return REMOVED if best == NAMED and joint[0].name not in names else best
 
 
 def _why_not(c: Candidate, end: Candidate | None, thresholds: Thresholds) -> str:

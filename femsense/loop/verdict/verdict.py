@@ -101,7 +101,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         after=errors_of(data, back, rng),
         effects=tuple(effects),
         entries=tuple(entries),
-        candidates=tuple(tried_effects(search.first, search.last, [*search.outweighed, *search.refits], data.thresholds)),
+        candidates=tuple(tried_effects(search.first, search.last, [*search.outweighed, *search.refits], names, data.thresholds)),
         confounded=tuple(pairs),
         next_experiment="",
         not_testable=tuple(untestable(search.first, names, data.thresholds)),

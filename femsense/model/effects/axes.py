@@ -23,7 +23,7 @@ def axis_of(body: BodyModel) -> FloatArray:
     along = along if (centre - held) @ along >= 0 else -along
     places = (nodes - centre) @ along
     clamped = places[body.clamped]
-    first = clamped.max() if len(clamped) and clamped.max() < 0.0 else places.min()  # what is clamped stays as it is
+    first = clamped.max() if len(clamped) and clamped.max() < 0.0 else places.min()  # clamped points stay fixed
     return np.array([centre + first * along, centre + places.max() * along])
 
 
@@ -51,14 +51,14 @@ def axis_from(entry: Entry, where: str) -> FloatArray:
 
 
 def along_axis(axis: FloatArray, points: FloatArray) -> FloatArray:
-    """Return how far along an axis (2, 3) points (p, 3) lie, from its first point on [m], shape (p,)."""
+    """Return the coordinates of points (p, 3) along an axis (2, 3), from its first point [m], shape (p,)."""
     return np.asarray((points - axis[0]) @ _unit(axis[1] - axis[0]))
 
 
 def across_axis(axis: FloatArray) -> FloatArray:
     """Return the axis' direction and two across it, right-handed unit vectors, shape (3, 3).
 
-    The second is nearest to that of the robot's axes x, y, z which the axis is least along (the first of several such).
+    The second is closest to the axis x, y or z of the robot that is most transverse to the axis.
     """
     along = _unit(axis[1] - axis[0])
     own = np.eye(3)[int(np.argmin(np.round(np.abs(along), 9)))]

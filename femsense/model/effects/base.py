@@ -63,7 +63,7 @@ class Parameter:
     plausible: float | None = None
     """Usual size of its distance from `null`, in the coordinate; None: `USUAL` of the range between the bounds."""
     of_range: bool = False
-    """Whether sizes (`plausible`, what calibration knows) are shares of the range of the input of its cable."""
+    """Whether `plausible` and the prior of calibration are relative to the range of the input of its cable."""
     length: KnownLength | None = None
     """Prior on the length of the vector of which it is a component."""
 
@@ -143,8 +143,8 @@ class Calibrated:
     planned_std: float
     """The same while an experiment is planned."""
     of_inputs: bool
-    """Whether it says where the inputs begin, not what the body is. Many effects look like it,
-    so that it is named only where the model misses it; initial inputs that are unknown stand for it."""
+    """Whether it is an offset of the inputs, not a property of the body. Many effects resemble it, so it is named only if the model lacks
+    it; unknown initial inputs include it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,18 +153,18 @@ class Alias:
 
     name: str
     common: bool = False
-    """Whether that is so where all parameters move alike; else it is its mirror image."""
+    """Whether that holds for equal changes of all parameters; otherwise for mirrored ones."""
     told_by: str = ""
     """The recording that distinguishes the two, in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """A named thing that a plain model may lack."""
+    """An effect that a plain model may lack."""
 
     name: str
     lacks: str
-    """What the declared model lacks, in a few words."""
+    """Short description of the effect."""
     parameters: Callable[[Robot, str], tuple[Parameter, ...]]
     """(robot, control) → the parameters that a fit moves; control is "tension" or "displacement". Empty: cannot act here."""
     apply: Callable[[Robot, Entry], Robot]
@@ -176,27 +176,27 @@ class Effect:
     path_dependent: bool = False
     """Whether the equilibrium depends on those before, so that all frames from the first on are solved."""
     discrete: bool = False
-    """Whether a seed changes the model by itself, by no small amount: it is then tried as a whole. Its parameters, if it has any,
-    start at their `null`, which is a plausible value and leaves no plain model."""
+    """Whether a seed alone changes the model by a finite amount: it is then refitted without linear screening. Its parameters, if any,
+    start at their `null`, a plausible value that is not the plain model."""
     polish: Callable[[Robot, str, Entry], tuple[Parameter, ...]] = lambda robot, control, seed: ()
-    """(robot, control, seed) → what the seed holds still while effects are compared and a joint fit may move after that; `null`
-    is the seed's own value."""
+    """(robot, control, seed) → parameters that are fixed while effects are compared and free in the joint fit afterwards; `null` is the
+    seed's value."""
     nearby: Callable[[Robot, Entry], Sequence[Entry]] = lambda robot, seed: ()
     """(robot, seed) → seeds between this one and its neighbours; tried once this one is known to be the best."""
     calibrated: Calibrated | None = None
     """How it is fitted along with everything; None: it is sought."""
     aliases: tuple[Alias, ...] = ()
-    """What it is confused with whatever the data are."""
+    """Effects with which it is confounded for any data."""
     told_by: Experiment | None = None
-    """What to record to tell it from others."""
+    """Recordings that distinguish it from others."""
     planned: Callable[[Robot], Sequence[tuple[str, Effect]]] | None = None
-    """(robot) → forms in which an experiment is planned for it, each with what distinguishes its label; None: itself."""
+    """(robot) → forms for which an experiment is planned, each with the suffix of its label; None: the effect itself."""
     drives: bool = False
-    """Whether it changes the tensions that drive a frame, and leaves the body as it is."""
+    """Whether it changes only the tensions of a frame, not the body."""
     remeshes: bool = False
     """Whether it changes the mesh."""
     places_markers: bool = False
-    """Whether it says where single markers sit: rest.csv measures that, and markers are added to it one by one."""
+    """Whether it describes the placement of single markers: rest.csv measures it, and markers are added one at a time."""
     moves_rest: bool = False
     """Whether it changes where markers are measured at rest."""
     turns_with_base: bool = False
@@ -221,7 +221,7 @@ def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLengt
 
 
 def range_units(parameters: Sequence[Parameter], cables: Sequence[str], ranges: FloatArray) -> FloatArray:
-    """Return the unit that sizes of parameters are shares of, shape (p,): the range of the cable's input [N] or [m], or 1."""
+    """Return the unit of relative parameter sizes, shape (p,): the range of the cable's input [N] or [m], or 1."""
     return np.array([float(ranges[cables.index(str(path_of(p.part)[0]))]) if p.of_range else 1.0 for p in parameters])
 
 
@@ -236,8 +236,7 @@ def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], s
 
 
 def absent_elsewhere(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Return the parameters of recordings in which an effect is absent, where it is that of others alone:
-    there they stay at their null."""
+    """Return the parameters of recordings in which an effect of other recordings is absent; they stay at their null."""
     given = {(p.key, p.part) for p in parameters}
     result = dict[tuple[str, Any], Parameter]()
     for p in parameters:
@@ -252,7 +251,7 @@ def absent_elsewhere(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
 
 
 def placed(slot: Any, part: int | str | tuple[str, int] | InRecording | None, value: Any) -> Any:
-    """Return what stands under a key of an entry with the value of one more part; components of a vector come in their order."""
+    """Return the value of a key of an entry extended by one part; components of a vector are appended in order."""
     return _placed(slot, path_of(part), value)
 
 

@@ -57,7 +57,7 @@ def _from_axis(axis: FloatArray, points: FloatArray) -> FloatArray:
 def _apply(robot: Robot, entry: Entry) -> Robot:
     body, nodes = robot.body, robot.body.mesh.nodes
     if not {"offset_m", "radius_scale", "angle_rad"} & set(entry):
-        raise InputError("nothing says where the cables run", where=NAME, expected="offset_m, radius_scale or angle_rad")
+        raise InputError("the paths of the cables are not declared", where=NAME, expected="offset_m, radius_scale or angle_rad")
     scales, angles = (per_cable(entry, key, NAME, robot, default) for key, default in (("radius_scale", 1.0), ("angle_rad", 0.0)))
     offsets, axis = _offsets(entry, body.cable_names), axis_of(body)
     places = {}

@@ -25,7 +25,7 @@ GAINS = float(np.log(0.3)), float(np.log(3.0))
 WEIGHT_TELLS = (
     "hang a known weight on the robot in some frames (loads.csv): a modulus answers to it, a gain of all cables does not"
 )
-"""How a common scale of all cables is told from the modulus."""
+"""How a common scale of all cables is distinguished from the modulus."""
 
 
 def _has_bends(robot: Robot) -> bool:
@@ -33,7 +33,7 @@ def _has_bends(robot: Robot) -> bool:
 
 
 def _rubbing(robot: Robot, control: str) -> list[str]:
-    """Return the cables whose friction moves the body: a bend where it leaves matters only if its tension at the motor does."""
+    """Return the cables whose friction moves the body: the bend at the exit matters only if the motor tension is given."""
     return [
         c.name
         for c in robot.body.cables

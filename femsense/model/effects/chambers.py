@@ -15,7 +15,7 @@ OFTEN = 50e3
 """Largest pressure of a soft chamber that declares none [Pa]."""
 FARTHEST, USUAL_ZERO = 0.25, 0.01
 """Largest and usual zero of a pressure sensor, as shares of the chamber's largest pressure:
-data sheets say 0.25 to 2 % of full scale."""
+0.25 to 2 % of full scale in data sheets."""
 
 
 def _largest(chamber: Chamber) -> float:

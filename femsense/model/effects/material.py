@@ -13,8 +13,8 @@ from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, P
 from femsense.model.robot import Robot, spread_features
 
 MODULUS_STD = 0.5
-"""How well the modulus is known beforehand, in its logarithm:
-a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
+"""Prior standard deviation of the logarithm of the modulus: a soft region in a stiff body and a stiff one in a soft body have nearly the
+same effect."""
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -76,7 +76,7 @@ def _middles(points: FloatArray, weights: FloatArray, halvings: int) -> list[Flo
 
 
 def _regions_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
-    """Spheres of several sizes around this place and places beside it; of those that hold the same elements only the first."""
+    """Spheres of several sizes around this point and neighbouring ones; of spheres with the same elements only the first."""
     mesh, center, radius = robot.body.mesh, np.asarray(seed["center_m"]), float(seed["radius_m"])
     centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
     moves = np.vstack([np.zeros((1, 3)), *(h * radius * np.vstack([np.eye(3), -np.eye(3)]) for h in (0.35, 0.8))])
@@ -134,8 +134,7 @@ def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 MOST_CREEP = 0.5
-"""Share of the stress of a cast silicone that may relax in one term;
-what acts like more is something else (0.05–0.3 are usual)."""
+"""Largest fraction of the stress of a cast silicone that relaxes in one term (0.05–0.3 are usual); more indicates another effect."""
 USUAL_CREEP = 0.15
 """Share that one term of a cast silicone relaxes."""
 

@@ -13,7 +13,7 @@ from femsense.model.effects.base import Effect, Entry, Experiment, Parameter, nu
 from femsense.model.robot import Robot
 
 NEAR_CLAMP = 0.25
-"""A marker beside the body may sit on the clamp if it is nearer to it than this times the body's reach."""
+"""A marker outside the body may be on the clamp if it is closer to it than this fraction of the body's reach."""
 
 
 def _depth_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -54,7 +54,7 @@ def _share_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 def _markers_by_the_clamp(robot: Robot) -> tuple[Entry, ...]:
-    """Return the markers beside the body near its clamp: all of them, and each alone."""
+    """Return the sets of markers outside the body near its clamp: all of them, and each alone."""
     names = _beside_the_clamp(robot)
     alone = tuple({"markers": [name]} for name in names)
     return ({"markers": names}, *alone) if len(names) > 1 else alone or ({},)

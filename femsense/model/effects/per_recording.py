@@ -15,7 +15,7 @@ from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
 PER, RECORDING = "per", "recording"
-"""Key and value that say so in robot.toml."""
+"""Its key and value in robot.toml."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class ByRecording:
 
 
 def owners_of(robot: Robot) -> frozenset[str]:
-    """Return the names that may stand between a key and its values: cables, chambers and markers."""
+    """Return the names that are allowed between a key and its values: cables, chambers and markers."""
     return frozenset((*robot.body.cable_names, *robot.body.chamber_names, *robot.marker_names))
 
 
@@ -64,10 +64,10 @@ def _value_in(value: Any, label: str, owners: frozenset[str], key: str) -> Any:
 
 @lru_cache(maxsize=64)
 def per_recording(effect: Effect, labels: tuple[str, ...] = ()) -> Effect:
-    """Return the form of an effect that has values of their own in recordings with these labels.
+    """Return the form of an effect with separate values for recordings with these labels.
     Raises InputError where it has none.
 
-    The last ones are kept: a form is the same object wherever it is asked for again.
+    Forms are cached, so that the same arguments give the same object.
     """
     if not effect.may_differ:
         raise InputError(

@@ -27,7 +27,7 @@ def _apply_size(robot: Robot, entry: Entry) -> Robot:
 
 
 def _mesh_seeds(robot: Robot) -> tuple[Entry, ...]:
-    """Quadratic elements and a finer mesh, where the mesh is linear and what comes of it can be computed."""
+    """Quadratic elements and a finer mesh, if the mesh is linear and the result is not too large to compute."""
     mesh = robot.body.mesh
     if mesh.is_quadratic:
         return ()

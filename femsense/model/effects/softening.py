@@ -1,4 +1,4 @@
-"""Mullins: what has been loaded before is softer than what is loaded for the first time."""
+"""Mullins effect: material that was loaded before is softer than at its first loading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects of what holds the body."""
+"""Effects of the clamp."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from femsense.model.robot import Robot
 
 KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
 SOFTEST = 150.0
-"""The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does.
-Clamps in which soft bodies hang by tens of millimetres are at a third of that; with 50 they lay beyond what was plausible,
-and nothing else came near."""
+"""Largest compliance of a clamp, relative to a cube of the material with the size of the body's reach. Clamps in which soft bodies move
+by tens of millimetres reach a third of it; with 50 they were excluded as implausible."""
 USUAL_SPRING, USUAL_PLATE = 0.01, 0.02
 """Plausible compliance of a clamp, of its springs and of its plate, as a share of the largest that is tried."""
 

@@ -72,10 +72,10 @@ def load_own_effect(path: str | Path) -> Effect:
 
 
 def try_own_effect(effect: Effect, robot: Robot) -> None:
-    """Run an effect of a user once beside its null and once there, from each seed.
+    """Run a user-defined effect once at its null and once next to it, from each seed.
 
     Raises:
-        InputError: where a function fails or gives something else, or where the effect does not vanish at its null.
+        InputError: a function fails or returns a wrong type, or the effect does not vanish at its null.
     """
     parameters = effect.parameters(robot, "")
     for seed in effect.seeds(robot):
@@ -88,12 +88,12 @@ def try_own_effect(effect: Effect, robot: Robot) -> None:
                 expected="no forces, the same robot, the same points",
                 found=", ".join(f"{p.key} = {null[p.key]}" for p in parameters if p.part in (None, 0))
                 + ", which changes the robot",
-                hint='say where it vanishes: "null" (femsense docs own)',
+                hint='declare the value without effect: "null" (femsense docs own)',
             )
 
 
 def _is_same(robot: Robot, other: Robot) -> bool:
-    """Return whether two robots carry, resist and are seen alike, as far as arrays show it."""
+    """Return whether two robots have equal loads, stiffness and markers, by comparison of their arrays."""
     points = np.array([[0.0, 0.0, 0.5], [0.1, -0.1, 1.0]])
     for correct in robot.observation.corrections[len(other.observation.corrections) :]:
         if not np.allclose(correct(points), points, rtol=0.0, atol=1e-9):
@@ -106,7 +106,7 @@ def _is_same(robot: Robot, other: Robot) -> bool:
 
 
 def find_own_file(entry: Mapping[str, Any], robot: Robot) -> Path:
-    """Return the file of an entry of `[[effects]]`: as it stands, or beside robot.toml."""
+    """Return the file of an entry of `[[effects]]`: as given, or relative to robot.toml."""
     file = Path(str(entry["file"])).expanduser()
     return file if file.is_absolute() or robot.folder is None else robot.folder / file
 

@@ -1,4 +1,4 @@
-"""Effects of weight: a density that is not as declared, and a mass that nobody declared. Both turn with gravity."""
+"""Effects of weight: a wrong density and an undeclared mass. Both rotate with gravity."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ DENSITY = Effect(
 )
 TIP_MASS = Effect(
     "tip_mass",
-    "a mass that nobody declared: its weight turns with gravity",
+    "an undeclared mass, with a weight along gravity",
     _mass_parameters,
     _apply_mass,
     _mass_places,

@@ -29,12 +29,12 @@ from femsense.report.loop.text import correction_text, open_pairs
 from femsense.report.page import Chapter, render
 
 TESTS = {
-    "neighbours": "neighbouring states are alike",
+    "neighbours": "the residuals of neighbouring states are correlated",
     "pattern": "one pattern in many states",
-    "sweep": "one sweep stands apart",
-    "marker": "one marker stands apart",
-    "cloud neighbours": "neighbouring states of the clouds are alike",
-    "cloud sweep": "one sweep of the clouds stands apart",
+    "sweep": "one sweep differs from the others",
+    "marker": "one marker differs from the others",
+    "cloud neighbours": "the residuals of neighbouring states of the clouds are correlated",
+    "cloud sweep": "one sweep of the clouds differs from the others",
 }
 COMPONENTS = {
     "white": "each measurement by itself",

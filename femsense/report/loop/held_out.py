@@ -84,7 +84,7 @@ def sweep_dots(frames: FrameTable, noise_m: float) -> Markup | None:
         _dots(sweeps, noise_m, "sweep"),
         alt=f"Error of each sweep before and after; it fell in {fell} of {len(held)} held-out sweeps.",
         caption=(
-            f"Large dots: a sweep; small ones: its frames; held-out sweeps stand on grey. The error fell in {fell} of "
+            f"Large dots: a sweep; small ones: its frames; held-out sweeps have a grey background. The error fell in {fell} of "
             f"{words.counted(len(held), 'held-out sweep')}."
         ),
     )

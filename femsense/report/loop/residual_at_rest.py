@@ -106,7 +106,7 @@ def _how_to_read(residual: MeanResidual, cameras: bool) -> str:
     factor, axes, before = residual.factor, residual.view.axes, residual.means[0]
     shown = float((residual.view.flat(before) ** 2).sum() / max((before**2).sum(), 1e-300))
     length = "at true length" if factor == 1 else f"drawn {factor:g} times as long"
-    camera = "; the black one says which way the camera looks" if cameras else ""
+    camera = "; the black one is the direction of the camera" if cameras else ""
     return (
         "Arrows point from the model to the measurement: the mean of each marker over the held-out frames, "
         f"{length}, with the same scale in both pictures{camera}. Small dots are single frames. "

@@ -172,7 +172,7 @@ def rigid_motion(before: FloatArray, after: FloatArray) -> FloatArray:
     a, b = after.reshape(-1, 3), before.reshape(-1, 3)
     try:
         return fit_rigid(a, b)
-    except DataError:  # all on a line: no more than a shift is known
+    except DataError:  # all on a line: only a translation is determined
         return make_pose(np.eye(3), (a - b).mean(axis=0))
 
 

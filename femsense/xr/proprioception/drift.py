@@ -70,7 +70,7 @@ class Drift:
             lines.append(f"{', or '.join(said)}; without that {self.left_mm:.2f} mm are left")
         if self.outside > 0.0:
             named = ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in self.channels.items())
-            lines.append(f"outside what was learnt in {100 * self.outside:.0f} % of the rows: {named}")
+            lines.append(f"outside the training domain in {100 * self.outside:.0f} % of the rows: {named}")
         return "\n".join(lines)
 
 
@@ -157,7 +157,7 @@ def _other_names(kind: str, here: tuple[str, ...], known: tuple[str, ...]) -> st
     """Return in words how names differ from those of the model."""
     missing, new = [n for n in known if n not in here], [n for n in here if n not in known]
     if not missing and not new:
-        return f"the {kind} stand in another order than when the model was learnt: {', '.join(here)}, not {', '.join(known)}"
+        return f"the {kind} are in another order than in the training data: {', '.join(here)}, not {', '.join(known)}"
     parts = [f"without {', '.join(missing)}"] * bool(missing) + [f"with {', '.join(new)}, which it does not know"] * bool(new)
     return f"other {kind} than the model's: {', and '.join(parts)}; it knows {', '.join(known)}"
 

@@ -163,7 +163,7 @@ def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
         MLPRegressor(hidden_layer_sizes=(MLP_UNITS,), solver="lbfgs", alpha=MLP_DECAY, max_iter=300, random_state=seed + i)
         for i in range(MLP_MEMBERS)
     ]
-    with warnings.catch_warnings():  # that it has not converged is the rule with so few steps, and held-out blocks decide
+    with warnings.catch_warnings():  # with few steps it usually has not converged; held-out blocks decide
         warnings.simplefilter("ignore")
         for member in members:
             member.fit(z, left / size if left.shape[1] > 1 else left[:, 0] / size)

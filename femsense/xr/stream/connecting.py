@@ -8,8 +8,8 @@ import ssl
 NO_ANSWER = "no answer"
 PASSWORD_WAYS = "--password-file FILE, or the variable FEMSENSE_PASSWORD"
 NO_TLS = "nothing is encrypted there: the address without the s (http://, mqtt://)"
-NO_STREAM = "what answers there is no stream of femsense, or one that is encrypted (https://)"
-NO_BROKER = "what answers there is no broker, or one that is encrypted (mqtts://)"
+NO_STREAM = "the server there is not a femsense stream, or is encrypted (https://)"
+NO_BROKER = "the server there is not a broker, or is encrypted (mqtts://)"
 REFUSED = "Connection refused: nothing listens at that port; is it the right one, and does the stream run?"
 
 
@@ -44,7 +44,7 @@ def _refused_by_server(status: int, *, password: bool) -> str:
         return "the server answers only to its own names: 127.0.0.1, or with a password those of its machine and of --name"
     if status == 503:
         return "too many viewers"
-    return f"what answers there is no stream of femsense (HTTP {status}): is it the right port?"
+    return f"the server there is not a femsense stream (HTTP {status}): is it the right port?"
 
 
 def _not_reached(error: OSError, *, tls: bool) -> str:
@@ -52,7 +52,7 @@ def _not_reached(error: OSError, *, tls: bool) -> str:
     if isinstance(reason, OSError):
         return _not_reached(reason, tls=tls)
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"the certificate is not trusted ({error.verify_message}): --authority PEM names what it is checked against"
+        return f"the certificate is not trusted ({error.verify_message}): --authority PEM is the authority that it is checked against"
     if isinstance(error, ssl.SSLError) or (tls and isinstance(error, ConnectionResetError)):
         return NO_TLS
     if isinstance(error, TimeoutError) and "handshake" in str(error):

@@ -49,7 +49,7 @@ from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
 """Of an input for which the robot declares no limit."""
-BEGINS = "; nobody says which inputs the robot has: the first command begins at those that are shown"
+BEGINS = "; the inputs of the robot are unknown: the first command starts from the displayed ones"
 FAR = 2.0
 """A wish farther from the body than this many times its size is no wish."""
 
@@ -118,17 +118,17 @@ class DragServer:
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None
-        self._grabbed = False  # a point, since the last answer
+        self._grabbed = False  # whether a point was grabbed since the last answer
         self._wanted: tuple[str, tuple[float, float, float]] | None = None
         self._still_since = 0.0
         self.lease = Lease(self.options.gate.hold_s)
-        self._told: dict[str, float] = {}  # the robot's own word of its inputs
+        self._told: dict[str, float] = {}  # inputs reported by the robot
         self._told_at = float("-inf")
         self.feedback = TipFeedback(self._size, self.options.feedback)
         self._handle = ""
         self._settled_since: float | None = None
         self._measured_at: dict[str, float] = {}  # marker → when it was measured last
-        self._unmeasured, self._unmeasured_at = "", float("-inf")  # why it is not
+        self._unmeasured, self._unmeasured_at = "", float("-inf")  # reason why the robot is not measured, and its time
         self._answer: tuple[FloatArray, dict[str, Any]] | None = None
         self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
         self._seq = self._commands = self._leases = 0
@@ -234,7 +234,7 @@ class DragServer:
             if self._wish is None or self._follower.resting:
                 self._fresh.wait()
             elif self._follower.ended:
-                self._fresh.wait(self.options.rest_s)  # then it is sought from rest
+                self._fresh.wait(self.options.rest_s)  # the search then starts from rest
             self._fresh.clear()
             with self._lock:
                 wish = self._wish
@@ -302,7 +302,7 @@ class DragServer:
             return ""
         if now - self._unmeasured_at <= fresh:
             return f"; not measured: {self._unmeasured}"
-        return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'nobody says where {handle} is'}"
+        return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'no measured position of {handle} is'}"
 
     def _document(self, handle: str, motion: Motion, ms: float) -> dict[str, Any]:
         units = {one.name: one.unit for one in self.gate.inputs}

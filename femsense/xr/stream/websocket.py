@@ -301,7 +301,7 @@ class WebSocketServer:
         if not self.access.knows_host(host, reached_at) or not same_origin(headers.get("Origin"), host):
             return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
         if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
-            await asyncio.sleep(0.3)  # who guesses waits
+            await asyncio.sleep(0.3)  # slows down password guessing
             more = {"Content-Type": TYPES[".html"]}
             if path not in ASKED_BY_PAGE:
                 more["WWW-Authenticate"] = 'Basic realm="femsense"'

@@ -127,7 +127,7 @@ def test_marks_between_thousands_are_read_and_noted(form: str, mark: str, tmp_pa
     recording, _ = imported(tmp_path / "take.csv", tmp_path)
     np.testing.assert_allclose(marker_grid(recording)[:, 0], 5.0 * PLACES, atol=1e-4)
     notes = " ".join(open_source(tmp_path / "take.csv").notes)
-    assert "between thousands" in notes and ("decimal commas" in notes) == (form[1] == ",")
+    assert "thousands separators" in notes and ("decimal commas" in notes) == (form[1] == ",")
 
 
 def test_decimal_commas_between_commas_are_refused_by_name(tmp_path: Path) -> None:
@@ -176,10 +176,7 @@ def test_a_unit_or_an_offset_in_a_mapping(target: str, pascals: float, tmp_path:
 
 def test_a_unit_that_nobody_says_is_noted(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("time,chamber_a\n0,2\n1,2\n")
-    assert any(
-        "no unit stands beside chamber_a: taken as Pa" in note
-        for note in read_actuation_log(tmp_path / "log.csv", Options()).notes
-    )
+    assert any("no unit for chamber_a: taken as Pa" in note for note in read_actuation_log(tmp_path / "log.csv", Options()).notes)
 
 
 def test_dates_and_times_in_two_columns(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_of_two_cameras_of_kalibr_the_first_is_read_and_that_is_noted(tmp_path: 
     one = f"  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n  resolution: [160, 120]\n"
     (tmp_path / "c.yaml").write_text(f"cam0:\n{one}cam1:\n{one.replace(str(FX), '525')}")
     lens, notes = read_lens(tmp_path / "c.yaml", WIDTH, HEIGHT)
-    assert lens.fx == FX and any("the first is read" in note for note in notes)
+    assert lens.fx == FX and any("the first is used" in note for note in notes)
 
 
 @pytest.mark.parametrize(

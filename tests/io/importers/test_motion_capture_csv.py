@@ -269,7 +269,7 @@ def test_a_short_recording_that_correlates_by_chance_tells_no_offset(seed: int, 
     ramps = [*(2 - abs((k % 6) - 3) * 2 / 3 for k in range(13)), 0.2, 0.4, 0.6, 0.6, 0.6, 0.6, 0.4, 0.2, 0.0]
     (tmp_path / "log.csv").write_text("\n".join(["time,cable_a", *(f"{100 + 0.5 * k},{v}" for k, v in enumerate(ramps))]))
     log = read_actuation_log(tmp_path / "log.csv", Options())
-    with pytest.raises(InputError, match="does not tell the offset"):
+    with pytest.raises(InputError, match="does not determine the offset"):
         imported(tmp_path / "a.csv", tmp_path / "out", Options(unit="m"), log=log, actuation="tension")
 
 
@@ -280,7 +280,7 @@ def test_motion_that_tells_no_offset_is_said(motion: float, tmp_path: Path) -> N
     rows = [f"{1 + 0.01 * k},{motion * drive(1 + 0.01 * k) + x},0,1" for k, x in enumerate(rng.normal(size=800) * 0.005)]
     (tmp_path / "a.csv").write_text("\n".join(["time,tip_x,tip_y,tip_z", *rows]))
     log = read_actuation_log(log_file(tmp_path / "log.csv", 0.0), Options())
-    with pytest.raises(InputError, match="does not tell the offset") as caught:
+    with pytest.raises(InputError, match="does not determine the offset") as caught:
         imported(tmp_path / "a.csv", tmp_path / "out", Options(unit="m"), log=log, actuation="tension")
     assert "--offset" in str(caught.value)
 

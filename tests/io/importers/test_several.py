@@ -149,9 +149,9 @@ def test_several_files_are_cameras_and_the_same_command_does_nothing(tmp_path: P
     assert load_recording(tmp_path / "r").camera_names == ("front", "second") and found["frames"] == 3
     import_into(tmp_path / "r", paths, Options(), say=said.append)
     assert len(said) == 1 and "already" in said[0]
-    with pytest.raises(InputError, match="another import"):
+    with pytest.raises(InputError, match="import of another source"):
         import_into(tmp_path / "r", [paths[0], f"third={tmp_path / 'side'}"], Options(), say=said.append)
-    with pytest.raises(InputError, match="stands twice"):
+    with pytest.raises(InputError, match="occurs twice"):
         import_into(tmp_path / "s", [f"a={tmp_path / 'side'}", f"a={tmp_path / 'front'}"], Options(), say=said.append)
 
 

@@ -72,7 +72,7 @@ def test_numbers_that_begin_at_zero(tmp_path: Path) -> None:
 
 def test_a_tetrahedron_of_two_groups_is_used_once_and_keeps_both(tmp_path: Path) -> None:
     file = gmsh_2(tmp_path / "a.msh", 5, 6)
-    with pytest.warns(UserWarning, match=f"{len(TETS)} of {2 * len(TETS)} tetrahedra stand there twice"):
+    with pytest.warns(UserWarning, match=f"{len(TETS)} of {2 * len(TETS)} tetrahedra occur twice"):
         same_body(file)
     np.testing.assert_array_equal(tet_values(file, "gmsh:physical", "here"), [[5, 6]] * len(TETS))
 

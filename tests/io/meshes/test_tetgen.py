@@ -51,7 +51,7 @@ def test_ten_nodes_in_any_order(order: tuple[int, ...], tmp_path: Path) -> None:
 def test_counts_that_are_not_those_of_the_rows_are_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "b.ele", block_mesh())
     file.write_text(file.read_text().rstrip().rpartition("\n")[0] + "\n")
-    with pytest.raises(InputError, match="does not hold what it announces"):
+    with pytest.raises(InputError, match="disagrees with its header"):
         read_tets(file)
 
 

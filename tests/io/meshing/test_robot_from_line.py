@@ -156,7 +156,7 @@ def test_a_curved_line_carries_its_sections_and_channels(tmp_path: Path) -> None
             {"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 2.0, "distance_mm": 5.0}]},
             "chambers leave no wall",
         ),
-        ({"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 3.0, "distance_mm": 2.0}]}, "reaches over it"),
+        ({"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 3.0, "distance_mm": 2.0}]}, "crosses it"),
         ({"angle_zero": [0.0, 0.0, 1.0]}, "points along the line"),
         ({"radius": 3.0}, "unknown key"),
     ],
@@ -194,7 +194,7 @@ def test_the_command_makes_a_robot_and_inspect_warns_of_few_points(tmp_path: Pat
     assert set(np.round(robot.body.mesh.nodes[robot.body.clamped, 2], 6)) == {0.0, -0.1}
     assert robot.body.material.density == SILICONE["density_kg_m3"]
     assert run(["mesh", str(source), "-o", str(tmp_path / "robot"), "--max-tets", "700"]) == 0
-    assert "holds this robot already" in capsys.readouterr().err
+    assert "contains this robot already" in capsys.readouterr().err
     assert run(["inspect", str(tmp_path / "robot")]) == 0
     assert "between points 0 and 1 of its path" in capsys.readouterr().out
     (tmp_path / "robot" / "mesh.json").unlink()

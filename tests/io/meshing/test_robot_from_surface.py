@@ -121,7 +121,7 @@ def test_shells_that_cross_are_filled_as_one(tmp_path: Path) -> None:
     both = trimesh.util.concatenate([trimesh.creation.box((100, 30, 30)), post])
     filled = fill(np.array(both.vertices), np.array(both.faces), MM)
     assert element_volumes(filled.mesh).sum() == pytest.approx(90e-6 + 20 * 20 * 35e-9, rel=0.02)
-    assert any("triangles cross others" in note for note in filled.done)
+    assert any("triangles intersect others" in note for note in filled.done)
 
 
 # The folder
@@ -200,7 +200,7 @@ def test_it_is_not_made_twice(tmp_path: Path, quick: Blocks) -> None:
         mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick) == json.loads(json.dumps(first))
         and len(quick.calls) == 1
     )
-    assert "holds this mesh already" in said[0]
+    assert "contains this mesh already" in said[0]
     mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick, again=True)
     mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append, mesher=quick)
     assert len(quick.calls) == 3 and len(said) == 1
@@ -245,7 +245,7 @@ def test_thin_walls_get_the_tetrahedra_that_they_ask_for_unless_somebody_says_ho
     walls = Walls((12, 8, 8), (11, 8, 8))  # 4608, then 4224: longer edges bring hardly fewer
     filled = fill(points, triangles, MeshOptions(unit="mm"), mesher=walls)
     assert len(filled.mesh.tets) == 6 * 11 * 8 * 8 and walls.calls == 2
-    assert any("4224 tetrahedra rather than 2000" in note for note in filled.done)
+    assert any("4224 tetrahedra instead of 2000" in note for note in filled.done)
     with pytest.raises(InputError, match="more tetrahedra than wanted") as error:
         fill(points, triangles, MeshOptions(unit="mm", most_tets=2000), mesher=Walls((12, 8, 8)))
     assert "--max-tets 4608" in str(error.value)
@@ -303,7 +303,9 @@ def test_crumbs_are_left_out_and_parts_are_refused() -> None:
         mesher = made_before(*[both] * 5)
         if fits:
             filled = fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
-            assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
+            assert len(filled.mesh.tets) == len(body.tets) and filled.done == (
+                "1 disconnected pieces of negligible volume were removed",
+            )
             continue
         with pytest.raises(InputError, match="fall into parts that no face joins"):
             fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
@@ -317,7 +319,7 @@ def test_a_wall_inside_is_said_and_filled(quick: Blocks) -> None:
     )
     faces = np.vstack([left.triangles, right.triangles[(right.triangles[:, :, 0] > 1).any(axis=1)]])
     filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM, mesher=quick)
-    assert any(note.startswith("4 edges have more than two triangles (walls inside") for note in filled.done)
+    assert any(note.startswith("4 edges have more than two triangles (inner walls") for note in filled.done)
     assert quick.calls[0]["check_volume"] is False
 
 
@@ -357,7 +359,7 @@ def test_what_takes_too_long_is_stopped() -> None:
             ),
             "a cloud of 2 points",
         ),
-        ("noise.stl", bytes(range(256)) * 10, "the file does not hold what it announces"),
+        ("noise.stl", bytes(range(256)) * 10, "the content disagrees with its header"),
         ("cut.stl", stl_bytes(BOX.triangles)[:300], "12 triangles announced, room for 4"),
         (
             "nan.stl",
@@ -386,7 +388,7 @@ def test_tetrahedra_are_no_surface(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("unit", "extent", "text", "hint"),
     [
-        (None, 100.0, "the unit of a surface file stands nowhere in it", "--unit mm makes it 100 mm long"),
+        (None, 100.0, "a surface file does not contain its unit", "--unit mm makes it 100 mm long"),
         ("m", 100.0, "the body has an unlikely size", "--unit mm makes it 100 mm long"),
         ("mm", 0.1, "the body has an unlikely size", "--unit m makes it 100 mm long"),
         ("inch", 100.0, "unknown unit", "--unit mm makes it 100 mm long"),

@@ -83,9 +83,7 @@ def test_a_sheet_that_hangs_on_the_body_is_left_out() -> None:
     a, b = np.flatnonzero((points[:, 1] > 0) & (points[:, 2] > 0))
     fin = np.vstack([points, points[[a, b]] + [0, 0, 30]])
     surface = repaired(fin, np.vstack([faces, [[a, b, 9], [a, 9, 8]]]))
-    assert surface.volume == pytest.approx(9e4) and surface.done == (
-        "1 sheets of 2 triangles that hang on the body were left out",
-    )
+    assert surface.volume == pytest.approx(9e4) and surface.done == ("1 sheets of 2 triangles attached to the body were removed",)
     fin[8:] += [0, 0, 200]
     with pytest.raises(InputError, match="3 edges of one triangle that go round no hole"):
         repaired(fin, np.vstack([faces, [[a, b, 9], [a, 9, 8]]]))
@@ -146,7 +144,7 @@ def test_crossing_triangles_are_found() -> None:
 
 def test_crumbs_are_left_out() -> None:
     surface = mended(BOX, box((0.1, 0.1, 0.1), at=(200, 0, 0)))
-    assert len(surface.triangles) == 12 and surface.done == ("1 shells that enclose next to nothing were left out",)
+    assert len(surface.triangles) == 12 and surface.done == ("1 shells of negligible volume were removed",)
 
 
 def test_many_bubbles_are_separated_and_too_many_pieces_are_refused() -> None:

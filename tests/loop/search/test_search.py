@@ -16,7 +16,7 @@ from femsense.loop.search.search import nothing_explains
 from femsense.loop.search.search_state import Search, SearchProgress
 from femsense.loop.thresholds import DEFAULTS
 from femsense.loop.verdict.confounding import confounded
-from femsense.loop.verdict.summary import tried_effects
+from femsense.loop.verdict.summary import REMOVED, tried_effects
 
 
 @pytest.fixture(scope="module")
@@ -66,5 +66,7 @@ def test_evidence_by_weights_that_were_given_up_is_compared_with_none_by_those_o
     ]
     search = Search(fitted, asked.history, fitted, fitted, weights, 100.0, [], [], asked.refits, None, asked.outweighed)
     assert not confounded(search, ["payload"], DEFAULTS)  # by the weights of now, 85 lie between the two
-    every = tried_effects([], [], [*search.outweighed, *search.refits], DEFAULTS)
+    every = tried_effects([], [], [*search.outweighed, *search.refits], ["payload"], DEFAULTS)
     assert {c.name: (c.verdict, len(c.refits)) for c in every} == {"payload": (NAMED, 2), "density": ("too little", 2)}
+    _, removed = tried_effects([], [], [*search.outweighed, *search.refits], [], DEFAULTS)
+    assert (removed.name, removed.verdict) == ("payload", REMOVED)

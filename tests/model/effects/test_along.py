@@ -96,7 +96,7 @@ def test_what_folds_over_and_what_is_no_axis_is_refused() -> None:
         ({"name": "rest_shape", "axis_m": AXIS, "curvature_1_m": [1.0]}, "not two numbers"),
         ({"name": "stiffness_gradient", "axis_m": [[0, 0, 0], [0, 0, 0]], "per_m": 1.0}, "not an axis"),
         ({"name": "cable_path", "offset_m": {"north": [0, 0, 0]}}, "unknown cable"),
-        ({"name": "cable_path"}, "nothing says where"),
+        ({"name": "cable_path"}, "are not declared"),
         ({"name": "cable_coupling", "from": "up", "to": "up", "share": 0.1}, "coupled with itself"),
         ({"name": "cable_coupling", "from": "up", "to": "west", "share": 0.1}, "unknown cable"),
     ):

@@ -98,7 +98,7 @@ def test_a_server_that_is_no_stream_is_told_from_one() -> None:
             super().__init__(f"HTTP {status}")
             self.code = status
 
-    assert why_not(Answer(404), tls=False, password=False).startswith("what answers there is no stream of femsense (HTTP 404)")
+    assert why_not(Answer(404), tls=False, password=False).startswith("the server there is not a femsense stream (HTTP 404)")
     assert "its own names" in why_not(Answer(403), tls=False, password=False)
     assert why_not(Answer(503), tls=False, password=False) == "too many viewers"
     assert why_not(socket.gaierror(), tls=False, password=False) == "no machine of that name is known"

@@ -403,7 +403,7 @@ def test_before_the_first_command_it_is_said_where_it_begins_unless_the_robot_sa
 ) -> None:
     hub, server = alone
     names, out = server.robot.body.cable_names, Commands(hub, server)
-    far, warned = target_of(server.robot, dict(zip(names, (1.5, 0.6)))), "the first command begins at those that are shown"
+    far, warned = target_of(server.robot, dict(zip(names, (1.5, 0.6)))), "the first command starts from the displayed ones"
     drag(hub, far, armed=False)
     assert within(20.0, lambda: warned in reach_of(hub).get("text", ""))
     inputs = [{"name": name, "unit": "N", "value": 0.1} for name in names]

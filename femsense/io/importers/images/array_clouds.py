@@ -21,12 +21,12 @@ MOST_COLUMNS = 12
 
 
 def read_array_cloud(file: Path) -> PointCloud:
-    """Return the cloud of a .npy or .npz file in the file's unit; places that are not finite, or all zero, are left out.
+    """Return the cloud of a .npy or .npz file in the file's unit, without points that are not finite or all zero.
 
     Arrays are (n, 3), (n, 6) with colours, (H, W, 3), or (3, n); fields or arrays x, y, z are columns.
 
     Raises:
-        InputError: not readable, or nothing in it, or several arrays, that can be places.
+        InputError: not readable, or no array, or several arrays, with a suitable shape.
     """
     try:
         loaded = np.load(file, allow_pickle=False)

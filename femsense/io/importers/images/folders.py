@@ -224,7 +224,7 @@ def _folder_lens(folder: Path, width: int, height: int) -> tuple[Camera, list[st
 
 
 def _unit_of_depth(folder: Path, options: Options, usual: float) -> tuple[float, bool]:
-    """Return metres in one unit of the depth images, and whether a person or a file says it.
+    """Return metres per unit of the depth images, and whether the options or a file declare it.
 
     `depth_scale` counts units in a metre as Open3D writes it, or millimetres in one unit (BOP), which is at most 1.
     """
@@ -257,7 +257,7 @@ def _warn_of_distance(file: Path, unit: float, said: bool, layout: str) -> None:
     ]
     begin = f"the scene is {away:.3g} m away where one unit of depth is {1e3 * unit:.3g} mm"
     from_layout = "" if said else f", as {layout} has it"
-    text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M says another'}"
+    text = f"{file}: {begin}{from_layout}: is it another unit? {'; '.join(fits) or '--depth-unit M states another'}"
     warnings.warn(text, stacklevel=3)
 
 

@@ -1,6 +1,6 @@
-"""Lenses in files of text, JSON and YAML: by the names that stand there, by the shape of matrices, at last by the order of numbers.
+"""Intrinsics from text, JSON and YAML files: identified by names, else by the shape of matrices, else by the order of numbers.
 
-Digits within words and in comments are no numbers of a lens. What cannot be a lens of the images is refused by `check_lens`.
+Digits within words and in comments are ignored. `check_lens` refuses implausible intrinsics.
 """
 
 from __future__ import annotations
@@ -121,10 +121,10 @@ class _Found:
 
 
 def read_lens(path: Path, width: int, height: int) -> tuple[Camera, list[str]]:
-    """Return the lens of a file for images of a size [px], and what was assumed of it.
+    """Return the intrinsics in a file for images of a size [px], and the assumptions made.
 
     Raises:
-        InputError: no lens in it, one of images of another size, or one that no camera has (see `check_lens`).
+        InputError: no intrinsics, those of another image size, or implausible ones (see `check_lens`).
     """
     text = read_text(path)
     found = _in_json(text, path) if path.suffix == ".json" else _in_text(text, width, height)
@@ -202,7 +202,7 @@ def lens_text(lens: Camera) -> str:
 
 
 def lens_line(lens: Camera) -> str:
-    """Return size, model and numbers of a lens as text, for the table of what was imported."""
+    """Return image size, model and parameters of the intrinsics as text, for the summary of the import."""
     return f"{lens.width} × {lens.height}, {lens.distortion_model}, {lens_text(lens)}"
 
 
@@ -242,7 +242,7 @@ def _in_json(text: str, path: Path) -> _Found | None:
 
 
 def _flatten(name: str, value: Any, into: dict[str, list[float]]) -> None:
-    """Gather numbers and lists of numbers under the last part of their name, in small letters; what comes first stays."""
+    """Collect numbers and lists of numbers under the last part of their key, in lower case; the first of several is kept."""
     if isinstance(value, Mapping):
         if set(map(str, value)) >= {"rows", "cols", "data"}:
             _flatten(name, value["data"], into)
@@ -264,7 +264,7 @@ def _flatten(name: str, value: Any, into: dict[str, list[float]]) -> None:
 
 
 def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
-    """Return what names say: of a matrix, or of fx, cx and the like; None where they name no lens."""
+    """Return the intrinsics identified by names, of a matrix or of fx, cx and similar; None without such names."""
     single = {KNOWN[name]: values[0] for name, values in flat.items() if name in KNOWN and len(values) == 1}
     sizes = next((flat[name] for name in SIZES if len(flat.get(name, ())) == 2), None)
     beside = dict(zip(("width", "height"), sizes)) if sizes else {}
@@ -292,7 +292,7 @@ def _of_names(flat: Mapping[str, list[float]]) -> _Found | None:
 
 
 def _matrix(values: FloatArray) -> dict[str, float] | None:
-    """Return fx, fy, cx, cy of a matrix of 3 × 3, 3 × 4 or 4 × 4 by rows or by columns; None for what is none, or a pose."""
+    """Return fx, fy, cx, cy of a matrix of 3 × 3, 3 × 4 or 4 × 4 by rows or by columns; None for other matrices, such as poses."""
     shapes = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
     if values.size not in shapes:
         return None
@@ -323,7 +323,7 @@ def _in_text(text: str, width: int, height: int) -> _Found | None:
     named = _named_numbers(lines)
     found = _of_names(named) or _of_model(named, width, height) or _of_shape(lines) or _of_order(lines, width, height)
     if found is not None and any(name.removesuffix(AGAIN) in (*KNOWN, *MATRICES) for name in named if name.endswith(AGAIN)):
-        found = replace(found, notes=(*found.notes, "several lenses stand there, and the first is read"))
+        found = replace(found, notes=(*found.notes, "the file has several lenses; the first is used"))
     if found is not None or "fx" in named:
         return found
     bare = [" ".join(NUMBER.findall(line)) for line in lines]  # numbers among words that name nothing
@@ -373,7 +373,7 @@ def _rows(lines: Sequence[str]) -> Iterator[list[float]]:
 
 
 def _of_shape(lines: Sequence[str]) -> _Found | None:
-    """Return the first matrix that stands in one line, or in three or four lines of three or four numbers."""
+    """Return the first matrix written in one line, or in three or four lines of three or four numbers."""
     rows = list(_rows(lines))
     for i, count in product(range(len(rows)), (1, 3, 4)):
         block = rows[i : i + count]
@@ -409,7 +409,7 @@ def _ordered(values: list[float], width: int, height: int) -> _Found | None:
     if len(values) == 5 and values[4] == 0.0:
         values = values[:4]
     if len(values) not in (4, 5, 6, 8, 9, 12) or (shares and len(values) == 5):
-        return None  # the fifth of LSD-SLAM's numbers bends rays in a way of its own
+        return None  # the fifth number of LSD-SLAM is a distortion model of its own
     orders = {"fx fy cx cy": (0, 1, 2, 3), "fx cx fy cy": (0, 2, 1, 3), "cx cy fx fy": (2, 3, 0, 1)}
     usual = [name for name, order in orders.items() if _is_usual([values[i] for i in order], width, height)]
     name = usual[0] if len(usual) == 1 else "fx fy cx cy"

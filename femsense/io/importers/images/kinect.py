@@ -1,7 +1,7 @@
 """Azure Kinect recordings (.mkv): depth bit for bit, colours registered to it, the lens from the calibration inside.
 
-What stands where: "Azure Kinect DK recording file format" of the vendor's documentation;
-how the calibration is scaled to a mode of the cameras: `mode_specific_calibration.c` of the Azure Kinect Sensor SDK.
+File layout: "Azure Kinect DK recording file format" of the vendor's documentation;
+scaling of the calibration to a camera mode: `mode_specific_calibration.c` of the Azure Kinect Sensor SDK.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def calibrated_lens(camera: Mapping[str, Any], width: int, height: int) -> Camer
     return camera_of_numbers(width, height, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3, k4, k5, k6))
 
 
-# What stands in the file
+# The contents of the file
 
 
 def _tracks(path: Path) -> Tracks:

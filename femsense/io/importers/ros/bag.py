@@ -100,7 +100,7 @@ class Bag:
 
 
 def content_ending(path: Path) -> str | None:
-    """Return the ending of a bag's content, whatever the file is called; None for what is no bag."""
+    """Return the suffix that fits the content of a bag, whatever its name; None for other files."""
     with path.open("rb") as stream:
         head = stream.read(16)
     return next((ending for begin, ending in BEGINNINGS if head.startswith(begin)), None)
@@ -189,7 +189,7 @@ def _streamed(path: Path, error: Exception) -> StreamedMcap:
         raise
     except InputError:
         raise _unreadable(path, error) from None
-    if "Profile is not" not in str(error):  # a whole file that does not say that it is of ROS 2, or is of ROS 1
+    if "Profile is not" not in str(error):  # a complete file that is of ROS 1, or not declared as ROS 2
         warnings.warn(
             f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages of whole chunks before the "
             f"break are read; {MENDED['.mcap']}",

@@ -145,11 +145,10 @@ def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
 
 
 def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) -> Camera:
-    """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for the images that its region and binning leave.
+    """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for images with its region of interest and binning.
 
-    Images as they come have the matrix K and the distortion D; rectified ones have the matrix P and no distortion.
-
-    image_geometry, `PinholeCameraModel`: a region moves the centre, binning divides.
+    Raw images have the matrix K and the distortion D; rectified ones have the matrix P and no distortion. As in `PinholeCameraModel` of
+    image_geometry, a region shifts the principal point and binning divides.
     """
     K = np.asarray(getattr(message, "k", None) if hasattr(message, "k") else message.K, dtype=float).ravel()
     D = np.asarray(getattr(message, "d", None) if hasattr(message, "d") else message.D, dtype=float).ravel()
@@ -173,7 +172,7 @@ def lens_of(message: Any, where: str | Path | None, *, rectified: bool = False) 
 
 
 def cloud_of(message: Any, where: str | Path | None) -> PointCloud:
-    """Return a sensor_msgs/PointCloud2 as a cloud [m]; points that are not finite, or at the origin, are left out."""
+    """Return a sensor_msgs/PointCloud2 as a cloud [m]; without points that are not finite or at the origin."""
     fields = {f.name: (int(f.offset), int(f.datatype)) for f in message.fields}
     lacking = [axis for axis in "xyz" if axis not in fields or fields[axis][1] not in POINT_TYPES]
     if lacking:

@@ -55,7 +55,7 @@ class Plan:
     clock: Stamps
     actuation: str | None
     columns: dict[str, dict[str, Taken]]
-    """Topic → name of a value → what it becomes."""
+    """Topic → name of a value → its target."""
     load_points: dict[str, list[float]]
     T_camera_markers: dict[str, FloatArray]
     metadata: dict[str, str]
@@ -67,11 +67,11 @@ class Plan:
     scale: float | None
     """Metres in one unit of clouds, markers and depth in floating point; None where no option gives it: metres."""
     names: dict[str, tuple[Becomes, ...]]
-    """Name that `--map` may take → what it may become."""
+    """Name that `--map` accepts → its allowed targets."""
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: Stamps) -> Plan:
-    """Return what is read from a bag, and how: streams, columns, clock."""
+    """Return the reading plan of a bag: streams, columns, clock."""
     notes = list(choice.notes)
     names = _mappable(bag, choice, options)
     pressures = [s.topic.name for s in choice.inputs if _is_pressure(s)]
@@ -88,7 +88,7 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: Stamps) -> Plan:
             notes.append(f"the forces of {stream.topic.name} (frame {stream.frame or '–'}) are taken in the robot's axes")
         else:
             notes.append(
-                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z says where they act"
+                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z states where they act"
             )
     poses = _marker_poses(bag, choice, notes)
     used = [s for s in choice.markers if s.topic.name in poses]
@@ -173,7 +173,7 @@ def _is_pressure(stream: Stream) -> bool:
 
 
 def _input_columns(bag: Bag, stream: Stream, options: Options, own: str) -> dict[str, Taken]:
-    """Return name in the message → what it becomes; `own` is the name of a pressure where several topics hold one."""
+    """Return name in the message → target; `own` is the name of a pressure if several topics contain one."""
     topic = stream.topic.name
     given = _largest_values(bag, stream)
     names = list(dict.fromkeys(name for name, _ in given))
@@ -213,7 +213,7 @@ def _largest_values(bag: Bag, stream: Stream) -> dict[tuple[str, str], float]:
         try:
             values = named_values(bag.decode(message), stream.topic.type)
         except InputError:
-            continue  # told when the frames are read
+            continue  # reported when the frames are read
         for key, value in values.items():
             largest[key] = max(largest.get(key, 0.0), abs(value))
     return largest
@@ -263,7 +263,7 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> Stamps:
             try:
                 decoded = bag.decode(message)
             except InputError:
-                continue  # told when the frames are read
+                continue  # reported when the frames are read
             if header_of(decoded) is None:
                 continue
             time, _ = stamp_of(decoded)

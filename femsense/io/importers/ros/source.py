@@ -60,8 +60,8 @@ def open_ros(path: Path, options: Options) -> Source:
 
 
 def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], options: Options) -> dict[str, Source]:
-    """Return a source a camera; a topic of markers is the first camera's that is joined to it:
-    what is measured once stands once."""
+    """Return one source per camera; a topic of markers belongs to the first camera connected to it, so that markers are not counted
+    twice."""
     others = tuple(topic for topic in options.topics if topic not in cameras)
     sources: dict[str, Source] = {}
     taken: set[str] = set()
@@ -73,7 +73,7 @@ def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], option
 
 
 def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
-    """Return what the chosen topics of a bag hold, seen by one camera."""
+    """Return the chosen topics of a bag as the source of one camera."""
     choice = choose(bag, streams, options)
     clock = clock_of(bag, choice, options)
     plan = plan_of(bag, choice, options, clock)
@@ -102,7 +102,7 @@ def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
 
 
 def list_ros(path: Path) -> dict[str, Any]:
-    """Return what a bag holds, without choosing: topics with what they are, messages and coordinate frames."""
+    """Return all topics of a bag with their content, types, number of messages and coordinate frames."""
     with open_bag(path) as bag:
         rows = [
             {"topic": s.topic.name, "holds": s.kind, "type": s.topic.type, "messages": s.topic.count, "frame": s.frame or None}
@@ -124,7 +124,7 @@ class _Track:
     times: deque[float] = field(default_factory=deque)
     values: deque[Any] = field(default_factory=deque)
     stamps: dict[float, float] = field(default_factory=dict)
-    """Time of recording → time of the device [s], where that stands in another topic."""
+    """Recording time → device time [s], if the latter is in another topic."""
 
     def stamp(self, record: float, device: float | None) -> None:
         if device is not None:
@@ -135,7 +135,7 @@ class _Track:
         self.values.append(value)
 
     def forget(self, before: float) -> None:
-        """Drop what is older than the last one before a time."""
+        """Drop all entries older than the last one before a given time."""
         while len(self.times) > 1 and self.times[1] <= before:
             self.times.popleft()
             self.values.popleft()
@@ -153,7 +153,7 @@ class _Track:
 
 
 def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
-    """Read the bag once, in the order in which it was written; hold back what is younger than LAG_S."""
+    """Read the bag once, in the order of writing; hold back messages younger than LAG_S."""
     choice, rays = plan.choice, None
     if choice.lens is not None:
         rays = pixel_rays(choice.lens)
@@ -180,10 +180,10 @@ def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
 
 
 def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
-    """Return all that a topic of inputs or loads says; messages that are broken are counted in a warning."""
+    """Return all values of a topic of inputs or loads; a warning counts broken messages."""
     rows, broken = array("d"), list[str]()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where a bag breaks off is told when the frames are read
+        warnings.simplefilter("ignore")  # the truncation of a bag is reported when the frames are read
         for message in bag.messages([topic]):
             try:
                 decoded = bag.decode(message)

@@ -18,7 +18,7 @@ PACKINGS = ("cdr", "ros1")
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic with its type; the fields of a connection of `rosbags`, as far as they are used."""
+    """A topic with its type: the fields of a `rosbags` connection that are used here."""
 
     topic: str
     msgtype: str
@@ -32,7 +32,7 @@ class NotRos(InputError):
 
 
 class StreamedMcap:
-    """Stands for a reader of `rosbags`: the messages of a file up to its end or to where it breaks off."""
+    """A replacement for the reader of `rosbags`: the messages of a file up to its end or its truncation."""
 
     def __init__(self, path: Path) -> None:
         """Count the messages of a file.

@@ -1,4 +1,4 @@
-"""Which topics of a bag make a recording: what each holds, what a person chose, what is left to choose."""
+"""The topics of a bag that make a recording: their contents, the user's choice, and choices still open."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stream:
-    """A topic and what it holds."""
+    """A topic and its content."""
 
     topic: Topic
     kind: Kind
@@ -75,7 +75,7 @@ class Choice:
 
 
 def streams_of(bag: Bag) -> list[Stream]:
-    """Return what each topic holds; images are known by their first message."""
+    """Return the content of each topic; images are identified by their first message."""
     return [_stream(bag, topic) for topic in bag.topics if topic.count]
 
 
@@ -102,7 +102,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
             where=bag.path,
             found=found,
             expected="depth images, PointCloud2, markers or inputs",
-            hint=f"{lost[0]} has 8 bits: what was depth is lost in it; record 16UC1 or compressedDepth" if lost else None,
+            hint=f"{lost[0]} has 8 bits: the depth is not recoverable; record 16UC1 or compressedDepth" if lost else None,
         )
     choice = Choice(primary, tuple(of[Kind.MARKERS]), tuple(of[Kind.INPUTS]), tuple(of[Kind.LOADS]))
     if depth is None:
@@ -279,13 +279,14 @@ def _lens(bag: Bag, stream: Stream) -> Camera | None:
 
 
 def _sdk_model(bag: Bag, name: str) -> str | None:
-    """Return the distortion model that a file of the RealSense SDK from 2.58 names in a text; its CameraInfo says plumb_bob to all."""
+    """Return the distortion model from the text metadata of a file of the RealSense SDK (from 2.58); its CameraInfo always has plumb_bob."""
     parts = sdk_values(bag.first([t.name for t in bag.topics if t.name == f"{name.split('/image/')[0]}/camera_info"]))
     return MODELS.get(parts["model"].strip().lower()) if "model" in parts else None
 
 
 def _depth_unit(bag: Bag, stream: Stream, options: Options) -> float:
-    """Return metres in one unit: FINE_UNIT for floating point, as a person says, the option of a RealSense sensor, or the millimetre of REP 118."""
+    """Return metres per unit: FINE_UNIT for floating point, else the user's option, else that of a RealSense sensor, else the millimetre
+    of REP 118."""
     if stream.encoding.startswith("32FC1"):
         return FINE_UNIT
     if options.depth_unit is not None:
@@ -308,7 +309,7 @@ def _with_color(bag: Bag, choice: Choice, streams: Sequence[Stream]) -> Choice:
     lens = _lens(bag, color)
     T = _extrinsics(bag, depth, color)
     if lens is None or T is None:
-        lacking = "its CameraInfo" if lens is None else "its place beside the depth camera (TF, extrinsics)"
+        lacking = "its CameraInfo" if lens is None else "its pose relative to the depth camera (TF, extrinsics)"
         return replace(choice, notes=(*choice.notes, f"the colours of {color.topic.name} are left out: the bag lacks {lacking}"))
     return replace(choice, color=color, color_lens=lens, T_color_depth=T)
 

@@ -1,4 +1,4 @@
-"""A log of what drove the robot, on a clock of its own: laid onto the frames by a known offset, or by the motion."""
+"""An actuation log with its own clock, aligned with the frames by a known offset or by cross-correlation with the motion."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from femsense.io.importers.tables.mapping import check_targets, resolved
 from femsense.io.importers.tables.plain_csv import input_columns, mapped_time, notation_notes, unit_notes
 
 SURE = 0.6
-"""A correlation below this does not tell the offset."""
+"""Least correlation that determines the offset."""
 DEVIATIONS = 5.0
-"""So many standard deviations it must be away from none (Fisher's z): of 40 random walks of 22 frames, 6 had more than 0.6."""
+"""Least distance of the correlation from zero in standard deviations (Fisher's z): of 40 random walks of 22 frames, 6 had more than 0.6."""
 APART = 0.1
-"""The best correlation must lie this much above the next peak."""
+"""Least difference between the best correlation and the next peak."""
 SMOOTH_S = 0.1
-"""Both signals are averaged over this time before their speed is taken:
-noise of a tenth of the motion leaves 0.84 of correlation, not 0.41."""
+"""Averaging time of both signals before differentiation: with noise of a tenth of the motion the correlation is 0.84 instead of 0.41."""
 FLAT = 1e-9
 """A signal whose variance over the overlap is below this share of its energy is constant (rounding of the transform)."""
 QUARTER_S, FARTHEST_ZONE_S, ZONE_SLACK_S = 900.0, 14 * 3600.0, 120.0
@@ -48,7 +47,7 @@ class ActuationLog:
     """[N], [m] or [Pa], NaN where a cell is empty, shape (n, columns)."""
     actuation: str | None = None
     notes: tuple[str, ...] = ()
-    """What was assumed."""
+    """Assumptions made."""
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
         """Return each column at these times of the log's clock [s], NaN where it is not known; see `Samples.at`."""
@@ -93,7 +92,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
             if len(back)
             else f"{len(time_s)} rows",
             expected="rows in order of time",
-            hint="stamps that stand still were rounded: log more digits" if len(back) > 1 else None,
+            hint="repeated time stamps were rounded: log more digits" if len(back) > 1 else None,
         )
     values = np.stack([column.values(table[kept]) for column in chosen], axis=1)
     notes += notation_notes(file) + unit_notes(chosen, names, columns)
@@ -101,15 +100,15 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
 
 
 def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[ActuationLog, dict[str, Any]]:
-    """Return the log on the frames' clock, and how it got there.
+    """Return the log on the frames' clock, and a description of the alignment.
 
     Arguments:
         log: the inputs.
-        journal: the frames, with the centre of what was seen.
+        journal: the frames, with the centre of their points.
         offset: the frames' time minus the log's [s]; None finds it.
 
     Raises:
-        InputError: the motion does not tell the offset, or the two do not overlap.
+        InputError: the motion does not determine the offset, or the two do not overlap.
     """
     times = journal.times()
     said: dict[str, Any] = {"actuation_log": log.path.name, "actuation_offset_from": "--offset"}
@@ -135,7 +134,7 @@ def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[Ac
 
 
 def _offset_hint(apart: float) -> str:
-    """Return what to try where clocks are `apart` [s]: whole quarters of an hour are time zones."""
+    """Return a hint for clocks that differ by `apart` [s]: multiples of a quarter of an hour suggest time zones."""
     zone = QUARTER_S * round(apart / QUARTER_S)
     if zone and abs(zone) <= FARTHEST_ZONE_S and abs(apart - zone) < ZONE_SLACK_S:
         return f"one is in local time and the other in UTC, {abs(zone) / 3600:g} hours apart: --offset {zone:g}"
@@ -167,8 +166,8 @@ def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) ->
 
 
 def _places(journal: Journal) -> FloatArray:
-    """Return what moves, shape (frames, columns) [m], NaN where it was not seen: x, y, z of the markers that half of the frames
-    show; without such the centre of what was seen, which jumps where a marker is hidden."""
+    """Return the moving coordinates [m], shape (frames, columns), NaN if hidden: x, y, z of the markers visible in half of the frames;
+    without such markers the centroid, which jumps when a marker is hidden."""
     centers, seen = [], list[dict[str, list[float]]]()
     for entry in journal.entries():
         centers.append(entry.center or [np.nan] * 3)
@@ -198,7 +197,7 @@ def _activity(times: FloatArray, values: FloatArray, step: float) -> FloatArray:
 def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
     """Return Pearson's correlation over the overlap for each lag −(len(drive) − 1) … len(motion) − 1.
 
-    It is 0 below half an overlap, and where one of both stands still in it: nothing correlates with a constant.
+    It is 0 for an overlap below one half, and if one of the signals is constant in it.
     """
     from scipy.signal import fftconvolve
 
@@ -220,7 +219,7 @@ def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
 
 def _unsure(log: ActuationLog, found: str) -> InputError:
     return InputError(
-        "the motion does not tell the offset between the log of actuation and the frames",
+        "the motion does not determine the offset between the actuation log and the frames",
         where=log.path,
         found=found,
         expected="--offset SECONDS: the frames' time minus the log's (0 where both have one clock)",

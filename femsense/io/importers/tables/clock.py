@@ -17,15 +17,15 @@ COUNTERS = {2.0**k: f"a counter of {k} bits" for k in (16, 24, 31, 32)}
 CLOCKS = {60.0: "a minute", 3600.0: "an hour", 0.5 * DAY_S: "twelve hours", DAY_S: "midnight"}
 """Where times of day begin again [s]."""
 AFTER_WRAP = 8.0
-"""A wrap leaves a step of at most so many usual ones."""
+"""After an overflow is undone, the step is at most this multiple of the usual one."""
 
 
 def seconds_of(values: FloatArray, unit: Unit | None) -> tuple[FloatArray, list[str]]:
-    """Return times in seconds, and what was assumed of them.
+    """Return times in seconds, and the assumptions made.
 
     Arguments:
         values: as the file has them, in order of its rows, NaN where one is missing, shape (n,).
-        unit: what the file says; None where it says none.
+        unit: declared in the file; None without one.
     """
     scale, notes = (unit.size, []) if unit is not None else _scale(values)
     wrapped, said = _unwrapped(values, scale)
@@ -33,7 +33,7 @@ def seconds_of(values: FloatArray, unit: Unit | None) -> tuple[FloatArray, list[
 
 
 def _scale(values: FloatArray) -> tuple[float, list[str]]:
-    """Return seconds in one unit of times that say none."""
+    """Return the seconds per unit of times without a declared unit."""
     known = values[np.isfinite(values)]
     if not len(known):
         return 1.0, []
@@ -49,7 +49,7 @@ def _scale(values: FloatArray) -> tuple[float, list[str]]:
 
 
 def _unwrapped(values: FloatArray, scale: float) -> tuple[FloatArray, list[str]]:
-    """Return the times with what a counter or a clock lost by beginning again added, and notes about it."""
+    """Return the times with overflows of a counter or clock undone, and notes about it."""
     known = np.flatnonzero(np.isfinite(values))
     steps = np.diff(values[known])
     if not (steps > 0).any():
@@ -61,5 +61,5 @@ def _unwrapped(values: FloatArray, scale: float) -> tuple[FloatArray, list[str]]
         period = min(periods, key=lambda p: abs(steps[k] + p - usual))
         if 0.0 < steps[k] + period <= AFTER_WRAP * usual:
             added[known[k + 1] :] += period
-            notes.append(f"the time begins again at row {known[k + 1] + 1}: {periods[period]} went round; it is counted on")
+            notes.append(f"the time begins again at row {known[k + 1] + 1}: {periods[period]} overflowed, which is undone")
     return values + added, notes

@@ -45,7 +45,7 @@ ENDED = re.compile(
 )
 """A unit behind a name without brackets: not those that are words or parts of a robot, such as in, min, g, a."""
 NO_TEXT = bytes([*range(9), *range(14, 27), *range(28, 32)])
-"""Bytes that stand in no text."""
+"""Bytes that do not occur in text."""
 EMPTY = ("", "na", "n/a", "null", "none")
 """Cells without a number, in small letters; float() reads "nan" itself."""
 MARKS = "\t;,"
@@ -106,7 +106,7 @@ class Layout:
 
 
 def layout_of(path: Path) -> Layout:
-    """Return what stands between the cells of a table, and how its numbers are written."""
+    """Return the separator of a table, and the notation of its numbers."""
     with open_text(path) as stream:
         return _layout(stream.read(8192), path)
 
@@ -165,9 +165,9 @@ def is_cut_off(path: Path) -> bool:
 
 
 def header_of(path: Path) -> tuple[list[str], bool]:
-    """Return the names of the columns, and whether they stand in the file; a file of bare numbers has 1, 2, …
+    """Return the names of the columns, and whether they are in the file; without a header they are 1, 2, …
 
-    Units in a row of their own come behind the names, in brackets.
+    Units in a separate row are appended to the names in brackets.
     """
     rows = (row for row in rows_of(path) if any(cell.strip() for cell in row))
     first = next(rows, [])
@@ -183,7 +183,7 @@ def header_of(path: Path) -> tuple[list[str], bool]:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether the row below the names says units: words where numbers should stand, one of them a unit."""
+    """Whether the row below the names contains units: words instead of numbers, at least one of them a unit."""
     words = [cell.strip().strip("[]()") for cell in cells if cell.strip()]
     return all(number_in(word) is None for word in words) and any(unit_named(word) is not None for word in words)
 
@@ -198,10 +198,10 @@ def read_numbers(path: Path) -> tuple[list[str], FloatArray]:
 def number_rows(path: Path) -> Iterator[list[float]]:
     """Yield the rows of numbers after the header; NaN where a cell is empty.
 
-    A last row that was cut off is left out with a warning.
+    A truncated last row is removed with a warning.
 
     Raises:
-        InputError: another row that is no row of numbers, with its line.
+        InputError: another row that is not numeric, with its line number.
     """
     names, headed = header_of(path)
     rows = (item for item in enumerate(rows_of(path), start=1) if any(cell.strip() for cell in item[1]))
@@ -233,7 +233,7 @@ def number_rows(path: Path) -> Iterator[list[float]]:
 
 
 def _row_hint(cells: Sequence[str], bad: str, width: int) -> str | None:
-    """Return what is probably wrong with a row that is no row of numbers."""
+    """Return the probable error in a row that is not numeric."""
     if len(cells) > width and ("," not in "".join(cells)):
         return "decimal commas between commas? Export with points, or with semicolons between the cells"
     if ":" in bad or re.search(r"\d[./-]\d+[./-]\d", bad):
@@ -242,10 +242,10 @@ def _row_hint(cells: Sequence[str], bad: str, width: int) -> str | None:
 
 
 def column_unit(name: str) -> tuple[str, Unit | None]:
-    """Return a column's name without its unit, and the unit that stands behind it, in brackets or after "_"; None where there is none.
+    """Return a column's name without its unit, and the unit that follows it in brackets or after "_"; None without one.
 
     Raises:
-        InputError: a unit that can be read in two ways.
+        InputError: an ambiguous unit.
     """
     text = name.strip()
     for match in (BRACKETED.fullmatch(text), ENDED.fullmatch(text)):
@@ -259,7 +259,7 @@ def column_unit(name: str) -> tuple[str, Unit | None]:
 
 
 def time_column(names: Sequence[str], path: Path) -> tuple[int, Unit | None]:
-    """Return the column of time, and its unit; None where its name says none. Raises InputError."""
+    """Return the column of time, and its unit; None without one in its name. Raises InputError."""
     for j, name in enumerate(names):
         found = _as_time(name)
         if found is not None:
@@ -269,7 +269,7 @@ def time_column(names: Sequence[str], path: Path) -> tuple[int, Unit | None]:
 
 
 def is_time(name: str) -> bool:
-    """Whether a column's name says that it holds times."""
+    """Whether a column's name denotes times."""
     return _as_time(name) is not None
 
 

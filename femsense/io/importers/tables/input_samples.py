@@ -1,4 +1,4 @@
-"""Inputs and loads that were sampled at other times than the frames: what is known of them at a frame, and what is not."""
+"""Inputs and loads sampled at other times than the frames: interpolation, and the limits of validity."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class Column:
 
 
 def check_targets(columns: Mapping[str, str]) -> None:
-    """Refuse what is no target, and two names that become the same. Raises InputError."""
+    """Refuse invalid targets, and two names with the same target. Raises InputError."""
     names: dict[str, str] = {}
     for old, new in columns.items():
         if kind_of_target(new) is None:
@@ -89,7 +89,7 @@ def check_targets(columns: Mapping[str, str]) -> None:
 
 
 def kind_of_target(target: str) -> Becomes | None:
-    """Return what a target names; None for what is no target. Raises InputError: a factor that is none."""
+    """Return the kind of a target; None for an invalid one. Raises InputError for an invalid factor."""
     if target.startswith("load@"):
         return Becomes.LOAD
     name = parse_target(target).name
@@ -110,7 +110,7 @@ def parse_target(target: str) -> Target:
     """Return a target such as cable_north, cable_north*4.615, chamber_a*bar or chamber_a*1-101325.
 
     Raises:
-        InputError: what follows the star is neither a factor, nor a factor with an offset, nor a unit of what the target holds.
+        InputError: the text after the asterisk is neither a factor, nor a factor with an offset, nor a unit of the target's quantity.
     """
     name, star, text = target.partition("*")
     name = plain_name(name)
@@ -131,16 +131,16 @@ def parse_target(target: str) -> Target:
 def check_names(
     columns: Mapping[str, str], known: Mapping[str, Sequence[Becomes]], path: Path, elsewhere: Sequence[str] = ()
 ) -> None:
-    """Refuse names that the source lacks, and markers that would become inputs or the other way round.
+    """Refuse names that the source lacks, and markers mapped to inputs or inputs mapped to markers.
 
     Arguments:
         columns: name in the source → target.
-        known: name in the source → what it may become.
+        known: name in the source → its allowed targets.
         path: the source, for the message.
-        elsewhere: names of the columns of a log of actuation, which were looked at first.
+        elsewhere: names of the columns of an actuation log, which are searched first.
 
     Raises:
-        InputError: with the names that are there.
+        InputError: lists the existing names.
     """
     for old, new in columns.items():
         if old not in known:
@@ -200,12 +200,12 @@ def mappable(names: Sequence[str]) -> dict[str, Sequence[Becomes]]:
 
 
 def mapped_inputs(names: Sequence[str], columns: Mapping[str, str]) -> tuple[list[Column], set[str]]:
-    """Return the mapped inputs in SI units, and what the units say that cables hold ("tension", "displacement").
+    """Return the mapped inputs in SI units, and the quantity of the cables by their units ("tension", "displacement").
 
-    A factor or a unit in the mapping stands for the unit; else the unit behind the name counts; without one the values are in N, m or Pa.
+    A factor or unit in the mapping takes precedence over the unit after the name; without either the values are in N, m or Pa.
 
     Raises:
-        InputError: a unit that is none of what the column becomes.
+        InputError: a unit of another quantity than the target's.
     """
     found, kinds = list[Column](), set[str]()
     for old, new in columns.items():
@@ -221,14 +221,14 @@ def mapped_inputs(names: Sequence[str], columns: Mapping[str, str]) -> tuple[lis
 
 
 def cable_kind(target: str, unit: Unit | None) -> set[str]:
-    """Return what a unit says that a cable's column holds."""
+    """Return the quantity of a cable's column by its unit."""
     if unit is None or not target.startswith("cable_"):
         return set()
     return {"tension" if unit.quantity is Quantity.FORCE else "displacement"}
 
 
 def unit_beside(name: str, target: str, *, mapped: bool = True) -> Unit | None:
-    """Return a column's unit; None where its name says none.
+    """Return a column's unit; None without one in its name.
 
     A single letter counts only in brackets: a cable may be named arm_n.
 
@@ -248,6 +248,6 @@ def unit_beside(name: str, target: str, *, mapped: bool = True) -> Unit | None:
             where=f"column {name}",
             found=bracketed[1] if bracketed else spelt,
             expected="|".join(units_of(*wanted)),
-            hint=f"--map '{name}={bare if target == name else target}*FACTOR' says what one of it is in SI units",
+            hint=f"--map '{name}={bare if target == name else target}*FACTOR' states one of it in SI units",
         )
     return None

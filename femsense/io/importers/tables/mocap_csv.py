@@ -118,7 +118,7 @@ def _notes(export: Export, options: Options, step: float | None) -> list[str]:
     if export.rate and step and abs(step * export.rate - 1.0) > 0.05:
         notes.append(f"the header says {export.rate:g} frames a second, the times {1.0 / step:.4g}: the times count")
     if options.rate is not None and (export.time is not None or export.rate is not None):
-        notes.append("--rate has no effect: the file says its times")
+        notes.append("--rate has no effect: the file contains times")
     return notes
 
 
@@ -228,7 +228,7 @@ def _qualisys(head: list[list[str]], path: Path) -> Export:
 
 
 def _whole(cell: str) -> int | None:
-    """Return a count that a header says; None where it says none."""
+    """Return a count from a header; None without one."""
     value = _cell([cell], 0)
     return int(value) if np.isfinite(value) and value >= 0 else None
 
@@ -269,7 +269,7 @@ def _step(path: Path, export: Export) -> float | None:
 
 
 def _rate(cell: str) -> float | None:
-    """Return frames a second; None where the header does not say it."""
+    """Return the frame rate [1/s]; None if the header does not contain it."""
     value = _cell([cell], 0)
     return value if np.isfinite(value) and value > 0 else None
 

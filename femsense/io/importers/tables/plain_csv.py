@@ -115,12 +115,12 @@ def list_plain_csv(path: Path) -> dict[str, Any]:
 
 
 def notation_notes(path: Path) -> list[str]:
-    """Return what was assumed of how a table writes its numbers."""
+    """Return the assumptions about the notation of a table's numbers."""
     notation = layout_of(path).notation
     decimal = ["numbers are read with decimal commas"] if notation.commas else []
     order = "month/day/year" if notation.month_first else "day/month/year"
     dates = [] if notation.month_first is None else [f"dates with slashes are read as {order}"]
-    return dates + decimal + (["marks between thousands are left out of numbers"] if notation.grouped else [])
+    return dates + decimal + (["thousands separators are ignored"] if notation.grouped else [])
 
 
 def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[str, str]) -> list[str]:
@@ -140,9 +140,7 @@ def unit_notes(inputs: Sequence[Column], names: Sequence[str], columns: Mapping[
     units = " and ".join(
         dict.fromkeys("Pa" if name.startswith("chamber_") else "N, or m for --inputs displacement" for name in bare)
     )
-    return notes + (
-        [f"no unit stands beside {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT says another"] if bare else []
-    )
+    return notes + ([f"no unit for {', '.join(bare)}: taken as {units}; --map NAME=TARGET*UNIT states another"] if bare else [])
 
 
 def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> Samples:
@@ -152,7 +150,7 @@ def _input_samples(path: Path, inputs: Sequence[Column], times: FloatArray) -> S
 
 
 def _times(path: Path, names: list[str], headed: bool, options: Options) -> tuple[FloatArray, list[str]]:
-    """Return the time of each row [s], and what was assumed of it."""
+    """Return the time of each row [s], and the assumptions made."""
     clock = mapped_time(names, options.columns)
     if clock is None and not headed:
         clock = (1, None)
@@ -168,7 +166,7 @@ def _times(path: Path, names: list[str], headed: bool, options: Options) -> tupl
     if clock is None:
         return np.arange(sum(1 for _ in number_rows(path))) / (options.rate or 1.0), []
     times, notes = seconds_of(np.fromiter((row[clock[0]] for row in number_rows(path)), dtype=np.float64), clock[1])
-    return times, notes + (["--rate has no effect: the table says its times"] if options.rate is not None else [])
+    return times, notes + (["--rate has no effect: the table contains times"] if options.rate is not None else [])
 
 
 def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, Unit | None] | None:
@@ -182,12 +180,12 @@ def mapped_time(names: Sequence[str], columns: Mapping[str, str]) -> tuple[int, 
 
 
 def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) -> tuple[list[Column], str | None]:
-    """Return the inputs, mapped or named cable_… and chamber_…, and what cables hold.
+    """Return the inputs, mapped or named cable_… and chamber_…, and the quantity of the cables.
 
-    A unit behind a name gives the factor, and says whether cables hold tensions or displacements.
+    A unit after a name determines the factor and the quantity.
 
     Raises:
-        InputError: a unit that is none of the input's, or cables in newtons beside others in metres.
+        InputError: a unit of another quantity, or cables in newtons together with cables in metres.
     """
     found, kinds = mapped_inputs(names, mapping)
     for j, name in enumerate(names):
@@ -203,7 +201,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
         raise InputError("two columns become the same", where=path, found=twice, expected="a name each")
     if len(kinds) > 1:
         raise InputError(
-            "cables that hold tensions beside others that hold displacements",
+            "cables with tensions together with cables with displacements",
             where=path,
             found=", ".join(names[column.index] for column in found if column.name.startswith("cable_")),
             expected="one of both in all columns",
@@ -212,7 +210,7 @@ def input_columns(names: Sequence[str], mapping: Mapping[str, str], path: Path) 
 
 
 def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
-    """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
+    """Return the unit of length in the names of position columns; None without one. Raises InputError if there are several."""
     units = [unit for unit in (_place_unit(names[j]) for j in columns) if unit is not None and unit.quantity is Quantity.LENGTH]
     said = sorted({unit.name for unit in units})
     if len(said) > 1 or 0 < len(units) < len(columns):
@@ -226,7 +224,7 @@ def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> 
 
 
 def _place_unit(name: str) -> Unit | None:
-    """Return the unit of a column of places, which stands behind its name or before the axis (tip_mm_x)."""
+    """Return the unit of a position column, after its name or before the axis (tip_mm_x)."""
     place, unit = _as_place(name), column_unit(name)[1]
     return unit if unit is not None or place is None else place[2]
 
