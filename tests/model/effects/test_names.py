@@ -24,6 +24,7 @@ OTHER_MEANINGS = {
     ("io/robot_toml.py", "creep"),  # a property of the material
     ("io/meshing", "gravity"),  # a table of robot.toml
     ("model/recording.py", "gravity"),
+    ("model/plausibility.py", "gravity"),  # columns of frames.csv
     ("rig", "gravity"),
     ("app", "gravity"),  # what the declared model has
     ("io/meshing/robot_from_line.py", "gravity"),
