@@ -61,7 +61,7 @@ def run_many(asked: ManyJobs, run_job: Run, *, say: Say) -> Answer:
         _summarise(out, command, outcomes, folders)
     except OSError as error:
         raise DataError(
-            f"{out}: the summary is not written: {error.strerror}; results are kept, and the same command goes on"
+            f"{out}: the summary is not written: {error.strerror}; results are kept, and the same command continues"
         ) from error
     return _answer(out, command, outcomes)
 

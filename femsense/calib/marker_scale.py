@@ -135,6 +135,6 @@ def scaled(recording: Recording, views: Sequence[int], scale: float) -> Recordin
 def _text(which: str, best: MarkerScale, before: float, left: float) -> str:
     return (
         f"the markers of {which} are {best.scale:.3f} ± {best.std:.1g} times too large: divided by that they fit to "
-        f"{1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm. Is the scale of the motion capture or of the camera's depth right, "
+        f"{1e3 * left:.3g} mm instead of {1e3 * before:.3g} mm. Is the scale of the motion capture or of the camera's depth right, "
         f"and the size of the robot's mesh?"
     )

@@ -106,7 +106,7 @@ def check_other_readings(
     except DataError:
         return np.inf
     before = _rms(residual[np.isin(scene.frame, best.frames)])
-    found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm"
+    found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm instead of {1e3 * before:.3g} mm"
     if before > REFUSED * left and not best.fitted:
         raise DataError(found)
     if before <= TOLD * left:

@@ -145,7 +145,7 @@ def _text(recording: Recording, name: str, best: SingleInput, before: float, lef
     offset = f"plus {scale * best.offset:.2g} ± {scale * best.offset_std:.1g} {unit}"
     gain = f"times {best.gain:.3g} ± {best.gain_std:.1g}, " if best.gain_std else ""
     return (
-        f"the input of {name} alone seems off: {gain}{offset}, the markers fit to {1e3 * left:.3g} mm, as the files stand to "
+        f"the input of {name} alone seems off: {gain}{offset}, the markers fit to {1e3 * left:.3g} mm instead of "
         f"{1e3 * before:.3g} mm. Is its sensor calibrated, the cable slack or caught?"
     )
 

@@ -110,7 +110,7 @@ def run_jobs(
         progress: called after each outcome and about once a second.
 
     Raises:
-        DataError: the disk is full, or the workers are gone; outcomes so far are recorded, and the same call goes on.
+        DataError: the disk is full, or the workers are gone; outcomes so far are recorded, and the same call continues.
     """
     gathered = _Gathered(jobs)
     for job in jobs if again else ():
@@ -154,7 +154,7 @@ def _check_disk(outcome: Outcome, gathered: _Gathered) -> None:
     if outcome.status is Status.DISK_FULL:
         raise DataError(
             f"the disk is full: {outcome.reason}\n{len(gathered.found) - 1} of {len(gathered.jobs)} jobs are done; "
-            f"make room, and the same command goes on"
+            f"make room, and the same command continues"
         )
 
 
@@ -169,7 +169,7 @@ def _outcome(job: Job, future: Future[Outcome], engine: Engine) -> Outcome | Non
     if death is None:
         raise DataError(
             f"the workers cannot run jobs: {type(error).__name__}: {' '.join(str(error).split())[:300]}\n"
-            f"results so far are kept, and the same command goes on"
+            f"results so far are kept, and the same command continues"
         ) from error
     mark = _running(job)
     return None if mark is None else _after_death(job, death, mark)

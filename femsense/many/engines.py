@@ -34,7 +34,7 @@ FEWEST_DASK = 200
 """… and no fewer jobs than this: a cluster that starts small sees how much there is to do."""
 CONNECT = "10s"
 """A scheduler that does not answer within this time is taken as absent."""
-GONE = "the scheduler is gone, and its workers with it; results so far are kept, and the same command goes on"
+GONE = "the scheduler is gone, and its workers with it; results so far are kept, and the same command continues"
 TTL = "1 hour"
 """Longest silence of a dask worker: compiled code can hold Python's lock for minutes."""
 

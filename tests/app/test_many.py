@@ -152,7 +152,7 @@ def test_captures_are_imported_by_a_pattern(run: Any, tmp_path: Path) -> None:
         (("estimate", "robot", "recordings/a", "--jobs", "recordings/*", "-o", "out"), "--jobs declares the jobs"),
         (("estimate", "robot", "--jobs", "none*", "-o", "out"), "nothing matches this pattern"),
         (("estimate", "robot", "recordings", "-o", "out", "--memory", "0"), "not an amount of memory"),
-        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "of more than 8 recordings"),
+        (("improve", "robot", "recordings/a", "-o", "out", "--dask", "local"), "to more than 8 recordings"),
         (("import", "recordings", "-o", "out"), "--jobs 'recordings/*' makes a recording of each"),
         (("import", *("recordings/a/frames.csv",) * 9, "-o", "out"), "too many captures for the cameras of one recording"),
     ],

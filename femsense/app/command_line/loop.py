@@ -69,7 +69,7 @@ def improve(
     dask: Dask = None,
     memory: Memory = None,
 ) -> Answer:
-    """Find the effects that the model lacks and write the improved robot."""
+    """Find the effects that the model lacks; write a better robot."""
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.io.recording_folder import load_recording
