@@ -16,6 +16,12 @@ A picture takes from the beginning of the page's own step to where WebGL has fin
 of WebGL was made, "GPU" what the card's own clock says of those calls. Shadows are drawn anew in each picture. "a second" are
 pictures without a screen's pace, each waited for. "headset" is VR in an emulated Quest 3 (iwer): two eyes of 2064 × 2208, the robot
 half a metre away; what the emulator does of its own counts in "a second" alone.
+
+    python benchmarks/xr_browser.py --picture FILE --url URL [--press ID …] [--sizes WxH]
+
+takes a picture of a page that runs, after some of its buttons were pressed: those of docs/pictures are of
+`femsense stream femsense-demo/run --drag --commands` (--press drag arm, 1200x760; docs/pictures/page-armed.png) and of a sensor stream with a
+reading outside of what was learnt (390x844; docs/pictures/page-outside.png).
 """
 
 from __future__ import annotations
@@ -38,6 +44,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from femsense.xr.gltf import glb_bytes
 from femsense.xr.skinning import fit_skin
@@ -169,6 +176,24 @@ const { browser, args, url, seconds, pictures, width, height, headset } = JSON.p
 """
 
 
+PICTURE = """
+const { chromium } = require('playwright-core');
+const { browser, args, url, file, width, height, press } = JSON.parse(process.argv[2]);
+(async () => {
+  const opened = await chromium.launch({ executablePath: browser, args });
+  const page = await opened.newPage({ viewport: { width, height } });
+  await page.goto(url);
+  await page.waitForTimeout(8000);
+  for (const id of press) {
+    await page.click(`#${id}`);
+    await page.waitForTimeout(1000);
+  }
+  await page.screenshot({ path: file, timeout: 90000 });
+  await opened.close();
+})().catch((e) => { console.error(e); process.exit(1); });
+"""
+
+
 def hook() -> ModuleType:
     """The module that finds Node and npm for the wheel."""
     spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
@@ -215,18 +240,29 @@ class Browser:
 
     def look(self, url: str, **given: object) -> dict[str, Any]:
         """Return what the script found in the page."""
+        found: dict[str, Any] = json.loads(self._run(LOOK, url, **given).splitlines()[-1])
+        if found["error"] or found["size"] != [given["width"], given["height"]] or found["eyes"] != 2 * bool(given["headset"]):
+            raise SystemExit(f"WebGL error {found['error']}, {found['size']} pixels, {found['eyes']} eyes")
+        return found
+
+    def take(self, url: str, file: Path, size: str, press: list[str]) -> None:
+        """Write a picture of a page as PNG with 256 colours."""
+        width, height = map(int, size.split("x"))
+        self._run(PICTURE, url, file=str(file), width=width, height=height, press=press)
+        Image.open(file).convert("RGB").quantize(256).save(file, optimize=True)
+        print(f"{file}: {file.stat().st_size // 1000} kB")
+
+    def _run(self, text: str, url: str, **given: object) -> str:
+        """Return what a script prints."""
         script = self.modules / "look.cjs"
-        script.write_text(LOOK, encoding="utf-8")
+        script.write_text(text, encoding="utf-8")
         told = json.dumps({"browser": CHROMIUM, "args": [*ALWAYS, *self.flags], "url": url, **given})
         done = subprocess.run(
             [*hook().node_command(), str(script), told], capture_output=True, text=True, timeout=400, check=False
         )
         if done.returncode:
             raise SystemExit(done.stderr)
-        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-        if found["error"] or found["size"] != [given["width"], given["height"]] or found["eyes"] != 2 * bool(given["headset"]):
-            raise SystemExit(f"WebGL error {found['error']}, {found['size']} pixels, {found['eyes']} eyes")
-        return found
+        return done.stdout
 
 
 def measure(
@@ -303,6 +339,9 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+")
     parser.add_argument("--gpu", nargs="?", const=" ".join(GPU), metavar="FLAG …")
     parser.add_argument("--modules", type=Path)
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--url")
+    parser.add_argument("--press", nargs="*", default=[])
     asked = parser.parse_args()
     if CHROMIUM is None:
         raise SystemExit("no Chromium on this machine")
@@ -311,6 +350,9 @@ def main() -> None:
     print(json.dumps({"cores": os.cpu_count(), "load": round(os.getloadavg()[0], 1)}))
     with tempfile.TemporaryDirectory() as scratch:
         browser = Browser(asked.modules or npm_modules(Path(scratch)), flags)
+        if asked.picture:
+            browser.take(asked.url, asked.picture, (asked.sizes or [SMALL])[0], asked.press)
+            return
         drawer = measure(browser, 1000, pictures=1)["drawer"]
         print(f"drawn by {drawer}\n", flush=True)
         if gpu and any(name in drawer for name in ("SwiftShader", "llvmpipe", "softpipe")):
