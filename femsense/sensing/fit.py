@@ -359,7 +359,8 @@ def _finished(
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
         f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
         force_map[3 * i : 3 * i + 3, f] = axes.T * scale[f]
-        way = ways_of(contact)[0].T * scale[s]
+        ways, stds = ways_of(contact)
+        way = ways.T * (scale[s] if here.forces[i].any() else stds)  # without a force the place is where its object was seen
         places[i] = way @ P[s, s] @ way.T
         gain[i] = float(at[f] @ np.linalg.solve(P[f, f], at[f]) + np.linalg.slogdet(P[f, f])[1])
     odds = np.array([odds_of(model, contact, here.rows) for contact in here.contacts])
