@@ -15,7 +15,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.core.pose import invert_pose, transform_points
 from femsense.xr.armature import ArmatureOptions
 from femsense.xr.proprioception.bayes import train_bayesian
-from femsense.xr.proprioception.corrections import is_better
+from femsense.xr.proprioception.corrections import LINEAR, Frames, explain, is_better
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.files import read_labelled
 from femsense.xr.proprioception.labelled import Labelled, joined, labelled
@@ -382,3 +382,15 @@ def test_files_that_do_not_fit_are_refused(sensors: str, markers: str, message: 
     (tmp_path / "m.csv").write_text(markers)
     with pytest.raises(InputError, match=message):
         read_labelled(tmp_path / "s.csv", tmp_path / "m.csv")
+
+
+def test_two_frames_beyond_the_others_do_not_select_the_stiffest_map() -> None:
+    """38 frames are a linear map; the errors of the two saturated ones dominate every mean square, and are least with a stiff map."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (40, 2))
+    x[[5, 22]] = [[2.5, 0.2], [-2.5, -0.3]]
+    bent = np.column_stack([np.where(np.abs(x[:, 0]) > 1, 0.2 * np.sign(x[:, 0]), x[:, 0]), x[:, 1]])
+    y = bent @ np.array([[0.03, 0.0, 0.01], [0.01, 0.02, 0.0]]) + 2e-4 * rng.normal(size=(40, 3))
+    other_day = train_ridge(rng.uniform(-1, 1, (50, 2)), 0.05 * rng.normal(size=(50, 3)), penalty=1.0)
+    chosen, left = explain(Frames(other_day, x, y, np.full(2, 2.0)))
+    assert chosen == "afresh 0.0001" and min(LINEAR, key=lambda name: left[name]) == "base, line 1.0"
