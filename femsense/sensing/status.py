@@ -14,6 +14,7 @@ from femsense.sensing.contact_free import check_values
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import OVERLAPPING
+from femsense.sensing.tracks import size_std
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -101,7 +102,8 @@ def checked(model: Model, best: Fit) -> Verdict:
     for i, contact in enumerate(best.contacts):
         force, std = float(np.linalg.norm(best.forces[i])), std_along(best, i)
         if contact.source != "given" and force < UNDETERMINED * std:
-            return verdict(Status.UNDETERMINED, force_n=force, std_n=std)
+            reported = std if force == 0.0 else size_std(best.forces[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
+            return verdict(Status.UNDETERMINED, force_n=force, std_n=reported)
     inferred = any(contact.source == "shape" for contact in best.contacts)
     for one, (mean, std) in zip(best.frame.latent, best.latent_force):
         where = ", ".join(f"{1e3 * x:.0f}" for x in one.place)
