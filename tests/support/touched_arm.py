@@ -59,7 +59,8 @@ def touched(
         for node, push in zip(nodes, np.atleast_2d(force)) if ball and k == 3 else ():
             out = rng.normal(size=(1500, 3))
             out /= np.linalg.norm(out, axis=1, keepdims=True)
-            middle = x[node] - 0.006 * push / np.linalg.norm(push)
+            away = -push / np.linalg.norm(push) if push.any() else np.array([0.0, 0.0, 1.0])
+            middle = x[node] + 0.006 * away
             more = middle + 0.006 * out
             seen = np.einsum("pc,pc->p", out, T_ROBOT_CAMERA[:3, 3] - more) > 0
             if push[1] > 0.0:  # behind the arm: what stands out over the upper edge of the side that it pushes on
