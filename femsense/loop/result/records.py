@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -139,6 +139,16 @@ class ConfoundedPair:
     """√(1 − ρ²): the share of one that calibration absorbs, if the other is a nuisance effect."""
     cosine: float | None = field(default=None, metadata=LEFT_OUT)
     """Cosine between their fields, calibration projected out."""
+
+
+def alternatives(pairs: Iterable[ConfoundedPair], names: Collection[str]) -> dict[str, list[str]]:
+    """Return for each accepted effect the others that a refit, or calibration, does not distinguish from it; collinear fields alone do not count."""
+    found: dict[str, list[str]] = {}
+    for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
+        for own, other in (pair.pair, pair.pair[::-1]):
+            if own in names and other not in names:
+                found.setdefault(own, []).append(other)
+    return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -40,16 +40,18 @@ def acceptance_test(
         h ≥ min(held_gain · g · n_held / n_fitted,  s − 2 z √s),    g − c − π + h > evidence,
         it moves the markers by at least `above_mesh` times the discretisation error, and the unweighted rms does not grow (`plainly_worse`).
 
-    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. Names in code style are fields of `Thresholds`.
+    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. An effect with implausible values is not given this allowance for
+    chance. Names in code style are fields of `Thresholds`.
     """
     thresholds = data.thresholds
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
-    # for a true effect `held` has mean `acts` and variance 4 · acts
-    acts = held_shift(data, fitted, made, noise)
-    wanted = min(thresholds.held_gain * gain * held_share(data), acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
+    wanted = thresholds.held_gain * gain * held_share(data)
+    if is_plausible(data.declared, candidate.effect, made.fit):  # for a true effect `held` has mean `acts` and variance 4 · acts
+        acts = held_shift(data, fitted, made, noise)
+        wanted = min(wanted, acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
     fit_objection = _objection(made, candidate, score, thresholds)
     if fit_objection is None and np.isfinite(std_error) and better <= thresholds.sweeps_for * std_error:
@@ -91,16 +93,14 @@ def plainly_worse(before: FittedModel, after: FittedModel, thresholds: Threshold
     return after.fit.rms > thresholds.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
 
 
+def is_plausible(declared: Robot, effect: Effect, fit: JointFit) -> bool:
+    """Return whether the fitted values of an effect are plausible (`Effect.plausible`)."""
+    return effect.plausible(declared, fit.coordinates[span_of(fit, effect.name)])
+
+
 def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
     """Return −2 log of the prior density of the fitted values of an effect."""
     return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
-
-
-def cv_lower_bound(refitted: Refit) -> float:
-    """Return the cross-validation gain minus its standard error, if that is known."""
-    gain, std = refitted.record.cv_gain, refitted.record.cv_std
-    assert gain is not None and std is not None
-    return gain - (std if np.isfinite(std) else 0.0)
 
 
 def _taken_over(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> tuple[str, ...]:

@@ -42,22 +42,6 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
     )
 
 
-def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], thresholds: Thresholds) -> str:
-    """Return sentences on the alternatives to the accepted effects, by refits or by absorption; empty if there are none."""
-    instead: dict[str, list[str]] = {}
-    stands_for: dict[str, list[str]] = {}
-    for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
-        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= thresholds.evidence
-        for own, other in (pair.pair, pair.pair[::-1]):
-            if own in names and other not in names:
-                (stands_for if far else instead).setdefault(own, []).append(other)
-    said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
-    told = [f"{own} may stand for {' or '.join(others)}" for own, others in stands_for.items()]
-    return (f" These data do not distinguish {', nor '.join(said)}." if said else "") + (
-        f" Because of the remaining model error, {', and '.join(told)}." if told else ""
-    )
-
-
 def _as_evident(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects whose refits are within `evidence` of an accepted one's, or that replace an accepted nuisance effect with as much evidence."""
     ours = _named(search, names)

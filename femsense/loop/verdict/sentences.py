@@ -12,7 +12,7 @@ from femsense.loop.fit.discretisation_error import mesh_error_rms, mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
-from femsense.loop.result.records import AllRecordings, ModelError, NamedEffect, Value
+from femsense.loop.result.records import AllRecordings, ConfoundedPair, ModelError, NamedEffect, Value, alternatives
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import DEFAULTS, Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
@@ -31,8 +31,10 @@ def verdict_in_words(
     after: FittedModel,
     budget: ModelError,
     thresholds: Thresholds = DEFAULTS,
+    pairs: Sequence[ConfoundedPair] = (),
 ) -> str:
-    """Return the verdict as a sentence, with the held-out error and the share of model error in it."""
+    """Return the verdict as a sentence, with the held-out error and the share of model error in it. An effect that these data do not distinguish from others
+    is followed by these."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
@@ -53,10 +55,16 @@ def verdict_in_words(
         for name, size in ((MESH.name, mesh), ("places of markers", budget.placement_m))
         if size > 5e-6
     )
-    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
+    others = alternatives(pairs, [e.name for e in effects])
+    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)}{_or(others.get(e.name, ()))})" for e in effects)
     tail = "" if verdict == FOUND else " A residual remains that no effect fits."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
+
+
+def _or(others: Sequence[str]) -> str:
+    """Return the effects that these data do not distinguish from an accepted one, in words."""
+    return f"; not distinguished from {' or '.join(others)}" if others else ""
 
 
 def _noise_in_words(budget: ModelError) -> str:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.result.records import ConfoundedPair, RefitRecord
+from femsense.loop.result.records import ConfoundedPair, RefitRecord, alternatives
 from femsense.loop.result.tables import table_of
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import DEFAULTS
-from femsense.loop.verdict.confounding import confounded, in_words
+from femsense.loop.verdict.confounding import confounded
 from femsense.model.effects import find_effect
 
 
@@ -58,7 +58,7 @@ def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_know
         "dbic_gap": 3.0,
         "cosine": pytest.approx(0.9975, abs=1e-4),
     }
-    assert in_words(pairs, ["cable_friction"], DEFAULTS) == " These data do not distinguish cable_friction from cable_gain."
+    assert alternatives(pairs, ["cable_friction"]) == {"cable_friction": ["cable_gain"]}
 
 
 def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_said() -> None:
@@ -67,7 +67,7 @@ def test_beside_an_error_of_the_model_what_passes_alone_and_is_needless_then_is_
     search.last[:] = [candidate("creep", 0, 0, 1)]  # creep still explains something beside the payload
     pairs = confounded(search, ["payload"], DEFAULTS)
     assert [(p.pair, p.dbic_gap) for p in pairs] == [(("payload", "density"), 74.0)]
-    assert in_words(pairs, ["payload"], DEFAULTS) == " Because of the remaining model error, payload may stand for density."
+    assert alternatives(pairs, ["payload"]) == {"payload": ["density"]}
     assert not confounded(searched(refits), ["payload"], DEFAULTS)  # by the noise, evidence tells them apart
 
 
@@ -76,7 +76,7 @@ def test_what_took_the_place_of_more_evidence_is_not_told_from_it() -> None:
     density = refit("density", 80.0, "named", in_place_of="payload")
     pairs = confounded(searched([refit("payload", 200.0), payload, density], errs=True), ["density"], DEFAULTS)
     assert [(p.pair, p.dbic_gap) for p in pairs] == [(("density", "payload"), 0.0)]
-    assert in_words(pairs, ["density"], DEFAULTS) == " These data do not distinguish density from payload."
+    assert alternatives(pairs, ["density"]) == {"density": ["payload"]}
 
 
 def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> None:
@@ -86,7 +86,7 @@ def test_pairs_are_those_of_what_is_named_and_fields_alone_are_not_said() -> Non
     ]
     pairs = confounded(searched([refit("creep", 30.0, "named")], fields), ["creep"], DEFAULTS)
     assert [p.pair for p in pairs] == [("creep", "cable_gain")]
-    assert in_words(pairs, ["creep"], DEFAULTS) == ""  # fields alone: no refit says so
+    assert alternatives(pairs, ["creep"]) == {}  # fields alone: no refit says so
 
 
 def test_an_effect_that_makes_the_modulus_needless_is_its_rival_unless_another_one_is_far_ahead() -> None:
@@ -135,6 +135,6 @@ def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None
     hidden.retained, hidden.response = 0.02, np.zeros((2, 1))
     pairs = confounded(searched([], [hidden]), ["stiffness"], DEFAULTS)
     assert table_of(pairs) == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
-    assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"], DEFAULTS) == (
-        " These data do not distinguish stiffness from cable_friction, nor gravity from cable_offset."
-    )
+    more = ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)
+    said = {"stiffness": ["cable_friction"], "gravity": ["cable_offset"]}
+    assert alternatives([*pairs, more], ["stiffness", "gravity"]) == said
