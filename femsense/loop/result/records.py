@@ -82,10 +82,6 @@ class RefitRecord:
     """Its standard error."""
     held_dchi2: float | None = field(default=None, metadata=LEFT_OUT)
     """Decrease of χ² on held-out data."""
-    moved_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Rms displacement of the markers, calibration refitted [m]."""
-    mesh_cost_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Discretisation error after calibration is projected out [m]."""
     takes_over: tuple[str, ...] | None = field(default=None, metadata=LEFT_OUT)
     """Nuisance effects that are significant without it, and not with it."""
     seed_std: Vector | None = field(default=None, metadata=LEFT_OUT)
@@ -137,14 +133,12 @@ class ConfoundedPair:
     """Difference between the dBIC of their refits."""
     absorbed_share: float | None = field(default=None, metadata=LEFT_OUT)
     """√(1 − ρ²): the share of one that calibration absorbs, if the other is a nuisance effect."""
-    cosine: float | None = field(default=None, metadata=LEFT_OUT)
-    """Cosine between their fields, calibration projected out."""
 
 
 def alternatives(pairs: Iterable[ConfoundedPair], names: Collection[str]) -> dict[str, list[str]]:
-    """Return for each accepted effect the others that a refit, or calibration, does not distinguish from it; collinear fields alone do not count."""
+    """Return for each accepted effect the others that these data do not distinguish from it."""
     found: dict[str, list[str]] = {}
-    for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
+    for pair in pairs:
         for own, other in (pair.pair, pair.pair[::-1]):
             if own in names and other not in names:
                 found.setdefault(own, []).append(other)

@@ -19,7 +19,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, is_plausible
+from femsense.loop.search.acceptance import acceptance_test, eligible
 from femsense.loop.search.location_search import climbed, lies_on_body, located
 from femsense.loop.search.refit import evidence, refit, tried, with_term, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
@@ -38,21 +38,19 @@ def select_next(
     if not any(r.record.passes for r in refits.values()):  # a seed may be the cause
         evident = data.thresholds.evidence
         refits = {i: polished(data, fitted, r, noise, progress) if r.score > evident else r for i, r in refits.items()}
-    plausible = {i: r for i, r in refits.items() if is_plausible(data.declared, r.candidate.effect, r.fitted.fit)}
-    # beside a model error that the weights include, implausible values compensate for that error
-    leading = leaders(data, fitted, refits if noise.assumed is None else plausible, noise, progress)
+    leading = leaders(data, fitted, refits, noise, progress)
     if not leading:
         return None, _updated(records, refits)
-    first = max(leading, key=lambda i: (i in plausible, leading[i].on_all_data))
+    first = max(leading, key=lambda i: leading[i].on_all_data)
     winner = _enriched(data, fitted, leading[first], table, noise, progress).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
 def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, progress: Progress) -> dict[int, Refit]:
-    """Return the passing refits within `evidence` of the best one, on fitted and held-out data together, each with its seed improved."""
-    passing = {i: r for i, r in refits.items() if r.record.passes}
-    best = max((r.on_all_data for r in passing.values()), default=np.inf)
-    near = {i: r for i, r in passing.items() if r.on_all_data > best - data.thresholds.evidence}
+    """Return the eligible refits within `evidence` of the best one, on fitted and held-out data together, each with its seed improved."""
+    able = eligible(data, refits.values(), noise)
+    best = max((r.on_all_data for r in able), default=np.inf)
+    near = {i: r for i, r in refits.items() if r in able and r.on_all_data > best - data.thresholds.evidence}
     return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, progress) for i, r in near.items()}
 
 

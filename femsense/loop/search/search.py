@@ -116,7 +116,7 @@ def _take_step(state: SearchProgress, progress: Progress) -> None:
         return
     state.earlier = data
     winner = next_one.fitted
-    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not same_mesh_error(fitted, winner)
+    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted) and not same_mesh_error(fitted, winner)
     history = [*history, (next_one.candidate.effect.name, winner)]
     history, refits = swapped(data, history, refits, noise, n_effective, progress)
     last = history[-1][1]

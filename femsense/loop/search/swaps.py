@@ -14,10 +14,10 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweeps_predicted
-from femsense.loop.fit.fitted_model import FittedModel, keeping
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, is_plausible, prior_cost
+from femsense.loop.search.acceptance import acceptance_test, eligible, prior_cost
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import leaders, shortlist
 from femsense.loop.search.input_offset import OFFSETS, evidence_for_offsets, offsets_are_evident
@@ -152,7 +152,7 @@ def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord]
         and r.name not in fitted.fit.hypothesis.names
     ]
     others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
-    return [name] * bool(seeds[name]) + others[: data.effort.alternatives]
+    return [name] * bool(seeds[name]) + others
 
 
 def _better(
@@ -175,14 +175,19 @@ def _better(
     worth = evidence(without.fit, fitted.fit) - price
     listed = [c for c in table if c.effect.name in alternatives and (c.cost < price or not by_held_out)]
     asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, progress)
-    passing = [r for r in asked if r.record.passes]
-    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
+    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in asked if r.record.passes)]
+    able = eligible(data, asked, noise)
     if by_held_out:
-        serve = [r for r in passing if r.penalty < price and not predicts_worse(data, fitted, r.fitted)]
-        plausible = [r for r in serve if is_plausible(data.declared, r.candidate.effect, r.fitted.fit)]
-        return min(plausible, key=lambda r: r.penalty, default=None), records
-    best = max(passing, key=lambda r: r.score, default=None)
-    return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
+        serve = [r for r in able if r.penalty < price and not predicts_worse(data, fitted, r.fitted)]
+        return min(serve, key=lambda r: r.penalty, default=None), records
+    best = max(able, key=lambda r: r.on_all_data, default=None)
+    least = worth + _held_decrease(data, without, fitted, noise) + data.thresholds.swap
+    return (best if best is not None and best.on_all_data > least else None), records
+
+
+def _held_decrease(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
+    """Return the decrease of χ² on held-out data."""
+    return held_chi2(data, before, noise) - held_chi2(data, after, noise)
 
 
 def _asked(
@@ -229,7 +234,7 @@ def instead_of_offsets(
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
     asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, progress)
-    best = max((r for r in asked if r.record.passes), key=lambda r: r.score, default=None)
+    best = max(eligible(data, asked, noise), key=lambda r: r.score, default=None)
     if best is None:
         return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])
     takes, ahead = _takes(data, best, fitted, without, worth)

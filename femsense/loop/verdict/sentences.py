@@ -14,11 +14,13 @@ from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
 from femsense.loop.result.records import AllRecordings, ConfoundedPair, ModelError, NamedEffect, Value, alternatives
 from femsense.loop.search.search_state import Search
-from femsense.loop.thresholds import DEFAULTS, Thresholds
+from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
 MOST_LISTED = 3
 """Maximum number of effects that are listed."""
+AT_NOISE = 1.15
+"""Ratio of the held-out error to the noise up to which the sentence calls the model a fit to the noise."""
 ROUNDED = 1e-6
 """Components below this share of the largest one of a vector, or of their standard deviation, are written as 0."""
 
@@ -30,7 +32,6 @@ def verdict_in_words(
     before: FittedModel,
     after: FittedModel,
     budget: ModelError,
-    thresholds: Thresholds = DEFAULTS,
     pairs: Sequence[ConfoundedPair] = (),
 ) -> str:
     """Return the verdict as a sentence, with the held-out error and the share of model error in it. An effect that these data do not distinguish from others
@@ -38,9 +39,9 @@ def verdict_in_words(
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= thresholds.noisy * np.hypot(known, mesh):
+    if verdict == NONE and before.held_rms <= AT_NOISE * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        own = finer if mesh and before.held_rms > thresholds.noisy * known else ""
+        own = finer if mesh and before.held_rms > AT_NOISE * known else ""
         return f"The model fits the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
     of_it = f"of which {1e3 * budget.held_out_m:.2f} mm is model error and {_noise_in_words(budget)} noise"
     if verdict == NONE:
@@ -120,8 +121,8 @@ def evidence_for(data: Data, found: list[str], insignificant: list[str]) -> str:
 
 def by_noise(data: Data, measured: Repeatability) -> str:
     """Return a sentence if the noise exceeds that of any camera; else empty."""
-    reach, thresholds = data.robot.body.reach, data.thresholds
-    if measured.total < thresholds.significant * thresholds.resolved * reach:
+    reach = data.robot.body.reach
+    if measured.total < data.thresholds.relevant * reach:
         return ""
     return (
         f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is larger than that of any camera: repeated frames differ."

@@ -87,7 +87,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     budget = model_error(data, excess, noise, measured)
     return LoopResult(
         verdict=verdict,
-        sentence=verdict_in_words(verdict, effects, found, before, back, budget, data.thresholds, pairs)
+        sentence=verdict_in_words(verdict, effects, found, before, back, budget, pairs)
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)

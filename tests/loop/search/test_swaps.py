@@ -17,7 +17,7 @@ from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test
+from femsense.loop.search.acceptance import acceptance_test, held_share
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
 from femsense.loop.search.location_search import closer, without_last
@@ -32,7 +32,7 @@ from femsense.model.effects import find_effect
 RECORD = RefitRecord("", {})
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
-LENIENT = replace(DEFAULTS, sweeps_for=-np.inf, held_gain=-1e9, above_mesh=0.0, plainly_worse=np.inf)
+LENIENT = replace(DEFAULTS, held_gain=-1e9, plainly_worse=np.inf)
 """Evidence alone."""
 HIDDEN = [
     {"name": "payload", "point_m": [0.05, 0.0, 0.01], "force_n": [0.06, 0.15, 0.12]},
@@ -230,9 +230,9 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
     rough = acceptance_test(data, base, far, refit(data, base, far, NOISE), RECORD, NOISE)
     end = polished(data, base, rough, NOISE, lambda text: None)
     there = acceptance_test(data, base, far, end.fitted, RECORD, NOISE)
-    sure = [r.record.cv_gain / r.record.cv_std for r in (rough, there)]
-    for wanted, found in ((0.5 * min(sure), True), (2.0 * max(sure), False)):
-        own = replace(data, thresholds=replace(DEFAULTS, sweeps_for=wanted))
+    held = [r.record.held_dchi2 / r.record.dchi2 / held_share(data) for r in (rough, there)]
+    for wanted, found in ((0.5 * (held[0] + held[1]), True), (2.0 * max(held), False)):
+        own = replace(data, thresholds=replace(DEFAULTS, held_gain=wanted, significant=0.0))
         winner, records = select_next(own, base, [far], NOISE, lambda text: None)
         assert (winner is not None) == found and records[0].is_named == found
 
