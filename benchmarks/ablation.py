@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from ablation_cases import make_problem, tuning_cases
-from ablation_watch import SEEN, predicting_best_watched, table_of_best
+from ablation_watch import SEEN, simplest_watched, table_of_best
 from loop import answer_set, named
 from loop_cases import Case
 
@@ -33,19 +33,10 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.improve import ImproveOptions, search_recordings
 from femsense.loop.result.tables import table_of
 from femsense.loop.thresholds import Effort, Thresholds
-from femsense.loop.verdict.returned_model import HeldOutComparison
 from femsense.loop.verdict.verdict import conclude
 from femsense.many.engines import open_engine, spread
 
 INF = float("inf")
-
-
-class OneCriterion(HeldOutComparison):
-    """No worse in millimetres, or better by the noise and no worse beyond the mesh."""
-
-    def holds(self, thresholds: Thresholds) -> bool:
-        least = thresholds.evidence if self.only_calibrated else 0.0
-        return self.error <= thresholds.not_worse or (self.gain > least and self.beyond_mesh <= thresholds.not_worse)
 
 
 def nothing(*given: Any, **more: Any) -> None:
@@ -60,11 +51,6 @@ def none_at_all(*given: Any) -> tuple[()]:
 def no_words(*given: Any) -> str:
     """A rule that has nothing to say."""
     return ""
-
-
-def zero(*given: Any) -> float:
-    """A rule that adds nothing."""
-    return 0.0
 
 
 def as_it_is(data: Any, fitted: Any, refitted: Any, *given: Any) -> Any:
@@ -114,43 +100,35 @@ class Switch:
                 setattr(module, name, known)
 
 
-BEST = "what predicts best"
-BASE = Switch("all rules", {}, {}, {"search.swaps.predicting_best": predicting_best_watched})
+BEST = "the simplest"
+BASE = Switch("all rules", {}, {}, {"search.swaps.simplest": simplest_watched})
 SEARCH = (
-    Switch("sweeps_for", {"sweeps_for": -INF}),
     Switch("held_gain", {"held_gain": -1e9}),
-    Switch("above_mesh", {"above_mesh": 0.0}),
     Switch("plainly_worse", {"plainly_worse": INF}),
-    Switch("evidence alone", {"sweeps_for": -INF, "held_gain": -1e9, "above_mesh": 0.0, "plainly_worse": INF}),
     Switch("swap", {"swap": INF}),
     Switch("places", {}, {"starts": 1, "rounds": 0}),
     Switch("mesh_turns", {"mesh_turns": 0.0}),
-    Switch("mesh_varies", {"mesh_varies": 0.0, "mesh_varies_held": 0.0}),
-    Switch("mesh error", {"mesh_share": 1e-6, "mesh_varies": 0.0, "mesh_varies_held": 0.0, "mesh_turns": 0.0}),
+    Switch("mesh_varies", {"mesh_varies": 0.0}),
+    Switch("mesh error", {"mesh_share": 1e-6, "mesh_varies": 0.0, "mesh_turns": 0.0}),
     Switch("evidence", {"evidence": 5.0}),
     Switch("testable", {"testable": 0.0}),
     Switch("hinted", {"hinted": INF}),
     Switch("mesh_share", {"mesh_share": 1e-6}),
-    Switch("mesh_varies_held", {"mesh_varies_held": 0.25}),
     Switch("outliers", {"outlying": INF}),
     Switch("states", {"states": 0}),
     Switch("effects", {}, {"effects": 6}),
     Switch("refits", {}, {"refits": 12}),
-    Switch("alternatives", {}, {"alternatives": 0}),
     Switch("sizes", {}, {"work": 10**9}, {"data.dataset.MAX_ROWS": 10**6, "fit.discretisation_error.MOST_WORK": 10**9}),
     Switch("rows for the noise", {}, {}, {"fit.noise_components.MAX_REML_ROWS": 1000}),
     Switch("noise near the last", {}, {}, {"fit.noise_components.NEAR_STD": 10.0}),
     Switch("rough fits", {}, {}, {"fit.fitted_model.ROUGHLY": 8}),
     Switch("declared pose", {}, {}, {"fit.joint_fit.BESIDE_MARKERS": np.array([0.1] * 3 + [0.01] * 3)}),
-    Switch("two sweeps disagree", {}, {}, {"fit.cross_validation.LEAST_SWEEPS": 2}),
     Switch("needless", {}, {}, {"search.swaps._if_needless": nothing}),
-    Switch("elsewhere", {}, {}, {"search.forward_selection._elsewhere": as_it_is}),
     Switch("richer forms", {}, {}, {"search.forward_selection._enriched": as_it_is}),
     Switch("more markers", {}, {}, {"search.forward_selection._with_more_markers": as_it_is}),
-    Switch("surely predicts", {}, {}, {"search.acceptance.cv_lower_bound": zero}),
     Switch("slack cables", {}, {}, {"fit.slack_nonsmoothness.trial_nonsmoothness": nothing}),
     Switch("instead of offsets", {}, {}, {"search.swaps.instead_of_offsets": nothing}),
-    Switch(BEST, {}, {}, {"search.swaps.predicting_best": as_found}),
+    Switch(BEST, {}, {}, {"search.swaps.simplest": as_found}),
     Switch("some states", {}, {"work": 0}, {"data.representative_states.FEWEST": 8}),
     Switch("fewer states", {}, {"work": 0}, {"data.representative_states.FEWEST": 4}),
     Switch("nearly all states", {}, {"work": 0}, {"data.representative_states.FEWEST": 12, "search.some_states.SPARED": 1.0}),
@@ -161,13 +139,9 @@ VERDICT = (
     Switch("relevant", {"relevant": 0.0}),
     Switch("explained", {"explained": -INF}),
     Switch("lacks", {"lacks": INF}),
-    Switch("resolved", {"resolved": INF}),
-    Switch("noisy", {"noisy": 1.0}),
-    Switch("alike", {"alike": INF}),
     Switch("significant", {"significant": 2.0}),
     Switch("structure", {"structure": 0.0}),
     Switch("not_worse", {"not_worse": INF}),
-    Switch("held-out exceptions", {}, {}, {"verdict.returned_model.HeldOutComparison": OneCriterion}),
     Switch("much is lacking", {}, {}, {"verdict.verdict.lacks_much": nothing}),
     Switch("surprise", {}, {}, {"verdict.verdict._surprise": no_words}),
     Switch("moves alike", {}, {}, {"verdict.confounding._in_common": none_at_all}),

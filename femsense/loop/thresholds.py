@@ -17,12 +17,9 @@ class Thresholds:
     evidence: float = 10.0
     """Minimum dBIC of an effect: of its linear score to be refitted, of its refit to be accepted. Alternatives within this dBIC of the best count as
     equally good."""
-    sweeps_for: float = 0.5
-    """Minimum gain in the log predictive density of left-out sweeps, in its standard errors; −inf: no criterion."""
     held_gain: float = 0.25
     """Minimum decrease of χ² per held-out row, as a share of the decrease per fitted row; −1e9: no criterion."""
-    above_mesh: float = 0.5
-    """Minimum displacement of the markers by an effect or by input offsets, relative to the discretisation error beyond calibration; 0: no criterion."""
+
     plainly_worse: float = 1.25
     """An effect is rejected if it multiplies the unweighted fitted rms by more than this and the held-out rms grows too; inf: no criterion."""
 
@@ -43,8 +40,6 @@ class Thresholds:
     """Standard deviation of the share of the discretisation error that is common to all sweeps …"""
     mesh_varies: float = 0.25
     """… of the share that each sweep adds …"""
-    mesh_varies_held: float = 0.12
-    """… of the same if cables are held at a displacement …"""
     mesh_turns: float = 0.07
     """… and of the entries of a matrix that rotates and stretches the error."""
 
@@ -52,7 +47,8 @@ class Thresholds:
     significant: float = 3.0
     """Number of standard deviations from the declared value to be reported; and ratio to the median marker offset to count as a single outlier."""
     relevant: float = 0.02
-    """… and minimum deviation, as a share of the value or of a cable's range; 0: no criterion."""
+    """… and minimum deviation, as a share of the value, of a cable's range, or of the body's reach: upper limit of a noise that was not measured, and of the
+    distance of a fitted place from the body; 0: no criterion."""
 
     # --- verdict -----------------------------------------------------------------------------------------------------------------
     explained: float = 0.8
@@ -62,17 +58,8 @@ class Thresholds:
     lacks: float = 2.0
     """Largest ratio of mean squares between the returned model and the model with all nuisance parameters, and between quadratic elements and the
     declared linear ones; inf: no criterion."""
-    resolved: float = 0.01
-    """Resolution of the measurements as a share of the body's reach: upper limit of a noise that was not measured, and of the distance of a fitted
-    place from the body."""
     not_worse: float = 1.02
-    """Largest ratio of the held-out error of the returned model to that of the declared one …"""
-    noisy: float = 1.15
-    """… and of calibration alone, if χ² shows that noise hides the improvement."""
-
-    # --- what cannot be distinguished ----------------------------------------------------------------------------------------------
-    alike: float = 0.95
-    """Two fields with at least this cosine count as collinear, and two places with such fields as the same place; inf: none."""
+    """Largest ratio of the held-out error of the returned model to that of the declared one."""
 
     # --- data ----------------------------------------------------------------------------------------------------------------------
     outlying: float = 4.0
@@ -97,8 +84,6 @@ class Effort:
     """Number of seeds of an effect that are improved, the best ones …"""
     rounds: int = 4
     """… and maximum number of moves of each to a better neighbour."""
-    alternatives: int = 2
-    """Number of alternatives to an effect that are tried."""
     matchings: int = 6
     """Maximum number of times that the rows of clouds are recomputed."""
     recordings: int = 8

@@ -48,7 +48,7 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     loop = improve(arm(), [recording])
     assert [e.name for e in loop.effects] == ["stiffness"]
-    assert "do not tell" not in loop.sentence  # weight tells it from a gain of all cables
+    assert "not distinguished" not in loop.sentence  # weight tells it from a gain of all cables
     assert found(loop, "stiffness").parameters["scale"].value == pytest.approx(1.25, rel=0.06)
     assert [e["name"] for e in loop.entries] == ["stiffness", *loop.fitted_along] and "cable_offset" in loop.fitted_along
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
@@ -72,7 +72,7 @@ def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pul
         "load_forces": np.array(list(forces.values())),
     }
     loop = improve(weightless, [replace(recording, **known) if forces else recording], effects=["cable_gain", "cable_friction"])
-    said = "These data do not distinguish stiffness from cable_gain." in loop.sentence
+    said = "; not distinguished from cable_gain)" in loop.sentence
     assert [e.name for e in loop.effects] == ["stiffness"] and said == (not load)
     assert loop.next_experiment.startswith("hang a known weight") == (not load)
 

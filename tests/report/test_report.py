@@ -119,7 +119,7 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
         ],
         "confounded": [
             {"pair": ["gravity", "payload"], "dbic_gap": 3.2},
-            {"pair": ["cable_gain", "cable_stretch"], "cosine": 0.972},
+            {"pair": ["cable_gain", "cable_stretch"], "absorbed_share": 0.972},
         ],
         "next_experiment": "turn the base by 90° between frames, camera fixed",
         "not_testable": [{"name": "poisson", "absorbed_share": 0.97, "retained_share": 0.24}],
@@ -556,7 +556,7 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "poisson_ratio in [0.050, 0.50] 0 −7.40 – 5 % – not testable: 97 % of it is absorbed by calibration",
         "5. What these data cannot say",
         "gravity and payload: their evidence differs by a ΔBIC of 3.2 only",
-        "leave the same trace (agreement 97.2 %)",
+        "97.2 % of the second is absorbed by calibration",
         "poisson: 97 % of it is absorbed by calibration",
         "Next experiment: turn the base by 90°",
         "How much of the trace of the effect on the left is collinear with that of the effect below",

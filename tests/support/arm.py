@@ -108,7 +108,8 @@ def record(
     true = apply_effects(truth or arm((8, 3, 3), law="neo_hookean"), effects)
     ties = true.markers if placements is None else true.tie_markers(true.marker_points + placements)
     plain = make_recording(
-        Timeline(np.arange(len(inputs)) * 1.0), drives=Drives(actuation=actuation, cable_names=NAMES, inputs=inputs)
+        Timeline(np.arange(len(inputs)) * 1.0),
+        drives=Drives(actuation=actuation, cable_names=true.body.cable_names, inputs=inputs),
     )
     driven = DrivenRobot(true, drive_of(true, plain, initial=initial))
     points, states, state = [], [], None
@@ -133,7 +134,7 @@ def record(
     count = len(true.marker_names)
     recording = make_recording(
         Timeline(np.arange(len(inputs)) * 1.0, sweep=labels, free=np.full(len(inputs), free)),
-        drives=Drives(actuation=actuation, actuation_zero=zero, cable_names=NAMES, inputs=inputs),
+        drives=Drives(actuation=actuation, actuation_zero=zero, cable_names=true.body.cable_names, inputs=inputs),
         markers=MarkerRows(
             true.marker_names, np.repeat(np.arange(len(inputs)), count), np.tile(np.arange(count), len(inputs)), measured
         ),

@@ -23,6 +23,8 @@ from femsense.loop.design.experiment_blocks import Block, Form
 from femsense.loop.search.screening import penalty
 from femsense.loop.thresholds import DEFAULTS, Thresholds
 
+COLLINEAR = 0.95
+"""Cosine of two fields beyond which an experiment does not distinguish their effects."""
 ABSORBED = 1e-9
 """Share of its χ² below which a direction counts as fully absorbed."""
 
@@ -77,8 +79,8 @@ class Identifiability:
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and self.cannot_distinguish(p)]
 
     def cannot_distinguish(self, pair: tuple[int, int, float, float]) -> bool:
-        """Return whether a pair as of `pairs` is collinear (above `alike`) or too close in evidence."""
-        return pair[2] > self.thresholds.alike or pair[3] < self.thresholds.evidence
+        """Return whether a pair as of `pairs` is collinear (above COLLINEAR) or too close in evidence."""
+        return pair[2] > COLLINEAR or pair[3] < self.thresholds.evidence
 
     def distinguished(self) -> tuple[int, int]:
         """Return the number of pairs of detectable effects that are distinguished, and the number of all pairs."""
@@ -98,10 +100,10 @@ class Identifiability:
     @property
     def confusion(self) -> float:
         """The objective of planning: the sum of the shortfalls of effects and pairs, each between 0 and 1."""
-        least, alike, wanted = self.thresholds.testable, self.thresholds.alike, self.thresholds.evidence
+        least, wanted = self.thresholds.testable, self.thresholds.evidence
         missing = sum(max(0.0, 1.0 - r.retained / least) + np.clip(1.0 - r.dbic / wanted, 0.0, 1.0) for r in self.rows)
         pairs = sum(
-            np.clip(1.0 - gap / wanted, 0.0, 1.0) + np.clip((share - alike) / (1 - alike), 0, 1)
+            np.clip(1.0 - gap / wanted, 0.0, 1.0) + np.clip((share - COLLINEAR) / (1 - COLLINEAR), 0, 1)
             for *_, share, gap in self.pairs()
         )
         return float(missing + pairs)

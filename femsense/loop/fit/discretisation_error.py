@@ -228,9 +228,7 @@ def _by_sweep(
     error = np.einsum("kca,ka->kc", along, error)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
-    by_sweep[np.arange(len(error)), :, number] = (
-        thresholds.mesh_varies_held if trial.scene.recording.actuation == "displacement" else thresholds.mesh_varies
-    ) * error
+    by_sweep[np.arange(len(error)), :, number] = thresholds.mesh_varies * error
     return np.concatenate([thresholds.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
 
 

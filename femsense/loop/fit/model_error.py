@@ -27,7 +27,7 @@ class Excess:
     mesh: float
     """Discretisation error; 0 if unknown."""
     believed: float
-    """The noise used: the measured repeatability or, if none was measured, the assumed one up to `resolved` of the body's reach."""
+    """The noise used: the measured repeatability or, if none was measured, the assumed one up to `relevant` of the body's reach."""
     explained: float
     """Share of the mean square beyond `floor` that the effects removed: the smaller of that of the final model in the fitted data and that of the
     returned model in the held-out data."""
@@ -42,7 +42,7 @@ def excess_of(
     data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise, measured: Repeatability
 ) -> Excess:
     """Return the residuals of three models: `before`, the final one, and the returned one (`back`)."""
-    believed = measured.total if measured.known else min(measured.total, data.thresholds.resolved * data.robot.body.reach)
+    believed = measured.total if measured.known else min(measured.total, data.thresholds.relevant * data.robot.body.reach)
     floor = float(np.hypot(believed, placement_rms(data, noise)))
     fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
     held = [beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]

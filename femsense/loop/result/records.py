@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -82,10 +82,6 @@ class RefitRecord:
     """Its standard error."""
     held_dchi2: float | None = field(default=None, metadata=LEFT_OUT)
     """Decrease of χ² on held-out data."""
-    moved_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Rms displacement of the markers, calibration refitted [m]."""
-    mesh_cost_m: float | None = field(default=None, metadata=LEFT_OUT)
-    """Discretisation error after calibration is projected out [m]."""
     takes_over: tuple[str, ...] | None = field(default=None, metadata=LEFT_OUT)
     """Nuisance effects that are significant without it, and not with it."""
     seed_std: Vector | None = field(default=None, metadata=LEFT_OUT)
@@ -137,8 +133,16 @@ class ConfoundedPair:
     """Difference between the dBIC of their refits."""
     absorbed_share: float | None = field(default=None, metadata=LEFT_OUT)
     """√(1 − ρ²): the share of one that calibration absorbs, if the other is a nuisance effect."""
-    cosine: float | None = field(default=None, metadata=LEFT_OUT)
-    """Cosine between their fields, calibration projected out."""
+
+
+def alternatives(pairs: Iterable[ConfoundedPair], names: Collection[str]) -> dict[str, list[str]]:
+    """Return for each accepted effect the others that these data do not distinguish from it."""
+    found: dict[str, list[str]] = {}
+    for pair in pairs:
+        for own, other in (pair.pair, pair.pair[::-1]):
+            if own in names and other not in names:
+                found.setdefault(own, []).append(other)
+    return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -36,32 +37,28 @@ def acceptance_test(
     With g the evidence (decrease of χ², `refit.evidence`), c the BIC penalty, π the prior cost and h the decrease of held-out χ², an effect passes if
 
         g − c − π > evidence,    its parameters are identifiable and inside their bounds,
-        the log predictive density of left-out sweeps rises by more than `sweeps_for` standard errors,
         h ≥ min(held_gain · g · n_held / n_fitted,  s − 2 z √s),    g − c − π + h > evidence,
-        it moves the markers by at least `above_mesh` times the discretisation error, and the unweighted rms does not grow (`plainly_worse`).
+        and the unweighted rms does not grow (`plainly_worse`).
 
-    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. Names in code style are fields of `Thresholds`.
+    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. An effect with implausible values is not given this allowance for
+    chance. Names in code style are fields of `Thresholds`.
     """
     thresholds = data.thresholds
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
-    # for a true effect `held` has mean `acts` and variance 4 · acts
-    acts = held_shift(data, fitted, made, noise)
-    wanted = min(thresholds.held_gain * gain * held_share(data), acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
-    moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
+    wanted = thresholds.held_gain * gain * held_share(data)
+    if is_plausible(data.declared, candidate.effect, made.fit):  # for a true effect `held` has mean `acts` and variance 4 · acts
+        acts = held_shift(data, fitted, made, noise)
+        wanted = min(wanted, acts - 2.0 * thresholds.significant * float(np.sqrt(acts)))
     fit_objection = _objection(made, candidate, score, thresholds)
-    if fit_objection is None and np.isfinite(std_error) and better <= thresholds.sweeps_for * std_error:
-        fit_objection = f"left-out sweeps are not predicted better (log density {better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = (
             f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} in the fitted data)"
         )
     if fit_objection is None and score + held <= thresholds.evidence:  # held-out data weaken the evidence
         fit_objection = f"too little evidence (dBIC {score:.1f}) with the held-out data (χ² {_moves(held)} there)"
-    if fit_objection is None and moved < thresholds.above_mesh * mesh:
-        fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm; the discretisation error is {1e3 * mesh:.3f} mm"
     if fit_objection is None and plainly_worse(fitted, made, thresholds):
         fit_objection = (
             f"the unweighted error of the fitted data grows (from {1e3 * fitted.fit.rms:.3f} to {1e3 * made.fit.rms:.3f} mm)"
@@ -75,8 +72,6 @@ def acceptance_test(
         cv_gain=better,
         cv_std=std_error,
         held_dchi2=held,
-        moved_m=moved,
-        mesh_cost_m=mesh,
         takes_over=_taken_over(fitted, made, thresholds),
     )
     return Refit(candidate, made, score, record)
@@ -91,16 +86,25 @@ def plainly_worse(before: FittedModel, after: FittedModel, thresholds: Threshold
     return after.fit.rms > thresholds.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
 
 
+def is_plausible(declared: Robot, effect: Effect, fit: JointFit) -> bool:
+    """Return whether the fitted values of an effect are plausible (`Effect.plausible`)."""
+    return effect.plausible(declared, fit.coordinates[span_of(fit, effect.name)])
+
+
+def eligible(data: Data, refits: Iterable[Refit], noise: Noise) -> list[Refit]:
+    """Return the refits that pass and may be chosen: next to a model error that the weights include, implausible values compensate for that error; otherwise
+    they are accepted if nothing plausible has passed within `evidence` of them."""
+    passing = [r for r in refits if r.record.passes]
+    plausible = [r for r in passing if is_plausible(data.declared, r.candidate.effect, r.fitted.fit)]
+    if noise.assumed is not None:
+        return plausible
+    best = max((r.on_all_data for r in passing), default=0.0) - data.thresholds.evidence
+    return plausible if any(r.on_all_data > best for r in plausible) else passing
+
+
 def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
     """Return −2 log of the prior density of the fitted values of an effect."""
     return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
-
-
-def cv_lower_bound(refitted: Refit) -> float:
-    """Return the cross-validation gain minus its standard error, if that is known."""
-    gain, std = refitted.record.cv_gain, refitted.record.cv_std
-    assert gain is not None and std is not None
-    return gain - (std if np.isfinite(std) else 0.0)
 
 
 def _taken_over(before: FittedModel, after: FittedModel, thresholds: Thresholds) -> tuple[str, ...]:
@@ -124,18 +128,11 @@ def moved_by(before: FittedModel, after: FittedModel) -> float:
     return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
 
 
-def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) -> float:
-    """Return the rms discretisation error after calibration is projected out [m], as defined by `rms_of`; 0 if it is unknown.
-
-    With several sweeps, unless `whole`, the share common to all sweeps is projected out too, and the rotations and additions per sweep remain.
-    """
+def discretisation_rms(data: Data, fitted: FittedModel) -> float:
+    """Return the rms discretisation error after calibration is projected out [m], as defined by `rms_of`; 0 if it is unknown."""
     errors = mesh_errors(data)
     J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(fitted.fit.jets, errors)]
-    fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
-    if whole or any(len(np.unique(t.groups.sweep)) < 2 for t in data.train):
-        return rms_of([beside(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
-    left = [beside(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
-    return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
+    return rms_of([beside(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
 
 
 def _objection(made: FittedModel, candidate: Candidate, score: float, thresholds: Thresholds) -> str | None:

@@ -19,7 +19,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, cv_lower_bound
+from femsense.loop.search.acceptance import acceptance_test, eligible
 from femsense.loop.search.location_search import climbed, lies_on_body, located
 from femsense.loop.search.refit import evidence, refit, tried, with_term, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
@@ -35,22 +35,22 @@ def select_next(
     if not listed:
         return None, []
     refits, records = _refitted(data, fitted, listed, noise, progress)
-    if not any(r.record.passes for r in refits.values()):
-        refits = {i: _elsewhere(data, fitted, r, noise, progress) for i, r in refits.items()}
+    if not any(r.record.passes for r in refits.values()):  # a seed may be the cause
+        evident = data.thresholds.evidence
+        refits = {i: polished(data, fitted, r, noise, progress) if r.score > evident else r for i, r in refits.items()}
     leading = leaders(data, fitted, refits, noise, progress)
     if not leading:
         return None, _updated(records, refits)
-    # the highest evidence, with a bonus for a significantly better prediction, which decides if evidence is close
-    first = max(leading, key=lambda i: leading[i].score + cv_lower_bound(leading[i]))
+    first = max(leading, key=lambda i: leading[i].on_all_data)
     winner = _enriched(data, fitted, leading[first], table, noise, progress).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
 def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, progress: Progress) -> dict[int, Refit]:
-    """Return the passing refits within `evidence` of the best one, each with its seed improved."""
-    passing = {i: r for i, r in refits.items() if r.record.passes}
-    best = max((r.score for r in passing.values()), default=np.inf)
-    near = {i: r for i, r in passing.items() if r.score > best - data.thresholds.evidence}
+    """Return the eligible refits within `evidence` of the best one, on fitted and held-out data together, each with its seed improved."""
+    able = eligible(data, refits.values(), noise)
+    best = max((r.on_all_data for r in able), default=np.inf)
+    near = {i: r for i, r in refits.items() if r in able and r.on_all_data > best - data.thresholds.evidence}
     return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, progress) for i, r in near.items()}
 
 
@@ -84,24 +84,15 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
-def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, progress: Progress) -> Refit:
-    """Return a refit with evidence that fails another criterion, tested again with its seed improved: the seed may be the cause."""
-    if refitted.score <= data.thresholds.evidence or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
-        return refitted
-    better = polished(data, fitted, refitted, noise, progress)
-    if better.fitted is refitted.fitted:
-        return better
-    return acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
-
-
 def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, progress: Progress) -> Refit:
-    """Return a refit with an improved seed, and with the scatter of its coordinates over seeds that fit equally well."""
+    """Return a refit with an improved seed, tested again, and with the scatter of its coordinates over seeds that fit equally well. A refit that passes
+    keeps a seed whose improvement does not."""
     made, scatter = _polish(data, fitted, refitted, noise, progress)
     record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
         return replace(refitted, record=record)
-    score = refitted.score - evidence(fitted.fit, refitted.fitted.fit) + evidence(fitted.fit, made.fit)
-    return replace(refitted, fitted=made, score=score, record=replace(record, dbic=score, validation_rms_m=made.held_rms))
+    better = acceptance_test(data, fitted, refitted.candidate, made, record, noise)
+    return better if better.record.passes or not refitted.record.passes else replace(refitted, record=record)
 
 
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, progress: Progress) -> Refit:

@@ -9,7 +9,6 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import FittedModel, keeping, span_of
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.refit import evidence
 from femsense.model.effects import OF_INPUTS
 from femsense.model.effects.base import range_units
@@ -36,7 +35,7 @@ def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, 
 
 
 def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effective: float) -> FittedModel | None:
-    """Return the model without the input offsets if the data need these, by evidence, held-out error and displacement of the markers; else None."""
+    """Return the model without the input offsets if the data need these, by evidence and held-out error; else None."""
     if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:
@@ -46,6 +45,4 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     if evidence_for_offsets(data, fitted, without, n_effective) <= data.thresholds.evidence:
         return None
     moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
-    if moved >= declared:
-        return None
-    return without if moved_by(without, fitted) > data.thresholds.above_mesh * discretisation_rms(data, without) else None
+    return without if moved < declared else None

@@ -22,6 +22,9 @@ from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
 from femsense.model.robot import Robot
 
+COLLINEAR = 0.95
+"""Cosine of two fields beyond which their places count as one."""
+
 
 def located(
     data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
@@ -67,14 +70,14 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     most = max((end.gain for end in ends), default=0.0)
     apart = list[Candidate]()
     for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
-        if not any(same_place(end, other, data.thresholds) for other in apart):
+        if not any(same_place(end, other) for other in apart):
             apart.append(end)
     return apart
 
 
-def same_place(a: Candidate, b: Candidate, thresholds: Thresholds) -> bool:
+def same_place(a: Candidate, b: Candidate) -> bool:
     """Return whether two places have nearly the same field with the same sign; with opposite signs (soft here, stiff there) they are different."""
-    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= thresholds.alike
+    return float(a.step @ b.step) > 0.0 and confounding(a, b) >= COLLINEAR
 
 
 def _scatter(seen: Sequence[Candidate], best: Candidate, fit: JointFit, thresholds: Thresholds) -> list[float]:
@@ -165,12 +168,12 @@ def _screen_seeds(
 def lies_on_body(
     robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, thresholds: Thresholds
 ) -> bool:
-    """Return whether each place among parameters lies in the body at rest, or outside it by at most `resolved` of its reach. Without this bound a fit may
+    """Return whether each place among parameters lies in the body at rest, or outside it by at most `relevant` of its reach. Without this bound a fit may
     place a force anywhere along its line of action."""
     places: dict[str, list[float]] = {}
     for p, v in zip(parameters, coordinates):
         if p.unit == "m" and isinstance(p.part, int):
             places.setdefault(p.key, []).append(p.value(float(v)))
     points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
-    most = thresholds.resolved * robot.body.reach
+    most = thresholds.relevant * robot.body.reach
     return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= most).all())

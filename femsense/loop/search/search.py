@@ -21,7 +21,7 @@ from femsense.loop.search.forward_selection import hinted, select_next
 from femsense.loop.search.richer_forms import with_all_parts
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
-from femsense.loop.search.swaps import instead_of_offsets, predicting_best, swapped
+from femsense.loop.search.swaps import instead_of_offsets, simplest, swapped
 from femsense.model.recording import state_key
 
 
@@ -44,7 +44,7 @@ def search_effects(state: SearchProgress, checkpoint: Checkpoint, progress: Prog
     assert noise is not None
     refits, before = state.refits, state.before
     if state.holds_error:
-        history, refits = predicting_best(data, history, refits, state.table, noise, state.n_effective, progress)
+        history, refits = simplest(data, history, refits, state.names, noise, state.n_effective, progress)
     fitted = history[-1][1]
     most = _most_effects(data)
     swap = instead_of_offsets(data, fitted, state.names, noise, state.n_effective, progress) if most else None
@@ -116,7 +116,7 @@ def _take_step(state: SearchProgress, progress: Progress) -> None:
         return
     state.earlier = data
     winner = next_one.fitted
-    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not same_mesh_error(fitted, winner)
+    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted) and not same_mesh_error(fitted, winner)
     history = [*history, (next_one.candidate.effect.name, winner)]
     history, refits = swapped(data, history, refits, noise, n_effective, progress)
     last = history[-1][1]

@@ -126,6 +126,18 @@ class Refit:
     record: RefitRecord
     """The record shown in the report."""
 
+    @property
+    def penalty(self) -> float:
+        """Penalty of its parameters, of its selection and of implausible values: the decrease of χ² minus dBIC."""
+        assert self.record.dchi2 is not None
+        return self.record.dchi2 - self.score
+
+    @property
+    def on_all_data(self) -> float:
+        """Evidence of the fitted data and of the held-out data together: dBIC plus the decrease of χ² there."""
+        assert self.record.held_dchi2 is not None
+        return self.score + self.record.held_dchi2
+
     def saying(self, verdict: str) -> Refit:
         """Return the refit with another verdict in its record."""
         return replace(self, record=replace(self.record, verdict=verdict))

@@ -1,7 +1,7 @@
 """Re-tests of accepted effects, because an effect that is accepted early can absorb part of one that is still missing.
 
 After each further effect: is an earlier one still needed, and does an alternative, or the same effect elsewhere, fit better in its place? At the end: does
-an effect fit better than the input offsets; and, with weights that include the model error, does an alternative predict held-out data better?
+an effect fit better than the input offsets; and, with weights that include the model error, does a simpler and more plausible effect suffice?
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweeps_predicted
-from femsense.loop.fit.fitted_model import FittedModel, keeping
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, prior_cost
+from femsense.loop.search.acceptance import acceptance_test, eligible, prior_cost
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import leaders, shortlist
 from femsense.loop.search.input_offset import OFFSETS, evidence_for_offsets, offsets_are_evident
@@ -54,43 +54,35 @@ def alternatives_to(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequ
     return [r for r in refits if r.passes and r.answers_as(own) and r.name not in left]
 
 
-def predicting_best(
+def simplest(
     data: Data,
     history: History,
     refits: list[RefitRecord],
-    table: Sequence[Candidate],
+    names: Sequence[str],
     noise: Noise,
     n_effective: float,
     progress: Progress,
 ) -> tuple[History, list[RefitRecord]]:
-    """Return a history and its refits in which an alternative that predicts held-out data significantly better replaces each effect.
+    """Return a history and its refits in which a simpler and more plausible effect replaces each one that it may stand for.
 
-    For weights that include the model error: the evidence of an effect then also measures how well it compensates for that error in the fitted data.
+    For weights that include the model error: the evidence of an effect then also measures how well it compensates for that error in the fitted data, and
+    held-out data decide whether a simpler one suffices (`predicts_worse`). The penalty of an effect is that of its parameters and of implausible values.
     """
     for name in [name for name, _ in history[1:]]:
-        named = history[-1][1].fit.hypothesis.names
-        own = next((r for r in reversed(refits) if r.name == name and r.is_named), None)
-        others = [] if own is None else sorted(alternatives_to(own, refits, table), key=_held_rms)
-        better = [r.name for r in others if r.name not in named and own is not None and _held_rms(r) < _held_rms(own)]
-        if better:
-            best = list(dict.fromkeys(better))[: data.effort.alternatives]
-            history, refits = _exchanged(data, history, refits, name, best, noise, n_effective, progress, by_held_out=True)
+        others = [n for n in names if n not in history[-1][1].fit.hypothesis.names]
+        history, refits = _exchanged(data, history, refits, name, others, noise, n_effective, progress, by_held_out=True)
     return history, refits
 
 
-def predicts_better(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
-    """Return whether the squared error of another model in held-out states, paired by state, is smaller by more than one standard error."""
-    falls = dict[tuple[int, bytes], list[float]]()
+def predicts_worse(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
+    """Return whether the squared error of another model in held-out states, paired by state, is larger by more than one standard error; also if there are
+    too few states to tell."""
+    rises = dict[tuple[int, bytes], list[float]]()
     for i, (trial, own, new) in enumerate(zip(data.held, fitted.held_residuals, other.held_residuals)):
-        for k, fall in zip(trial.scene.frame, (own**2 - new**2).sum(axis=1)):
-            falls.setdefault((i, state_key(trial.scene.recording, int(k))), []).append(float(fall))
-    means = np.array([np.mean(own) for own in falls.values()])
-    return len(means) >= LEAST_SWEEPS and bool(means.mean() > means.std(ddof=1) / np.sqrt(len(means)))
-
-
-def _held_rms(r: RefitRecord) -> float:
-    """Return the held-out error of a refit [m]; inf if it has none."""
-    return np.inf if r.validation_rms_m is None else r.validation_rms_m
+        for k, rise in zip(trial.scene.frame, (new**2 - own**2).sum(axis=1)):
+            rises.setdefault((i, state_key(trial.scene.recording, int(k))), []).append(float(rise))
+    means = np.array([np.mean(own) for own in rises.values()])
+    return len(means) < LEAST_SWEEPS or bool(means.mean() > means.std(ddof=1) / np.sqrt(len(means)))
 
 
 def _exchanged(
@@ -160,7 +152,7 @@ def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord]
         and r.name not in fitted.fit.hypothesis.names
     ]
     others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
-    return [name] * bool(seeds[name]) + others[: data.effort.alternatives]
+    return [name] * bool(seeds[name]) + others
 
 
 def _better(
@@ -179,16 +171,23 @@ def _better(
     own = _same(table, fitted, name)
     if own is None:
         return None, []
-    worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
-    listed = [c for c in table if c.effect.name in alternatives]
+    price = own.cost + prior_cost(data.declared, own.effect, fitted.fit)
+    worth = evidence(without.fit, fitted.fit) - price
+    listed = [c for c in table if c.effect.name in alternatives and (c.cost < price or not by_held_out)]
     asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, progress)
-    passing = [r for r in asked if r.record.passes]
-    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
+    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in asked if r.record.passes)]
+    able = eligible(data, asked, noise)
     if by_held_out:
-        best = min(passing, key=lambda r: r.fitted.held_rms, default=None)
-        return (best if best is not None and predicts_better(data, fitted, best.fitted) else None), records
-    best = max(passing, key=lambda r: r.score, default=None)
-    return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
+        serve = [r for r in able if r.penalty < price and not predicts_worse(data, fitted, r.fitted)]
+        return min(serve, key=lambda r: r.penalty, default=None), records
+    best = max(able, key=lambda r: r.on_all_data, default=None)
+    least = worth + _held_decrease(data, without, fitted, noise) + data.thresholds.swap
+    return (best if best is not None and best.on_all_data > least else None), records
+
+
+def _held_decrease(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
+    """Return the decrease of χ² on held-out data."""
+    return held_chi2(data, before, noise) - held_chi2(data, after, noise)
 
 
 def _asked(
@@ -235,7 +234,7 @@ def instead_of_offsets(
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
     asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, progress)
-    best = max((r for r in asked if r.record.passes), key=lambda r: r.score, default=None)
+    best = max(eligible(data, asked, noise), key=lambda r: r.score, default=None)
     if best is None:
         return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])
     takes, ahead = _takes(data, best, fitted, without, worth)

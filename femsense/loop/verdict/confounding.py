@@ -1,4 +1,4 @@
-"""Limits of the data: alternatives with as much evidence, collinear fields, and effects that a nuisance effect absorbs."""
+"""Limits of the data: alternatives with as much evidence, and effects that a nuisance effect absorbs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.fit.fitted_model import span_of
 from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.search.input_offset import OFFSETS
-from femsense.loop.search.screening import confounding, one_each
+from femsense.loop.search.screening import one_each
 from femsense.loop.search.search_state import Search
 from femsense.loop.search.swaps import alternatives_to
 from femsense.loop.thresholds import Thresholds
@@ -20,7 +20,7 @@ from femsense.loop.thresholds import Thresholds
 def confounded(search: Search, names: Sequence[str], thresholds: Thresholds) -> list[ConfoundedPair]:
     """Return the pairs that these data cannot distinguish: an accepted effect, and a possible alternative."""
     found: dict[frozenset[str], ConfoundedPair] = {}
-    asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common, _alike
+    asked = _as_evident, _in_place_of_an_error, _absorbed, _in_common
     for pair in (pair for ask in asked for pair in ask(search, names, thresholds)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
@@ -38,23 +38,6 @@ def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
         a.pair,
         chosen(min, a.dbic_gap, b.dbic_gap),
         chosen(max, a.absorbed_share, b.absorbed_share),
-        chosen(max, a.cosine, b.cosine),
-    )
-
-
-def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str], thresholds: Thresholds) -> str:
-    """Return sentences on the alternatives to the accepted effects, by refits or by absorption; empty if there are none."""
-    instead: dict[str, list[str]] = {}
-    stands_for: dict[str, list[str]] = {}
-    for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
-        far = pair.absorbed_share is None and pair.dbic_gap is not None and pair.dbic_gap >= thresholds.evidence
-        for own, other in (pair.pair, pair.pair[::-1]):
-            if own in names and other not in names:
-                (stands_for if far else instead).setdefault(own, []).append(other)
-    said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
-    told = [f"{own} may stand for {' or '.join(others)}" for own, others in stands_for.items()]
-    return (f" These data do not distinguish {', nor '.join(said)}." if said else "") + (
-        f" Because of the remaining model error, {', and '.join(told)}." if told else ""
     )
 
 
@@ -103,7 +86,7 @@ def _absorbed(search: Search, names: Sequence[str], thresholds: Thresholds) -> I
         own = np.hstack([poses, J[:, fit.own :][:, span_of(fit, name)]])
         for c in hidden:
             whole = beside(poses, c.columns - J @ c.response)
-            if np.linalg.norm(beside(own, whole)) < (1.0 - thresholds.alike**2) ** 0.5 * np.linalg.norm(whole):
+            if np.linalg.norm(beside(own, whole)) < thresholds.testable * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
@@ -126,24 +109,3 @@ def _common(search: Search, own: str, other: str, thresholds: Thresholds) -> Ite
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
     if retained < thresholds.testable:
         yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))
-
-
-def _alike(search: Search, names: Sequence[str], thresholds: Thresholds) -> Iterator[ConfoundedPair]:
-    """Yield the effects with a field collinear with that of an accepted one after calibration is projected out, if they have a positive score and refits do not
-    distinguish them."""
-    ones = [c for c in one_each(search.first) if c.retained >= thresholds.testable]
-    for a in (c for c in ones if c.effect.name in names):
-        for b in (c for c in ones if c is not a and c.score > 0.0):
-            share = min(confounding(a, b), confounding(b, a))
-            if share > thresholds.alike and not _are_distinguished(search, names, a.effect.name, b.effect.name, thresholds):
-                yield ConfoundedPair((a.effect.name, b.effect.name), cosine=share)
-
-
-def _are_distinguished(search: Search, names: Sequence[str], own: str, other: str, thresholds: Thresholds) -> bool:
-    """Return whether refits of another effect in place of an accepted one have less evidence by at least `evidence`."""
-    for named in (r for r in _named(search, names) if r.name == own and r.is_named):
-        there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
-        tried = [dbic for dbic in there if np.isfinite(dbic)]  # a fit that stopped early has none
-        if tried and max(tried) <= named.evidence - thresholds.evidence:
-            return True
-    return False

@@ -24,7 +24,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.loop_result import rounded
 from femsense.loop.search.acceptance import at_edge
-from femsense.loop.search.input_offset import OFFSETS, moved_nuisance, offsets_are_evident
+from femsense.loop.search.input_offset import moved_nuisance, offsets_are_evident
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import Thresholds
 from femsense.model.as_it_is import evaluate_robot
@@ -127,29 +127,14 @@ class HeldOutComparison:
     """Decrease of χ²."""
     beyond_mesh: float
     """Ratio of the errors after the most likely discretisation error is subtracted."""
-    error_to_base: float
-    """Ratio of its error to that of the model with all nuisance effects."""
     only_calibrated: bool
     """Whether it contains nuisance effects only."""
-    with_offsets: bool = False
-    """Whether these include input offsets."""
 
     def holds(self, thresholds: Thresholds) -> bool:
-        """Return whether the held-out data accept the model.
-
-        They do if its error does not exceed the declared model's by more than `not_worse`. Otherwise χ² must fall (by `evidence` for calibration alone), and
-        either it is calibration alone and the ratio is below `noisy`, or only the discretisation error makes it larger: the errors without it, and relative
-        to the fully calibrated model, are within `not_worse`, and it is not a calibration with input offsets.
-        """
-        if self.error <= thresholds.not_worse:
-            return True
-        if self.gain <= (thresholds.evidence if self.only_calibrated else 0.0):  # effects have already passed a held-out test
-            return False
-        if self.only_calibrated and self.error <= thresholds.noisy:
-            return True
-        only_offsets = self.only_calibrated and self.with_offsets  # many missing effects resemble input offsets
-        shown = not only_offsets and self.error_to_base <= thresholds.not_worse
-        return shown and self.beyond_mesh <= thresholds.not_worse
+        """Return whether the held-out data accept the model: its error does not exceed the declared model's by more than `not_worse`; or, if only the
+        discretisation error makes it larger, the error without that does not, and χ² falls (by `evidence` for calibration alone)."""
+        least = thresholds.evidence if self.only_calibrated else 0.0  # effects have already passed a held-out test
+        return self.error <= thresholds.not_worse or (self.gain > least and self.beyond_mesh <= thresholds.not_worse)
 
 
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
@@ -160,9 +145,7 @@ def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
         error=back.held_rms / search.before.held_rms,
         gain=held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise),
         beyond_mesh=after / before,
-        error_to_base=back.held_rms / search.base.held_rms,
         only_calibrated=not has_effects(names),
-        with_offsets=OFFSETS in names,
     )
     return compared.holds(data.thresholds)
 

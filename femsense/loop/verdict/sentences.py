@@ -12,13 +12,15 @@ from femsense.loop.fit.discretisation_error import mesh_error_rms, mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
-from femsense.loop.result.records import AllRecordings, ModelError, NamedEffect, Value
+from femsense.loop.result.records import AllRecordings, ConfoundedPair, ModelError, NamedEffect, Value, alternatives
 from femsense.loop.search.search_state import Search
-from femsense.loop.thresholds import DEFAULTS, Thresholds
+from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
 MOST_LISTED = 3
 """Maximum number of effects that are listed."""
+AT_NOISE = 1.15
+"""Ratio of the held-out error to the noise up to which the sentence calls the model a fit to the noise."""
 ROUNDED = 1e-6
 """Components below this share of the largest one of a vector, or of their standard deviation, are written as 0."""
 
@@ -30,15 +32,16 @@ def verdict_in_words(
     before: FittedModel,
     after: FittedModel,
     budget: ModelError,
-    thresholds: Thresholds = DEFAULTS,
+    pairs: Sequence[ConfoundedPair] = (),
 ) -> str:
-    """Return the verdict as a sentence, with the held-out error and the share of model error in it."""
+    """Return the verdict as a sentence, with the held-out error and the share of model error in it. An effect that these data do not distinguish from others
+    is followed by these."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= thresholds.noisy * np.hypot(known, mesh):
+    if verdict == NONE and before.held_rms <= AT_NOISE * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        own = finer if mesh and before.held_rms > thresholds.noisy * known else ""
+        own = finer if mesh and before.held_rms > AT_NOISE * known else ""
         return f"The model fits the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
     of_it = f"of which {1e3 * budget.held_out_m:.2f} mm is model error and {_noise_in_words(budget)} noise"
     if verdict == NONE:
@@ -53,10 +56,16 @@ def verdict_in_words(
         for name, size in ((MESH.name, mesh), ("places of markers", budget.placement_m))
         if size > 5e-6
     )
-    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
+    others = alternatives(pairs, [e.name for e in effects])
+    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)}{_or(others.get(e.name, ()))})" for e in effects)
     tail = "" if verdict == FOUND else " A residual remains that no effect fits."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
+
+
+def _or(others: Sequence[str]) -> str:
+    """Return the effects that these data do not distinguish from an accepted one, in words."""
+    return f"; not distinguished from {' or '.join(others)}" if others else ""
 
 
 def _noise_in_words(budget: ModelError) -> str:
@@ -112,8 +121,8 @@ def evidence_for(data: Data, found: list[str], insignificant: list[str]) -> str:
 
 def by_noise(data: Data, measured: Repeatability) -> str:
     """Return a sentence if the noise exceeds that of any camera; else empty."""
-    reach, thresholds = data.robot.body.reach, data.thresholds
-    if measured.total < thresholds.significant * thresholds.resolved * reach:
+    reach = data.robot.body.reach
+    if measured.total < data.thresholds.relevant * reach:
         return ""
     return (
         f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is larger than that of any camera: repeated frames differ."

@@ -21,7 +21,7 @@ from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
 from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
-from femsense.loop.verdict.confounding import confounded, in_words
+from femsense.loop.verdict.confounding import confounded
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.report_data import gather
 from femsense.loop.verdict.residual_diagnostics import describe_left, frame_errors, structure_tests
@@ -87,8 +87,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     budget = model_error(data, excess, noise, measured)
     return LoopResult(
         verdict=verdict,
-        sentence=verdict_in_words(verdict, effects, found, before, back, budget, data.thresholds)
-        + in_words(pairs, names, data.thresholds)
+        sentence=verdict_in_words(verdict, effects, found, before, back, budget, pairs)
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)

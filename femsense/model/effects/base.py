@@ -205,6 +205,9 @@ class Effect:
     """(declared robot) → whether every such body has it, though the robot does not declare it."""
     prior_cost: Callable[[Robot, FloatArray], float] = lambda robot, coordinates: 0.0
     """(declared robot, its coordinates) → −2 log of how likely they are beforehand, 0 at best."""
+    plausible: Callable[[Robot, FloatArray], bool] = lambda robot, coordinates: True
+    """(declared robot, its coordinates) → whether it is accepted where another effect serves as well, or where the model error remains that
+    it may make up for."""
     may_differ: bool = False
     """Whether its values may differ from recording to recording (`per = "recording"`)."""
     sought_by_recording: bool = True

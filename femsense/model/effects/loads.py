@@ -13,6 +13,8 @@ STANDARD_GRAVITY = 9.80665
 """[m/s²]."""
 SIZE = KnownLength(STANDARD_GRAVITY, 0.1)
 """Size of gravity on an unknown site [m/s²]."""
+LIFTED = 0.5
+"""Cosine to the vertical beyond which a force lifts: an undeclared load is a weight, or a hose that pulls sideways."""
 MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
 
@@ -53,6 +55,12 @@ def _apply_weight(robot: Robot, entry: Entry) -> Robot:
 
 def _payload_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return tuple(Parameter("force_n", i, "N", 0.0, -20.0, 20.0, 1e-3, plausible=0.05) for i in range(3))
+
+
+def _does_not_lift(declared: Robot, fitted: FloatArray) -> bool:
+    """Return whether a load is none that pulls upwards."""
+    down, force = declared.body.gravity, fitted[:3]
+    return bool(down @ force >= -LIFTED * np.linalg.norm(down) * np.linalg.norm(force))
 
 
 def _payload_places(robot: Robot) -> tuple[Entry, ...]:
@@ -127,4 +135,5 @@ PAYLOAD = Effect(
     polish=place_polish,
     nearby=places_nearby,
     told_by=Experiment.TURN_THE_BASE,
+    plausible=_does_not_lift,
 )

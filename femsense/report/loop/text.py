@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from femsense.loop.result.loop_result import NONE, Loop
@@ -15,6 +15,7 @@ from femsense.loop.result.records import (
     Untestable,
     Value,
     WorstMarker,
+    alternatives,
 )
 from femsense.report.text import columns
 from femsense.report.words import VERDICTS, known
@@ -28,8 +29,9 @@ def loop_text(loop: Loop) -> str:
     words = loop.sentence or VERDICTS.get(loop.verdict)
     lines = [f"verdict: {loop.verdict}" + (f" ({words})" if words else "")]
     lines.append(columns(_rows(loop)))
+    others = alternatives(loop.confounded, [effect.name for effect in loop.effects])
     for effect in loop.effects:
-        lines += ["", effect_text(effect)]
+        lines += ["", effect_text(effect, others.get(effect.name, ()))]
     for name, parameters in loop.fitted_along.items():
         lines += ["", f"{name} (fitted along, part of the improved robot, not named)", _values(parameters)]
     for title, said in (
@@ -44,13 +46,15 @@ def loop_text(loop: Loop) -> str:
     return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
 
 
-def effect_text(effect: NamedEffect) -> str:
-    """Return an effect that was found: its name, parameters with one standard deviation, and what it changed."""
+def effect_text(effect: NamedEffect, others: Sequence[str] = ()) -> str:
+    """Return an effect that was found: its name with those that the data do not distinguish from it, parameters with one standard deviation, and what it
+    changed."""
     rows = _value_rows(effect.parameters)
     before, after = effect.validation_rms_before_m, effect.validation_rms_after_m
     if known(before) and known(after):
         rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
-    return f"{effect.name}\n{columns(rows)}"
+    title = " or ".join([effect.name, *others]) + (": these data do not distinguish them" if others else "")
+    return f"{title}\n{columns(rows)}"
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import find_effect
 
 
-@pytest.mark.parametrize(("height", "on"), [(0.009, True), (0.0105, True), (0.0115, False), (-0.02, False)])
+@pytest.mark.parametrize(("height", "on"), [(0.009, True), (0.0105, True), (0.0125, False), (-0.02, False)])
 def test_a_load_hangs_on_the_body_or_hardly_beside_it(height: float, on: bool) -> None:
     robot = arm((4, 1, 1))  # 20 mm high, 100 mm long
     payload = find_effect("payload")

@@ -11,10 +11,11 @@ from arm import arm
 from fitted_arm import fitted_arm
 
 from femsense.fem.mesh import to_linear
-from femsense.loop.result.records import ModelError, NamedEffect, Value
+from femsense.loop.result.records import ConfoundedPair, ModelError, NamedEffect, Value
 from femsense.loop.verdict import sentences
 from femsense.model.effects import find_effect
 from femsense.model.remeshing import robot_on_mesh
+from femsense.report.loop.text import effect_text
 
 
 def budget(own: float, noise: float, *, measured: bool = True, mesh: float | None = None, note: str = "") -> ModelError:
@@ -42,6 +43,21 @@ def test_how_much_of_the_error_is_the_model_s_own_is_said_first() -> None:
     assert said("effects", 8.9, budget(8.8, 0.2, note="it is huge"), [stiff]).endswith(
         "discretisation error is unknown: it is huge."
     )
+
+
+def test_an_effect_is_followed_by_those_that_the_data_do_not_distinguish_from_it() -> None:
+    fitted = fitted_arm(arm((4, 2, 2)), 1.0)[1]
+    effects = [
+        NamedEffect("stiffness", {"scale": Value(0.8, 0.02, "1")}),
+        NamedEffect("density", {"scale": Value(0.7, 0.02, "1")}),
+    ]
+    pairs = [ConfoundedPair(("payload", "density"), dbic_gap=74.0), ConfoundedPair(("stiffness", "density"), dbic_gap=1.0)]
+    sentence = sentences.verdict_in_words("effects", effects, [], fitted, fitted, budget(0.0, 0.2), pairs)
+    assert sentence.startswith(
+        "The model lacks stiffness (scale 0.8), density (scale 0.7; not distinguished from payload); held-out error"
+    )
+    assert effect_text(effects[1], ["payload"]).startswith("density or payload: these data do not distinguish them\n")
+    assert effect_text(effects[0]).startswith("stiffness\n")
 
 
 @pytest.mark.parametrize("error, mesh, expected", [(0.5, None, False), (0.5, 1.0, False), (0.9, 1.0, True)])
