@@ -320,12 +320,13 @@ class _Fit:
         return result
 
     def rows(self, seen: _Seen, poses: Sequence[FloatArray]) -> tuple[RayRows, FloatArray]:
-        """Return the rows of a frame and their change with the parameters, shape (r, c), without rows on clamped nodes alone: what holds them hides them,
-        and lies where they should be or before."""
+        """Return the rows of a frame and their change with the parameters, shape (r, c). Rows on clamped nodes alone count only where inputs are
+        fitted too, which nothing else separates from poses: what holds them hides them, and lies where they should be or before."""
         mesh = self.robot.body.mesh
         size, held = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))), np.zeros(len(mesh.nodes), dtype=bool)
         held[self.robot.body.clamped] = True
-        rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * size).off(held)
+        rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * size)
+        rows = rows if self.fits_inputs else rows.off(held)
         by_input = -(rows.operator(len(mesh.nodes)) @ seen.moves.reshape(len(seen.moves), 3 * len(mesh.nodes)).T)
         return rows, np.hstack([rows.by_pose(pose_pivot(self.robot), len(poses)), by_input])
 
