@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from femsense import Calibration, DataError, Recording, Robot, apply_effects, calibrate, load_recording, load_robot
 from femsense.calib.cloud_pose_search import View, difference, settle_cloud_pose
 from femsense.calib.clouds_alone import START_STD
-from femsense.calib.from_clouds import measured_noises, refine_poses
+from femsense.calib.from_clouds import fit_clouds, measured_noises
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray
 from femsense.io.clouds.frame_clouds import read_frame_cloud
@@ -56,7 +56,7 @@ def from_nominal(robot: Robot, recording: Recording, nominal: FloatArray) -> tup
     declared = calibrate(robot, replace(recording, T_robot_camera=(near,), free=None))  # unjudged: it is only a start
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     start = np.diag([START_STD[0] ** 2] * 3 + [(START_STD[1] * size) ** 2] * 3)
-    found = refine_poses(robot, recording, replace(declared, joint_covariance=start), guessed=(0,))
+    found = fit_clouds(robot, recording, replace(declared, joint_covariance=start), guessed=(0,))
     scan = read_scan(robot, recording, 0, found.poses, state)
     assert scan is not None
     held = np.zeros(len(state), dtype=bool)

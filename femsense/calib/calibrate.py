@@ -18,11 +18,10 @@ from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.declared_by_clouds import check_declared_by_clouds, views_to_check
 from femsense.calib.declared_poses import Fitted, check_declared_poses
 from femsense.calib.first_poses import first_poses
-from femsense.calib.from_clouds import free_clouds, pose_pivot, refine_poses
+from femsense.calib.from_clouds import fit_clouds
 from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.input_checks import check_inputs
 from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
-from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, moved_by_law, root_mean_square
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.marker_scale import check_marker_scale
@@ -107,21 +106,13 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     else:
         by_markers = as_declared(robot, seen, chosen)
     if by_clouds:
-        by_markers = placed_by_clouds(robot, recording, by_markers, by_clouds)
-    found = _beside_clouds(robot, recording, by_markers, by_clouds, named=bool(len(seen.marker_frame)))
+        found = placed_by_clouds(robot, recording, by_markers, by_clouds)
+    elif len(seen.marker_frame) or recording.actuation_zero == "unknown":
+        found = fit_clouds(robot, recording, by_markers)
+    else:
+        found = by_markers
     check_declared_by_clouds(robot, recording, found, views_to_check(recording, seen.marker_view))
     return found
-
-
-def _beside_clouds(
-    robot: Robot, recording: Recording, found: Calibration, by_clouds: Sequence[int], *, named: bool
-) -> Calibration:
-    """Return the calibration with what the clouds of free frames say of poses and of unknown initial inputs."""
-    if not named and recording.actuation_zero == "unknown" and robot.body.cables:
-        return _with_std(robot, with_initial_inputs(robot, recording, found))
-    if by_clouds:
-        return _with_std(robot, found)
-    return _with_clouds(robot, recording, found) if named else found
 
 
 def _by_markers(robot: Robot, recording: Recording, chosen: IntArray) -> Calibration:
@@ -307,20 +298,6 @@ def _result(
         marker_covariance=fit.covariance,
         law_step=law_step,
     )
-
-
-def _with_clouds(robot: Robot, recording: Recording, by_markers: Calibration) -> Calibration:
-    """Return the calibration with poses and unknown initial inputs to which the clouds of free frames have their say."""
-    known = by_markers.marker_covariance
-    inputs_open = recording.actuation_zero == "unknown" and bool(robot.body.cables)
-    if inputs_open and free_clouds(recording) and np.isfinite(known).all() and known.any():
-        return _with_std(robot, with_initial_inputs(robot, recording, by_markers, known))
-    fitted = refine_poses(robot, recording, by_markers)
-    return by_markers if fitted is by_markers else _with_std(robot, fitted)
-
-
-def _with_std(robot: Robot, fitted: Calibration) -> Calibration:
-    return replace(fitted, pose_std=std_of_entries(fitted.poses[0], fitted.pose_covariance, pose_pivot(robot)))
 
 
 def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.cloud_pose_search import View, find_cloud_pose
 from femsense.calib.first_poses import in_line
-from femsense.calib.from_clouds import refine_poses
+from femsense.calib.from_clouds import START_STD, fit_clouds
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
@@ -27,9 +27,6 @@ from femsense.pointcloud.segmentation import color_mask
 
 FRAMES = 3
 """Free frames in which a pose is sought, those under the most different inputs."""
-START_STD = (0.1, 0.03)
-"""What the search is off by at most: [rad], and as a share of the body's diagonal;
-three times what benchmarks/calibration.py finds."""
 UNDETERMINED = 0.5
 """A direction is not determined where the clouds leave this share of START_STD."""
 
@@ -72,9 +69,10 @@ def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibratio
     start = started_at(
         robot, calibration, {v: find_cloud_pose(seen_by(robot, recording, states, v)).T_robot_camera for v in views}
     )
-    fitted = refine_poses(robot, recording, start, guessed=views)
+    fitted = fit_clouds(robot, recording, start, guessed=views)
     _check_determined(recording, start, fitted, views)
-    return replace(fitted, status="converged (cameras placed by clouds alone)")
+    inputs_too = recording.actuation_zero == "unknown" and bool(robot.body.cables) and not calibration.marker_covariance.any()
+    return fitted if inputs_too else replace(fitted, status="converged (cameras placed by clouds alone)")
 
 
 def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatArray]) -> Calibration:

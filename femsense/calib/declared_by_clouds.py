@@ -15,10 +15,8 @@ from femsense.calib.checks import EXPLAINED, SUSPICIOUS
 from femsense.calib.cloud_pose_search import LEAST, search_cloud_poses, settle_cloud_pose
 from femsense.calib.clouds_alone import free_states, seen_by, started_at
 from femsense.calib.declared_poses import DECLARED_STD, said
-from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot, refine_poses
+from femsense.calib.from_clouds import fit_clouds, free_clouds, measured_noises, pose_pivot
 from femsense.calib.inputs import calibrated_inputs
-from femsense.calib.inputs_from_clouds import with_initial_inputs
-from femsense.calib.residual_field import CELL
 from femsense.calib.scan import REACH, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
@@ -35,6 +33,8 @@ KNOWN = 4.48
 stay below that in 99.7 of 100 cases (chi-squared)."""
 ALLOWED = 2.0
 """… and it is said where turn or shift are so many of `DECLARED_STD`: what is less, free frames tell `estimate`."""
+CELL = 0.1
+"""Parts of the body at rest, as a share of its diagonal."""
 FRAMES = 4
 """Free frames that tell."""
 MODULUS = 3.0
@@ -116,9 +116,7 @@ def _fitted(robot: Robot, recording: Recording, found: Calibration, view: int) -
         near = max([near, *search_cloud_poses(views)[:1]], key=lambda pose: pose.gain)
     start = started_at(robot, found, {view: near.T_robot_camera})
     try:
-        if recording.actuation_zero == "unknown" and robot.body.cables and not len(recording.marker_frame):
-            return with_initial_inputs(robot, opened, start)
-        return refine_poses(robot, opened, start, guessed=(view,))
+        return fit_clouds(robot, opened, start, guessed=(view,))
     except DataError:
         return None
 

@@ -1,72 +1,431 @@
-"""Pose of the cameras and noise of their depth from the clouds of free frames, together with what markers say.
+"""Poses of the cameras and initial inputs of the cables from the clouds of contact-free frames, together with what markers say.
 
-The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a
-Gauss–Newton fit; the fit to the markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so clouds know
-what points know under a field along the surface (`residual_field`), and count beside markers by that.
+Parameters: a step of each pose and the initial inputs, with the Gaussian prior that markers, or a start, leave. The residual of each point lies along
+the normal of the surface that its ray meets. Gauss–Newton: the posterior mean of the linearised problem is the next point, with new states, rays and
+weights. Neighbouring residuals err together (mesh, law), so clouds know what points know under a smooth field along the surface (`residual_field`).
+A cable moves the whole body: a change of input looks like a change of pose in one frame alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import brentq, lsq_linear
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.inputs import calibrated_inputs
+from femsense.calib.inputs import calibrated_inputs, first_inputs, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.other_law import with_other_law
 from femsense.calib.residual_field import field_scores, row_weights
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
-from femsense.core.arrays import BoolArray, FloatArray, freeze
-from femsense.core.errors import FemsenseError
-from femsense.core.pose import moved_poses
-from femsense.fem.equilibrium import Equilibrium
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import DataError, FemsenseError
+from femsense.core.pose import moved_poses, std_of_entries
 from femsense.model.camera import CameraNoise
 from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import how_to_free
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 
-FRAMES = 12
-"""More free frames than this are thinned out evenly."""
-STEPS = 6
+FRAMES, FRAMES_WITH_INPUTS = 12, 6
+"""More free frames than this are thinned out evenly; fewer where each needs a state for every input."""
+STEPS = 12
 """Gauss–Newton steps at most; rays and weights are new in each."""
+DERIVATIVES = 3
+"""In so many first steps the derivative by the inputs is new; in the first one where markers tell them nearly."""
+STEP = {"tension": 1e-2, "displacement": 1e-4}
+"""Difference for the derivative by an input [N] or [m]."""
+START_STD = (0.1, 0.03)
+"""What a pose is off by at most that a search has found: [rad], and as a share of the body's diagonal; three times what benchmarks/calibration.py finds."""
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1)
 """Of a step, in units of what the best known direction is held by."""
 LOST = 0.01
 """A step may lose this share of the points that lie on the body: rays at a silhouette come and go."""
+FEWEST = 30
+"""Fewer rays that meet the body in all frames say nothing of its pose."""
+STILL = 0.02
+"""A fit has converged where no parameter goes farther, in its standard deviations."""
 USUAL = CameraNoise("stereo", at_1m=0.002)
 """A camera of which nothing is known: the D415 at its default setting."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Seen:
-    """A free frame."""
-
-    scan: Scan
-    state: Equilibrium
-    surface: Surface
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RaySums:
-    """Normal equations of the rows of all frames."""
-
-    normal: FloatArray
-    """JᵀJ, shape (p, p)."""
-    right: FloatArray
-    """Jᵀr, shape (p,)."""
-    rms: float
-    """Root mean square of the residual [m]."""
-    explained: float = 0.0
-    """How many points lie on the body: 1 for one on it, 0 for one that is REACH off [1]."""
 
 
 def pose_pivot(robot: Robot) -> FloatArray:
     """Return the point about which pose steps turn [m], shape (3,): the markers' mean, the body's where there are none."""
     return np.asarray(robot.marker_points.mean(axis=0) if len(robot.marker_points) else robot.body.mesh.nodes.mean(axis=0))
+
+
+def free_clouds(recording: Recording, most: int = FRAMES) -> list[int]:
+    """Return the frames that are free and have a cloud, evenly thinned out."""
+    if recording.free is None or not recording.has_clouds:
+        return []
+    free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
+    return [free[i] for i in np.unique(np.linspace(0, len(free) - 1, most).round().astype(int))] if free else []
+
+
+def fit_clouds(robot: Robot, recording: Recording, calibration: Calibration, *, guessed: Sequence[int] = ()) -> Calibration:
+    """Return the calibration with undeclared poses, and initial inputs whose zero is unknown, moved to where the clouds of free frames see the body.
+
+    Arguments:
+        robot, recording: as loaded.
+        calibration: of the markers, or a start; its covariances are the prior (zero: nothing is known but the start).
+        guessed: cameras whose pose is a start that nothing measured: its covariance is a bound, and pulls no answer of the clouds back.
+
+    Returns:
+        the calibration with poses, inputs, their covariance, and `normal_rms_m`; as it was where no free frame shows the body.
+
+    Raises:
+        DataError: initial inputs that no marker tells, and no free frame shows the body.
+    """
+    unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
+    alone = unknown and not calibration.marker_covariance.any()
+    if not free_clouds(recording) and alone:
+        raise DataError(
+            "initial inputs without markers need clouds of free frames: mark frames in which nothing touches the robot "
+            f"{how_to_free(recording)}"
+        )
+    if not free_clouds(recording) or not (unknown or len(_moving(recording))):
+        return calibration
+    p, a = 6 * len(calibration.poses), len(robot.body.cables) if unknown else 0
+    law = np.zeros(p + a)
+    law[: len(calibration.law_step)] = calibration.law_step[: len(law)]
+    prior, loose = _prior_of_poses(robot, recording, calibration.joint_covariance - np.outer(law[:p], law[:p]), guessed)
+    inputs = None
+    if unknown:
+        inputs = first_inputs(robot, recording) if alone else calibrated_inputs(robot, recording, calibration)
+        prior = _with_inputs(robot, recording, calibration, prior, guessed)
+    loose = np.append(loose, np.full(a, alone))
+    fit = _Fit(robot, recording, measured_noises(robot, recording, calibration), inputs, prior, loose, law)
+    try:
+        end = fit.end(calibration.poses, inputs, np.zeros(p + a))
+    except DataError:
+        if alone:
+            raise
+        return calibration
+    return fit.calibrated(calibration, end, alone=alone)
+
+
+def _with_inputs(
+    robot: Robot, recording: Recording, calibration: Calibration, poses: FloatArray, guessed: Sequence[int]
+) -> FloatArray:
+    """Return the prior covariance of pose steps and initial inputs: what markers say of both, beside that no input crushes the body."""
+    p, a = len(poses), len(robot.body.cables)
+    prior = block_diag(poses, largest_input(robot, recording.actuation) ** 2 * np.eye(a))
+    known = calibration.marker_covariance
+    if not known.any() or not np.isfinite(known).all():
+        return np.asarray(prior)
+    marked = [c for c in _moving(recording) if c // 6 not in guessed]
+    if len(marked) + a != len(known):  # poses that the markers were fitted with are declared here
+        known, marked = known[-a:, -a:], []
+    own = np.append(np.array(marked, dtype=np.int64), np.arange(p, p + a))
+    wide = known[-a:, -a:] + prior[p:, p:]
+    prior[np.ix_(own, own)] = known - known[:, -a:] @ np.linalg.solve(wide, known[-a:])
+    return np.asarray(prior)
+
+
+def _moving(recording: Recording) -> IntArray:
+    """Return the coordinates of undeclared poses."""
+    return np.flatnonzero(np.repeat([T is None for T in recording.T_robot_camera], 6))
+
+
+def _prior_of_poses(
+    robot: Robot, recording: Recording, covariance: FloatArray, guessed: Sequence[int]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the prior covariance of pose steps, and which of them only bounds a step, shapes (6 v, 6 v) and (6 v,): of cameras that are guessed,
+    and of those of which nothing is known."""
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    prior, loose = np.zeros_like(covariance), np.zeros(len(covariance), dtype=bool)
+    moving = _moving(recording)
+    prior[np.ix_(moving, moving)] = covariance[np.ix_(moving, moving)]
+    for v in np.unique(moving // 6).tolist():
+        own = slice(6 * v, 6 * v + 6)
+        unknown = not (np.isfinite(prior[own, own]).all() and (np.diag(prior[own, own]) > 0).all())
+        if unknown:
+            prior[own, :], prior[:, own] = 0.0, 0.0
+            prior[own, own] = np.diag(np.repeat([START_STD[0], START_STD[1] * size], 3) ** 2)
+        loose[own] = unknown or v in guessed
+    return prior, loose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """A free frame at a point."""
+
+    scan: Scan
+    surface: Surface
+    moves: FloatArray
+    """Change of the nodes with each initial input, shape (a or 0, n, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _End:
+    """Where a fit ended."""
+
+    poses: tuple[FloatArray, ...]
+    inputs: FloatArray | None
+    """Initial inputs, shape (a,)."""
+    gone: FloatArray
+    """How far poses and inputs went, shape (c,)."""
+    covariance: FloatArray
+    """Of them, shape (c, c)."""
+    scores: FloatArray
+    """Rows whose sum of squares is the covariance of the gradient, shape (g, c), see `field_scores`."""
+    rms: float
+    """Root mean square residual of the robot's pixels [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fit:
+    """Poses and, where the prior speaks of them, initial inputs."""
+
+    robot: Robot
+    recording: Recording
+    noises: tuple[CameraNoise, ...]
+    inputs: FloatArray | None
+    """Initial inputs at the start, shape (a,); None where the zero is known."""
+    prior: FloatArray
+    """Covariance of pose steps, and of steps of the initial inputs where they are fitted, about the start, shape (c, c)."""
+    loose: BoolArray
+    """Of which coordinates the start is a guess, shape (c,): their prior bounds a step, and pulls nothing back."""
+    law: FloatArray
+    """By how much another law moves what is known before, shape (c,)."""
+
+    @property
+    def fits_inputs(self) -> bool:
+        return len(self.prior) > 6 * len(self.recording.T_robot_camera)
+
+    def calibrated(self, calibration: Calibration, end: _End, *, alone: bool) -> Calibration:
+        """Return the calibration with what the clouds say; alone: no marker speaks of the initial inputs."""
+        p, robot = 6 * len(calibration.poses), self.robot
+        moved = self.moved_by_law(end)
+        covariance = end.covariance + np.outer(moved, moved)
+        fitted = replace(
+            calibration,
+            T_robot_camera=freeze(end.poses[0]),
+            poses=tuple(freeze(T) for T in end.poses),
+            pose_covariance=freeze(covariance[:6, :6]),
+            pose_std=std_of_entries(end.poses[0], covariance[:6, :6], pose_pivot(self.robot)),
+            joint_covariance=freeze(covariance[:p, :p]),
+            law_step=freeze(np.append(moved[:p], calibration.law_step[p:])),
+            normal_rms_m=end.rms,
+        )
+        if not self.fits_inputs:
+            return fitted
+        tables = input_tables(robot, self.recording, end.inputs, covariance[p:, p:])
+        own = tables.tension_std if self.recording.actuation == "tension" else tables.displacement_std
+        weak = weak_inputs(self.recording, own)
+        found, what = ("converged (initial inputs by clouds alone)", "the clouds") if alone else ("converged", "these data")
+        used = self.recording.frame_numbers[free_clouds(self.recording, FRAMES_WITH_INPUTS)]
+        return replace(
+            fitted,
+            status=f"{found}, but {what} hardly determine the initial input of {weak}" if weak else found,
+            cable_tension_n=tables.tension,
+            cable_displacement_m=tables.displacement,
+            tension_std_n=tables.tension_std,
+            displacement_std_m=tables.displacement_std,
+            frames=tuple(map(int, used)) if alone else calibration.frames,
+        )
+
+    def end(
+        self,
+        poses: Sequence[FloatArray],
+        inputs: FloatArray | None,
+        gone: FloatArray,
+        scores: FloatArray | None = None,
+    ) -> _End:
+        """Return where Gauss–Newton leads; `scores` where they are known: at first each point errs on its own.
+
+        A flat side that faces the camera hardly says where it lies in its plane, and a step may leave it. Steps are damped until no
+        more points than a few are lost (Levenberg 1944), those directions first that are known least.
+        """
+        poses = tuple(poses)
+        p = 6 * len(poses)
+        frames, blocks = self.at(poses, inputs, {}, 0)
+        settled, begun = scores is not None, (poses, inputs, gone)
+        for step in range(STEPS):
+            mean, explained = -np.where(self.loose, 0.0, gone), self.explained(blocks)
+            for damping in DAMPINGS:
+                said = self.posterior(blocks, mean, scores, damping)
+                change = self._within_bounds(said, inputs)
+                tried = tuple(moved_poses(poses, change[:p], pose_pivot(self.robot)))
+                pulled = inputs + change[p:] if inputs is not None and self.fits_inputs else inputs
+                there = self.at(tried, pulled, frames, step + 1)
+                if self.explained(there[1]) >= (1.0 - LOST) * explained:
+                    poses, inputs, gone, (frames, blocks) = tried, pulled, gone + change, there
+                    break
+            else:
+                change = np.zeros(len(gone))
+            if (np.abs(change) <= STILL * np.linalg.norm(said.root, axis=1)).all() or step == STEPS // 2 - 1:
+                if settled:
+                    break
+                scores, settled = field_scores(blocks, self.robot.body.mesh.nodes), True
+                if self.loose.any():  # nothing but a start holds the clouds: what they share changes how well they know, not what
+                    break
+                poses, inputs, gone = begun  # a step back to the markers would lose points: the second way leads from there, too
+                frames, blocks = self.at(poses, inputs, frames, step + 1)
+        assert scores is not None
+        root = self.posterior(blocks, mean, scores, 0.0).root
+        squares, count = sum(float((rows.residual**2).sum()) for rows, _ in blocks), sum(len(rows.residual) for rows, _ in blocks)
+        return _End(poses, inputs, gone, root @ root.T, scores, float(np.sqrt(squares / max(count, 1))))
+
+    def at(
+        self, poses: Sequence[FloatArray], inputs: FloatArray | None, before: dict[int, _Seen], step: int
+    ) -> tuple[dict[int, _Seen], list[tuple[RayRows, FloatArray]]]:
+        """Return the free frames at a point, and their rows. Raises DataError where hardly a ray meets the body at the start."""
+        frames = self.frames(poses, inputs, before, step)
+        blocks = [self.rows(seen, poses) for seen in frames.values()]
+        if step == 0 and sum(len(rows.residual) for rows, _ in blocks) < FEWEST:
+            raise DataError("the clouds of the free frames do not show the body")
+        return frames, blocks
+
+    def explained(self, blocks: Sequence[tuple[RayRows, FloatArray]]) -> float:
+        """Return how many points lie on the body: 1 for one on it, 0 for one that is REACH off [1]."""
+        reach = REACH * float(np.linalg.norm(np.ptp(self.robot.body.mesh.nodes, axis=0)))
+        return sum(float((1.0 - (rows.residual / reach) ** 2).sum()) for rows, _ in blocks)
+
+    def moved_by_law(self, end: _End) -> FloatArray:
+        """Return where a fit under the other law ends that begins where this one ended, shape (c,). What all cables have in common
+        compresses the body, and laws that agree for small strains differ there. 0 where the robot declares a law by an effect."""
+        other = with_other_law(self.robot)
+        if other is None:
+            return np.zeros(len(self.prior))
+        gone = end.gone - self.law  # from where the other law leads what is known before
+        try:
+            there = replace(self, robot=other).end(end.poses, end.inputs, gone, end.scores)
+        except DataError:
+            return np.zeros(len(self.prior))
+        return np.asarray(there.gone - gone)
+
+    def frames(
+        self, poses: Sequence[FloatArray], inputs: FloatArray | None, before: dict[int, _Seen], step: int
+    ) -> dict[int, _Seen]:
+        """Return the free frames: states anew where inputs change, and clouds and derivatives in the first steps."""
+        if before and not self.fits_inputs:
+            return before
+        states = self._states(inputs)
+        moves = {k: seen.moves for k, seen in before.items()}
+        if step < (DERIVATIVES if self.loose.any() else 1):
+            moves = self._moves(inputs, states)
+        result, triangles = dict[int, _Seen](), body_surface(self.robot.body.mesh).triangles
+        for k, positions in states.items():
+            scan = before[k].scan if step > 1 and k in before else self._scan(k, poses, positions)
+            if scan is not None and k in moves:
+                result[k] = _Seen(scan, Surface(positions, triangles), moves[k])
+        if sum(len(seen.scan.view) for seen in result.values()) < FEWEST:
+            raise DataError("the clouds of the free frames do not show the body")
+        return result
+
+    def rows(self, seen: _Seen, poses: Sequence[FloatArray]) -> tuple[RayRows, FloatArray]:
+        """Return the rows of a frame and their change with the parameters, shape (r, c). Rows on clamped nodes alone count only where inputs are
+        fitted too, which nothing else separates from poses: what holds them hides them, and lies where they should be or before."""
+        mesh = self.robot.body.mesh
+        size, held = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))), np.zeros(len(mesh.nodes), dtype=bool)
+        held[self.robot.body.clamped] = True
+        rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * size)
+        rows = rows if self.fits_inputs else rows.off(held)
+        by_input = -(rows.operator(len(mesh.nodes)) @ seen.moves.reshape(len(seen.moves), 3 * len(mesh.nodes)).T)
+        return rows, np.hstack([rows.by_pose(pose_pivot(self.robot), len(poses)), by_input])
+
+    def posterior(
+        self, blocks: Sequence[tuple[RayRows, FloatArray]], mean: FloatArray, scores: FloatArray | None, damping: float
+    ) -> _Posterior:
+        """Return what prior and points say of the next step.
+
+        The estimate of the points alone is that of least squares, −N⁻¹ g. Its information is Godambe's, N S⁻¹ N, with the covariance S ≥ N of the gradient
+        under noise and a smooth field (White 1982): nothing but N where `scores` are unknown.
+
+        Points and markers that are farther apart than both allow err by more than is known (lens, model); the points then count by so much less that
+        their distance is to be expected (Mandel & Paule 1970).
+
+        Arguments:
+            mean: of the prior, shape (c,).
+            damping: of the step, in units of what the best known direction is held by.
+        """
+        values, vectors = np.linalg.eigh(self.prior)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        root = root[:, values > 1e-14 * values.max()]
+        N, g = np.zeros((root.shape[1],) * 2), np.zeros(root.shape[1])
+        for rows, derivative in blocks:
+            J, weight = derivative @ root, row_weights(rows) / rows.std**2
+            N += (J * weight[:, None]).T @ J
+            g -= (J * weight[:, None]).T @ (rows.residual + derivative @ mean)
+        N += 1e-12 * max(float(np.trace(N)), 1e-300) * np.eye(len(N))
+        half = np.linalg.cholesky(N)
+        whitened = np.zeros((1, len(N))) if scores is None else np.linalg.solve(half, (scores @ root).T).T
+        errors, U = np.linalg.eigh(whitened.T @ whitened)
+        half = half @ U / np.sqrt(np.maximum(errors, 1.0))
+        known, V = np.linalg.eigh(half @ half.T)
+        known, apart = np.maximum(known, 0.0), V.T @ np.linalg.solve(N, g)
+        known *= _worth(known, apart) if scores is not None and not self.loose.any() else 1.0
+        back = root @ V
+        return _Posterior(mean + back @ (known / (1.0 + known + damping * known.max()) * apart), back / np.sqrt(1.0 + known))
+
+    def _scan(self, k: int, poses: Sequence[FloatArray], positions: FloatArray) -> Scan | None:
+        try:
+            return read_scan(self.robot, self.recording, k, poses, positions)
+        except FemsenseError:
+            return None
+
+    def _states(self, inputs: FloatArray | None) -> dict[int, FloatArray]:
+        """Return the nodes of the free frames under initial inputs [m]; a frame without an equilibrium is left out."""
+        driven = DrivenRobot(self.robot, drive_of(self.robot, self.recording, initial=inputs))
+        frames = free_clouds(self.recording, FRAMES_WITH_INPUTS if self.fits_inputs else FRAMES)
+        states = {k: state.positions for k, state in free_path(driven, frames)}
+        if not states:
+            raise DataError("no equilibrium in the free frames: are the inputs those of this robot?")
+        return states
+
+    def _moves(self, inputs: FloatArray | None, states: dict[int, FloatArray]) -> dict[int, FloatArray]:
+        """Return the change of the nodes of each frame with each initial input, shape (a, n, 3)."""
+        a, h = len(self.prior) - 6 * len(self.recording.T_robot_camera), STEP[self.recording.actuation]
+        near = [self._states(inputs + h * axis) for axis in np.eye(a)] if inputs is not None and a else []
+        return {
+            k: np.array([(one.get(k, positions) - positions) / h for one in near]).reshape(len(near), *positions.shape)
+            for k, positions in states.items()
+        }
+
+    def _within_bounds(self, said: _Posterior, inputs: FloatArray | None) -> FloatArray:
+        """Return the step, shape (c,), with inputs within their bounds: the likeliest one there."""
+        p, change, root = 6 * len(self.recording.T_robot_camera), said.mean, said.root
+        if inputs is None or not self.fits_inputs:
+            return change
+        low, high = (bound - inputs for bound in input_bounds(self.robot, self.recording))
+        if (change[p:] >= low).all() and (change[p:] <= high).all():
+            return change
+        own = np.flatnonzero(np.diag(self.prior) > 0.0)
+        information = np.linalg.cholesky(np.linalg.inv(root[own] @ root[own].T)).T
+        free = np.full(len(own) - len(inputs), np.inf)
+        box = (np.append(-free, low - 1e-12), np.append(free, high + 1e-12))
+        change = change.copy()
+        change[own] = lsq_linear(information, information @ change[own], bounds=box).x
+        return change
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Posterior:
+    """Of parameters."""
+
+    mean: FloatArray
+    """shape (c,)."""
+    root: FloatArray
+    """Of their covariance, shape (c, q)."""
+
+
+def _worth(values: FloatArray, apart: FloatArray) -> float:
+    """Return the share w by which information with eigenvalues λ counts beside a unit prior: Σ a² wλ/(1 + wλ) is at most its expectation."""
+
+    def excess(log: float) -> float:
+        known = np.exp(log) * values
+        return float((apart**2 * known / (1.0 + known)).sum()) - len(apart)
+
+    return 1.0 if excess(0.0) <= 0.0 else float(np.exp(brentq(excess, np.log(1e-12), 0.0)))
+
+
+# --- the noise of a camera -----------------------------------------------------------------------------------------------
 
 
 def measured_noises(robot: Robot, recording: Recording, calibration: Calibration) -> tuple[CameraNoise, ...]:
@@ -79,248 +438,21 @@ def measured_noises(robot: Robot, recording: Recording, calibration: Calibration
     declared = [camera.noise if camera is not None else None for camera in recording.cameras]
     if not recording.has_clouds or all(noise is not None for noise in declared):
         return tuple(noise or USUAL for noise in declared)
-    frames = _free_frames(robot, recording, calibration.poses, calibration)
-    return tuple(noise or _measured_noise(robot, frames, calibration.poses, view) for view, noise in enumerate(declared))
-
-
-def refine_poses(robot: Robot, recording: Recording, calibration: Calibration, *, guessed: Sequence[int] = ()) -> Calibration:
-    """Return the calibration with its undeclared poses moved to where the clouds of free frames see the body.
-
-    Arguments:
-        robot, recording: as loaded.
-        calibration: of the markers, or a start for the poses; its covariance is the prior (zero: nothing is known but the start).
-        guessed: cameras whose pose is a start that nothing measured: its covariance is a bound, and pulls no answer of the clouds back.
-
-    Returns:
-        the calibration with poses, their covariance, and `normal_rms_m`; as it was where no free frame has a cloud.
-    """
-    moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
-    frames = _free_frames(robot, recording, calibration.poses, calibration)
-    if not frames or not moving:
-        return calibration
-    noises = measured_noises(robot, recording, calibration)
-    pivot, size = pose_pivot(robot), float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
-    law = _law_of(calibration)
-    prior = _prior(calibration.joint_covariance - np.outer(law, law), which)
-    held = np.zeros(len(robot.body.mesh.nodes), dtype=bool)
-    held[robot.body.clamped] = True
-    equations = _Equations(frames, noises, pivot, size, which, held)
-    weight, center = np.eye(len(which)), np.zeros(len(which))
-    measured = prior.any() and not set(moving) <= set(guessed)
-    for _ in range(2 if measured else 1):  # the second time with what the clouds are worth beside the markers
-        used = weight, center
-        poses, gone, sums = _nearer(equations, list(calibration.poses), prior, *used)
-        normal, right, rms = sums.normal, sums.right, sums.rms
-        if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
-            return calibration
-        center = np.where(np.isin(which // 6, guessed), gone, 0.0)
-        apart = gone - center - np.linalg.solve(normal, right)
-        clouds = what_clouds_know(normal, field_scores(equations.rows(poses), robot.body.mesh.nodes))
-        clouds *= worth_of_clouds(clouds, prior, apart) if measured else 1.0
-        weight = clouds @ np.linalg.inv(normal)
-    ended = replace(calibration, poses=tuple(poses))
-    moved = _moved_by_law(robot, recording, ended, equations, prior, used[0], used[1] - gone + law[which])
-    covariance = np.zeros((6 * len(poses),) * 2)
-    covariance[np.ix_(which, which)] = np.linalg.inv(clouds + prior) + np.outer(moved, moved)
-    law_step = np.zeros(len(covariance))
-    law_step[which] = moved
-    return replace(
-        calibration,
-        T_robot_camera=freeze(poses[0]),
-        poses=tuple(freeze(T) for T in poses),
-        pose_covariance=freeze(covariance[:6, :6]),
-        joint_covariance=freeze(covariance),
-        law_step=freeze(np.append(law_step, calibration.law_step[len(law_step) :])),
-        normal_rms_m=rms,
-    )
-
-
-def _law_of(calibration: Calibration) -> FloatArray:
-    """Return by how much another law moves the poses of a calibration, shape (6 v,); 0 where nobody knows."""
-    p = 6 * len(calibration.poses)
-    return calibration.law_step[:p] if calibration.law_step.size else np.zeros(p)
-
-
-def _moved_by_law(
-    robot: Robot,
-    recording: Recording,
-    ended: Calibration,
-    equations: _Equations,
-    prior: FloatArray,
-    weight: FloatArray,
-    center: FloatArray,
-) -> FloatArray:
-    """Return where a fit under the other law ends that begins where a fit ended, shape (p,); 0 where the robot declares its law.
-    The center of the prior is where the other law moves it."""
-    other = with_other_law(robot)
-    frames = [] if other is None else _free_frames(other, recording, ended.poses, ended)
-    if not frames:
-        return np.zeros(len(prior))
-    return _nearer(replace(equations, frames=frames), list(ended.poses), prior, weight, center)[1]
-
-
-def what_clouds_know(normal: FloatArray, scores: FloatArray) -> FloatArray:
-    """Return the information of the clouds, shape (p, p): that of points that err together, N S⁻¹ N, in no direction more than N.
-
-    Arguments:
-        normal: N, information of points that err each on its own, shape (p, p).
-        scores: rows whose sum of squares S is the covariance of the gradient, shape (g, p).
-    """
-    root = np.linalg.cholesky(normal)
-    whitened = np.linalg.solve(root, scores.T)
-    values, vectors = np.linalg.eigh(whitened @ whitened.T)
-    half = root @ vectors / np.sqrt(np.maximum(values, 1.0))
-    return np.asarray(half @ half.T)
-
-
-def worth_of_clouds(clouds: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
-    """Return by which share the clouds count beside the markers [1].
-
-    Where clouds and markers are farther apart than both deviations say, the clouds err by more still (model, lens). They then
-    count by so much less that the difference is one that is to be expected.
-    Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
-
-    Arguments:
-        clouds: information of the clouds, shape (p, p).
-        prior: information of the markers, shape (p, p).
-        apart: answer of the clouds alone less that of the markers, shape (p,).
-    """
-    p, of_markers, of_clouds = len(clouds), np.linalg.inv(prior), np.linalg.inv(clouds)
-
-    def distance(worth: float) -> float:
-        return float(apart @ np.linalg.solve(of_markers + of_clouds / worth, apart))
-
-    if distance(1.0) <= p:
-        return 1.0
-    low, high = 1e-12, 1.0
-    for _ in range(60):
-        middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if distance(middle) < p else (low, middle)
-    return low
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Equations:
-    """The rays of all frames."""
-
-    frames: list[_Seen]
-    noises: tuple[CameraNoise, ...]
-    pivot: FloatArray
-    size: float
-    which: FloatArray
-    """Of all coordinates of poses, those that move, shape (p,)."""
-    held: BoolArray
-    """Nodes that are clamped, shape (n,): what holds them hides them, and lies where they should be or before."""
-
-    def rows(self, poses: list[FloatArray]) -> Iterator[tuple[RayRows, FloatArray]]:
-        """Yield the rows of each frame at poses, and how they change with them."""
-        for seen in self.frames:
-            rows = ray_rows(seen.scan, seen.surface, poses, self.noises, reach=REACH * self.size).off(self.held)
-            yield rows, rows.by_pose(self.pivot, len(poses))[:, self.which]
-
-    def at(self, poses: list[FloatArray]) -> RaySums:
-        """Return the normal equations at poses."""
-        return ray_sums(self.rows(poses), len(self.which), self.size)
-
-
-def _nearer(
-    equations: _Equations, poses: list[FloatArray], prior: FloatArray, weight: FloatArray, center: FloatArray
-) -> tuple[list[FloatArray], FloatArray, RaySums]:
-    """Return the poses to which Gauss–Newton leads, how far they went, shape (p,), and the equations there.
-
-    The rays' equations count by a weight, shape (p, p), beside a prior about a center, shape (p,).
-
-    A flat side that faces the camera hardly says where it lies in its plane, and a step may leave it. Steps are damped until no
-    more points than a few are lost (Levenberg 1944), those directions first that are known least.
-    """
-    gone, sums = np.zeros(len(prior)), equations.at(poses)
-    unit = np.tile([1.0 / equations.size**2] * 3 + [1.0] * 3, len(prior) // 6)
-    for _ in range(STEPS):
-        root = np.sqrt(unit)
-        rays = weight @ sums.normal
-        top = float(np.linalg.norm(rays * np.outer(root, root), 2))
-        for damping in DAMPINGS if sums.explained > 0.0 else ():
-            matrix = rays + prior + np.diag(damping * top / unit)
-            step = -np.linalg.lstsq(matrix, weight @ sums.right + prior @ (gone - center), rcond=None)[0]
-            full = np.zeros(6 * len(poses))
-            full[equations.which] = step
-            tried = moved_poses(poses, full, equations.pivot)
-            there = equations.at(tried)
-            if there.explained >= (1.0 - LOST) * sums.explained:
-                break
-        else:
-            break
-        poses, gone, sums = tried, gone + step, there
-        if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
-            break
-    return poses, gone, sums
-
-
-def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) -> RaySums:
-    """Return the robust normal equations of the rows of all frames.
-
-    Arguments:
-        frames: rows of each frame, and how their residual changes with the parameters, shape (r, p).
-        p: number of parameters.
-        size: diagonal of the body [m].
-    """
-    normal, right, squares, count, explained = np.zeros((p, p)), np.zeros(p), 0.0, 0, 0.0
-    for rows, derivative in frames:
-        J = derivative / rows.std[:, None]
-        z = rows.residual / rows.std
-        weight = row_weights(rows)
-        normal += J.T @ (weight[:, None] * J)
-        right += J.T @ (weight * z)
-        squares, count = squares + float((rows.residual**2).sum()), count + len(z)
-        explained += float(np.maximum(1.0 - (rows.residual / (REACH * size)) ** 2, 0.0).sum())
-    return RaySums(normal, right, float(np.sqrt(squares / max(count, 1))), explained)
-
-
-def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:
-    """Return the precision that the markers leave to the clouds; zero where they say nothing."""
-    own = covariance[np.ix_(which, which)] if covariance.size else np.zeros((len(which),) * 2)
-    if not np.isfinite(own).all() or not (np.diag(own) > 0).all():
-        return np.zeros_like(own)
-    return np.asarray(np.linalg.inv(own))
-
-
-def _free_frames(robot: Robot, recording: Recording, poses: tuple[FloatArray, ...], calibration: Calibration) -> list[_Seen]:
-    """Return what is seen in the free frames that have clouds."""
-    free = free_clouds(recording)
     initial = calibrated_inputs(robot, recording, calibration) if recording.actuation_zero == "unknown" else None
+    unit, size = (CameraNoise("stereo", at_1m=1.0),) * len(declared), float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     driven, triangles = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), body_surface(robot.body.mesh).triangles
-    result = []
-    for k, state in free_path(driven, free):
+    spread = [np.zeros(0)]
+    for k, state in free_path(driven, free_clouds(recording)):
         try:
-            scan = read_scan(robot, recording, k, poses, state.positions)
+            scan = read_scan(robot, recording, k, calibration.poses, state.positions)
         except FemsenseError:
             continue
         if scan is not None:
-            result.append(_Seen(scan, state, Surface(state.positions, triangles)))
-    return result
-
-
-def free_clouds(recording: Recording) -> list[int]:
-    """Return the frames that are free and have a cloud, evenly thinned out to FRAMES."""
-    if recording.free is None or not recording.has_clouds:
-        return []
-    free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
-    return [free[i] for i in np.unique(np.linspace(0, len(free) - 1, FRAMES).round().astype(int))] if free else []
-
-
-def _measured_noise(robot: Robot, frames: list[_Seen], poses: tuple[FloatArray, ...], view: int) -> CameraNoise:
-    """Return stereo noise that makes the residuals about their smooth part as large as they are."""
-    unit = (CameraNoise("stereo", at_1m=1.0),) * len(poses)
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    spread = [
-        _smooth_rest(rows)
-        for seen in frames
-        for rows in [ray_rows(seen.scan, seen.surface, poses, unit, reach=REACH * size)]
-        if len(rows.residual)
-    ]
-    every = np.concatenate(spread) if spread else np.zeros(0)
-    return CameraNoise("stereo", at_1m=1.483 * float(np.median(np.abs(every)))) if len(every) >= 100 else USUAL
+            rows = ray_rows(scan, Surface(state.positions, triangles), calibration.poses, unit, reach=REACH * size)
+            spread += [_smooth_rest(rows)] if len(rows.residual) else []
+    every = np.concatenate(spread)
+    found = CameraNoise("stereo", at_1m=1.483 * float(np.median(np.abs(every)))) if len(every) >= 100 else USUAL
+    return tuple(noise or found for noise in declared)
 
 
 def _smooth_rest(rows: RayRows) -> FloatArray:

@@ -148,6 +148,19 @@ def test_markers_and_clouds_find_initial_inputs_together(tmp_path: Path) -> None
     assert found.status.startswith("converged")
 
 
+def test_a_camera_placed_by_clouds_helps_with_initial_inputs(tmp_path: Path) -> None:
+    """Markers of one camera leave 0.43 N; its clouds and those of a camera without markers know more."""
+    inputs = np.array([[1.5, 0, 0, 0], [0, 1.5, 0, 0], [0, 0, 1.5, 0]])
+    initial = np.array([0.6, 0.3, 0.2, 0.4])
+    recording, states = record(inputs, zero="unknown", initial=initial, noise=1e-3)
+    bare, poses = with_clouds(tmp_path, recording, states, EYES, clutter=False, colored=True)
+    found = calibrate(arm(), with_markers(bare, recording, poses[0]))
+    error = np.array(list(found.cable_tension_n.values())) - initial
+    std = np.array(list(found.tension_std_n.values()), dtype=float)
+    assert (std < 0.35).all() and (np.abs(error) < 1.5 * std).all()
+    assert "cameras placed by clouds alone" in found.status
+
+
 def test_walls_that_the_body_hides_are_not_expected_in_the_cloud() -> None:
     """A hollow box: inside walls face the camera, which does not see them."""
     box = trimesh.creation.box(extents=[0.04, 0.04, 0.04])

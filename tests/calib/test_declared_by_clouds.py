@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.clouds_alone import started_at
-from femsense.calib.from_clouds import pose_pivot, refine_poses
+from femsense.calib.from_clouds import fit_clouds, pose_pivot
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, move_pose, transform_points
@@ -94,7 +94,7 @@ def test_deviations_of_a_pose_hold_what_another_law_would_move(seen: Seen) -> No
         return
     robot = arm()
     start = started_at(robot, calibrate(robot, replace(recording, T_robot_camera=(T,))), {0: T})
-    found = refine_poses(robot, recording, start, guessed=(0,))
+    found = fit_clouds(robot, recording, start, guessed=(0,))
     apart, pivot = T @ invert_pose(found.poses[0]), pose_pivot(robot)
     step = np.append(Rotation.from_matrix(apart[:3, :3]).as_rotvec(), transform_points(apart, pivot[None])[0] - pivot)
     assert np.sqrt(step @ np.linalg.solve(found.joint_covariance, step)) < 3.0

@@ -11,7 +11,7 @@ from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.files import read_calibration, write_calibration
-from femsense.calib.from_clouds import measured_noises, refine_poses, what_clouds_know
+from femsense.calib.from_clouds import fit_clouds, measured_noises
 from femsense.core.pose import invert_pose, move_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
@@ -62,7 +62,7 @@ def test_a_start_is_enough_without_markers(free):
     start = move_pose(T_ROBOT_CAMERA, [0.01, -0.01, 0.005, 0.002, -0.002, 0.003], pivot_a=[0.05, 0, 0])
     unknown = replace(near, poses=(start,), T_robot_camera=start, joint_covariance=np.zeros((6, 6)))
     assert off(start) > 3e-3
-    assert off(refine_poses(robot, free, unknown).poses[0]) < 4e-4
+    assert off(fit_clouds(robot, free, unknown).poses[0]) < 4e-4
 
 
 def test_a_start_from_which_no_ray_meets_the_body_stays(free):
@@ -70,7 +70,7 @@ def test_a_start_from_which_no_ray_meets_the_body_stays(free):
     near = calibrate(robot, free)
     start = move_pose(T_ROBOT_CAMERA, [0, 0, 0, 0.0, 0.045, 0.0], pivot_a=[0.05, 0, 0])
     lost = replace(near, poses=(start,), T_robot_camera=start, joint_covariance=1e-4 * np.eye(6))
-    np.testing.assert_array_equal(refine_poses(robot, free, lost).poses[0], start)
+    np.testing.assert_array_equal(fit_clouds(robot, free, lost).poses[0], start)
 
 
 def test_noise_that_is_not_declared_is_measured(free):
@@ -90,16 +90,6 @@ def test_the_covariance_of_all_cameras_survives_its_file(free, tmp_path):
     assert again.normal_rms_m == pytest.approx(calibration.normal_rms_m)
 
 
-def test_points_that_err_together_know_less_and_never_more_than_on_their_own() -> None:
-    """N S⁻¹ N: with S = c N in a direction, 1/c of what N knows there, and at most all of it."""
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(4, 4))
-    vectors, share = np.linalg.qr(rng.normal(size=(4, 4)))[0], np.array([0.25, 1.0, 4.0, 100.0])
-    scores = np.sqrt(share)[:, None] * (root @ vectors).T
-    expected = root @ vectors @ np.diag(1.0 / np.maximum(share, 1.0)) @ vectors.T @ root.T
-    np.testing.assert_allclose(what_clouds_know(root @ root.T, scores), expected, rtol=1e-9)
-
-
 def test_clouds_of_a_body_that_errs_smoothly_do_not_overrule_markers(free, tmp_path):
     """All points lie off by a bow of 1 mm, as under another law: many of them, and yet one error."""
     recording, _ = record(INPUTS, noise=1e-4)
@@ -112,7 +102,7 @@ def test_clouds_of_a_body_that_errs_smoothly_do_not_overrule_markers(free, tmp_p
         files.append((tmp_path / f"{k}.ply",))
     bowed = replace(recording, free=np.ones(3, dtype=bool), cloud_files=tuple(files), color_files=((None,),) * 3)
     by_markers, both = calibrate(arm(), replace(bowed, cloud_files=((None,),) * 3)), calibrate(arm(), bowed)
-    alone = refine_poses(arm(), bowed, replace(by_markers, joint_covariance=np.zeros((6, 6))))
+    alone = fit_clouds(arm(), bowed, replace(by_markers, joint_covariance=np.zeros((6, 6))))
     assert off(alone.poses[0]) > 5e-4
     assert off(both.poses[0]) < 1e-4
 
@@ -123,5 +113,5 @@ def test_a_pose_that_is_only_guessed_pulls_no_answer_back(free):
     start = move_pose(T_ROBOT_CAMERA, [0.0, 0.0, 0.0, 0.002, -0.002, 0.003], pivot_a=[0.05, 0, 0])
     held = replace(near, poses=(start,), T_robot_camera=start, joint_covariance=np.diag([1e-4] * 3 + [1e-8] * 3))
     loose = replace(held, joint_covariance=np.diag([1e-2] * 3 + [1e-5] * 3))
-    assert off(refine_poses(robot, free, held).poses[0]) > 2e-3
-    assert off(refine_poses(robot, free, loose, guessed=(0,)).poses[0]) < 4e-4
+    assert off(fit_clouds(robot, free, held).poses[0]) > 2e-3
+    assert off(fit_clouds(robot, free, loose, guessed=(0,)).poses[0]) < 4e-4

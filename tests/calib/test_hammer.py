@@ -10,7 +10,7 @@ from helpers import DATA
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.cloud_pose_search import View, difference, settle_cloud_pose
-from femsense.calib.from_clouds import refine_poses
+from femsense.calib.from_clouds import fit_clouds
 from femsense.calib.scan import RayRows
 from femsense.core.errors import DataError
 from femsense.core.pose import move_pose
@@ -38,7 +38,7 @@ def test_a_flat_side_settles_and_the_holder_does_not_pull() -> None:
     with pytest.raises(DataError, match="declared pose of camera"):  # 9 mm off
         calibrate(robot, replace(recording, T_robot_camera=(start,)))
     declared = calibrate(robot, replace(recording, T_robot_camera=(start,), free=None))
-    found = refine_poses(robot, recording, replace(declared, joint_covariance=np.zeros((6, 6))))
+    found = fit_clouds(robot, recording, replace(declared, joint_covariance=np.zeros((6, 6))))
     assert found.normal_rms_m < 1.4e-3  # 2.0e-3 with the holder in front of the clamped head; 3.0e-3 undamped, 0.7 rad away
     turn, shift = difference(found.poses[0], near.T_robot_camera, surface)
     assert turn < 0.2 and shift < 0.02
