@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from femsense.loop.result.tables import LEFT_OUT, NAN, Columns, Number, Triple, Vector
+from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import Entry
 
 NAMED, PASSES = "named", "passes"
@@ -134,9 +135,14 @@ class ConfoundedPair:
     absorbed_share: float | None = field(default=None, metadata=LEFT_OUT)
     """√(1 − ρ²): the share of one that calibration absorbs, if the other is a nuisance effect."""
 
+    @property
+    def is_by_model_error(self) -> bool:
+        """Whether the refits differ by more than `Thresholds.evidence`: the model error that the weights include may still be the reason of the difference."""
+        return self.absorbed_share is None and self.dbic_gap is not None and self.dbic_gap >= DEFAULTS.evidence
+
 
 def alternatives(pairs: Iterable[ConfoundedPair], names: Collection[str]) -> dict[str, list[str]]:
-    """Return for each accepted effect the others that these data do not distinguish from it."""
+    """Return for each accepted effect the others that form a pair with it."""
     found: dict[str, list[str]] = {}
     for pair in pairs:
         for own, other in (pair.pair, pair.pair[::-1]):

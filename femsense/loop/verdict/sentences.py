@@ -56,16 +56,22 @@ def verdict_in_words(
         for name, size in ((MESH.name, mesh), ("places of markers", budget.placement_m))
         if size > 5e-6
     )
-    others = alternatives(pairs, [e.name for e in effects])
-    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)}{_or(others.get(e.name, ()))})" for e in effects)
+    names = [e.name for e in effects]
+    same = alternatives([pair for pair in pairs if not pair.is_by_model_error], names)
+    instead = alternatives([pair for pair in pairs if pair.is_by_model_error], names)
+    what = ", ".join(
+        f"{e.name} ({values_in_words(e.parameters)}{_or('not distinguished from', same.get(e.name, ()))}"
+        f"{_or('by the model error may stand for', instead.get(e.name, ()))})"
+        for e in effects
+    )
     tail = "" if verdict == FOUND else " A residual remains that no effect fits."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
 
 
-def _or(others: Sequence[str]) -> str:
-    """Return the effects that these data do not distinguish from an accepted one, in words."""
-    return f"; not distinguished from {' or '.join(others)}" if others else ""
+def _or(relation: str, others: Sequence[str]) -> str:
+    """Return the effects that have a relation to an accepted one, in words."""
+    return f"; {relation} {' or '.join(others)}" if others else ""
 
 
 def _noise_in_words(budget: ModelError) -> str:

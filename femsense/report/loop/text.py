@@ -29,7 +29,8 @@ def loop_text(loop: Loop) -> str:
     words = loop.sentence or VERDICTS.get(loop.verdict)
     lines = [f"verdict: {loop.verdict}" + (f" ({words})" if words else "")]
     lines.append(columns(_rows(loop)))
-    others = alternatives(loop.confounded, [effect.name for effect in loop.effects])
+    close = [pair for pair in loop.confounded if not pair.is_by_model_error]
+    others = alternatives(close, [effect.name for effect in loop.effects])
     for effect in loop.effects:
         lines += ["", effect_text(effect, others.get(effect.name, ()))]
     for name, parameters in loop.fitted_along.items():

@@ -51,11 +51,14 @@ def test_an_effect_is_followed_by_those_that_the_data_do_not_distinguish_from_it
         NamedEffect("stiffness", {"scale": Value(0.8, 0.02, "1")}),
         NamedEffect("density", {"scale": Value(0.7, 0.02, "1")}),
     ]
-    pairs = [ConfoundedPair(("payload", "density"), dbic_gap=74.0), ConfoundedPair(("stiffness", "density"), dbic_gap=1.0)]
+    pairs = [ConfoundedPair(("payload", "density"), dbic_gap=4.0), ConfoundedPair(("stiffness", "density"), dbic_gap=1.0)]
     sentence = sentences.verdict_in_words("effects", effects, [], fitted, fitted, budget(0.0, 0.2), pairs)
     assert sentence.startswith(
         "The model lacks stiffness (scale 0.8), density (scale 0.7; not distinguished from payload); held-out error"
     )
+    errs = [ConfoundedPair(("payload", "density"), dbic_gap=74.0)]  # by far, if the model were right
+    sentence = sentences.verdict_in_words("effects", effects[1:], [], fitted, fitted, budget(0.0, 0.2), errs)
+    assert "density (scale 0.7; by the model error may stand for payload);" in sentence
     assert effect_text(effects[1], ["payload"]).startswith("density or payload: these data do not distinguish them\n")
     assert effect_text(effects[0]).startswith("stiffness\n")
 
