@@ -81,4 +81,4 @@ def test_magnet(tmp_path: Path) -> None:
     entry = build_entry(effect.parameters(robot, "tension"), [0.0, 0.1, -0.2], seed)
     pulled = effect.apply(robot, entry)
     np.testing.assert_allclose((pulled.body.dead_forces - robot.body.dead_forces).sum(axis=0), [0.0, 0.1, -0.2], atol=1e-12)
-    assert effect.lacks == "a magnet beside the tip" and len(effect.seeds(robot)) == 2
+    assert effect.lacks == "a magnet next to the tip" and len(effect.seeds(robot)) == 2
