@@ -213,9 +213,8 @@ print("next experiment:", loop["next_experiment"])
 # %% [markdown]
 # - **`unexplained` is not a failure.** Frames of a beam at rest repeat to micrometres, so the millimetre that remains counts as model error. A repetition of the run at 1.00 N differed by 0.59 mm,
 #   which one recording cannot show. If you know the repeatability, declare it (`marker_noise_m` in `recording.toml`): the verdict then becomes `effects` ([study](../studies/beam-study.md)).
-# - **The list is not unique beyond modulus and gravity.** These two reduce the held-out error from 5.5 to 1.4 mm; the others change it by 0.5 mm, less than a repetition of the run did. Both robots estimate the weights
-#   correctly, with moduli of 313 kPa (and a soft spot) and 240 kPa; in the [study](../studies/beam-study.md) of the same data the loop finds only modulus and gravity, with 240 kPa. Use such a list as a
-#   question to the robot: is there a bubble at this place, does that marker sit on the clamp?
+# - **Modulus and gravity are all that these data show.** They reduce the held-out error from 5.5 to 1.2 mm, and a repetition of the run differs by half of what remains. With or without `--effects gravity` the modulus
+#   is 240 kPa and the weights are estimated correctly. A gradient of the modulus and creep would explain the data as well as a uniform modulus, and a payload might stand for gravity.
 # - **Gravity along the beam is hardly determined.** An axial force of the size of the weight stretches the beam by 0.2 mm. The standard deviation of the first component says so.
 # - **Clamp and modulus are collinear** with one orientation of the base: the modulus is 262 ± 3 kPa with a rigid clamp and 262 ± 38 kPa with one that may rotate.
 # - **Creep does not show** in runs of half a second.
