@@ -13,7 +13,7 @@ from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.swaps import History, simplest
 
 SEEN = list[dict[str, Any]]()
-"""What `simplest` was asked in the case that is under way, and what it changed."""
+"""Calls of `simplest` in the current case, and the changes that it made."""
 
 
 def simplest_watched(data: Any, history: History, refits: list[RefitRecord], *given: Any) -> Any:

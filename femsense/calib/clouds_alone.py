@@ -159,7 +159,7 @@ def _check_determined(recording: Recording, start: Calibration, fitted: Calibrat
         if values[-1] > UNDETERMINED**2:
             raise DataError(
                 f"the clouds do not determine the pose of camera {recording.camera_names[v] or '(only one)'} "
-                f"{_direction(vectors[:, -1])}: what was found may be far off. Record contact-free frames in which other inputs bend the "
+                f"{_direction(vectors[:, -1])}: the fitted pose may be far off. Record contact-free frames in which other inputs bend the "
                 "robot in other directions, or three markers; or declare T_robot_camera"
             )
 

@@ -192,7 +192,7 @@ class _Fit:
     loose: BoolArray
     """Of which coordinates the start is a guess, shape (c,): their prior bounds a step, and pulls nothing back."""
     law: FloatArray
-    """By how much another law moves what is known before, shape (c,)."""
+    """Change of the prior mean under another law of the material, shape (c,)."""
 
     @property
     def fits_inputs(self) -> bool:
@@ -338,8 +338,8 @@ class _Fit:
         The estimate of the points alone is that of least squares, −N⁻¹ g. Its information is Godambe's, N S⁻¹ N, with the covariance S ≥ N of the gradient
         under noise and a smooth field (White 1982): nothing but N where `scores` are unknown.
 
-        Points and markers that are farther apart than both allow err by more than is known (lens, model); the points then count by so much less that
-        their distance is to be expected (Mandel & Paule 1970).
+        If the estimates of points and of markers differ by more than their covariances allow, both have a further error (lens, model): the covariance of
+        the points is then increased until the difference is expected (Mandel & Paule 1970).
 
         Arguments:
             mean: of the prior, shape (c,).

@@ -37,8 +37,6 @@ FIT_STEPS = 25
 """Steps of a fit at most."""
 NEAREST, END = 0.1, 0.5
 """A rod meets a body with its end where this share of its points, the nearest, lie within so many radii of that end."""
-LONG = 1.15
-"""What is not longer than so many times its width is seen as a ball."""
 ROD = 3.0
 """How much farther than for other shapes the points of a rod count, for the direction of its axis."""
 MOST_POINTS = 400
@@ -386,9 +384,6 @@ def _round_end(points: FloatArray, std: FloatArray, origins: FloatArray, near: F
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     middle, look = points.mean(axis=0), ray.mean(axis=0)
     frame = np.linalg.svd(points - middle, full_matrices=False)[2]
-    long, wide = np.ptp((points - middle) @ frame[:2].T, axis=0)
-    if long < LONG * wide:
-        return None
     nearest = points[near <= np.quantile(near, NEAREST)].mean(axis=0)
     frame = frame * np.array([[np.sign((nearest - middle) @ frame[0])], [1.0], [1.0]])
     last = float(((points - middle) @ frame[0]).max())

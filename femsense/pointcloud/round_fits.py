@@ -111,7 +111,7 @@ def _evaluate(
     k, total = len(x), 0.0
     axis, unit, base = np.zeros(3), np.empty(3), np.empty(3)
     size, shortened, end = radius, 1.0, np.inf
-    rod = kind >= CYLINDER
+    rod = kind in (CYLINDER, ROUND_END)
     if kind == SPHERE:
         size = np.exp(x[3])
     if kind == ROUND_END:

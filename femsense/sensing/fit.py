@@ -137,7 +137,7 @@ def fit(
 def _loaded(
     model: Model, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium
 ) -> tuple[tuple[Touch, ...], FloatArray, Equilibrium | None]:
-    """Return contacts, forces and their equilibrium; of a half, a quarter, … of the forces where Newton does not get to all of them from the start."""
+    """Return contacts, forces and their equilibrium; under a share of the forces (`LENGTHS`) if Newton's method does not reach all of them from the start."""
     for share in LENGTHS:
         part = share * forces
         loaded = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, part))

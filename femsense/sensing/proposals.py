@@ -192,9 +192,7 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
     new = [one for one in seen if not _is_there(model, best, one)]
     if not new:
         return []
-    n = len(best.state.positions)
-    loads = np.array([one.patch.spread(axis, n) for one in new for axis in np.eye(3)])
-    sites = near.sites(np.moveaxis(best.linearised.tangent.respond(loads), 0, 2))
+    sites = _at_touches(near, new)
     axes, push = axes_at(model, new, best.state), np.zeros(len(new), dtype=bool)
     odds = np.array([odds_of(model, one, best.rows) for one in new])
     gains, forces = evidence_at(near, sites, axes, push)
@@ -208,6 +206,13 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
                 if g - L + best.odds[i] - best.drop_gain[i] > -SHORT
             ]
     return found
+
+
+def _at_touches(near: Vicinity, touches: Sequence[Touch]) -> Sites:
+    """Return what forces at some touches add."""
+    best, n = near.fit, len(near.fit.state.positions)
+    loads = np.array([one.patch.spread(axis, n) for one in touches for axis in np.eye(3)])
+    return near.sites(np.moveaxis(best.linearised.tangent.respond(loads), 0, 2))
 
 
 def _is_there(model: Model, best: Fit, seen: Touch) -> bool:
@@ -311,7 +316,7 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
     if not inferred:
         return added
     near, nodes, positions = vicinity(model, best), model.sensor.candidates, best.state.positions
-    at, tangent = at_candidates(near), best.linearised.tangent
+    at = at_candidates(near)
     share = float(model.sensor.surface.area.sum()) / len(nodes)
     ways = (False, True) if model.upward.any() else (False,)
     for i in inferred:
@@ -326,17 +331,12 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
         if (other := _other_side(model, best, i)) is not None:
             way = other.patch.mean(positions) - place
             mass[np.linalg.norm(points - way, axis=1) < np.sqrt(share)] = 0.0
-            sites = near.sites(
-                np.moveaxis(tangent.respond(np.array([other.patch.spread(axis, len(positions)) for axis in np.eye(3)])), 0, 2)
-            )
             there = [replace(other, pulls=pulls) for pulls in ways]
-            gains = [
-                evidence_at(near, sites, axes_at(model, [one], best.state), np.array([one.pulls]), without=i)[0][0]
-                for one in there
-            ]
+            axes = axes_at(model, there, best.state)
+            gains, _ = evidence_at(near, _at_touches(near, there), axes, np.array(ways), without=i)
             odds = [odds_of(model, one, best.rows) for one in there]
             points = np.vstack([points, way])
-            mass = np.append(mass, volume * _likelihood(np.array(gains) - odds - own).sum())
+            mass = np.append(mass, volume * _likelihood(gains - odds - own).sum())
         added[i] = (points * mass[:, None]).T @ points / (volume + mass.sum())
     return added
 

@@ -20,11 +20,9 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.design.experiment_blocks import Block, Form
-from femsense.loop.search.screening import penalty
+from femsense.loop.search.screening import COLLINEAR, penalty
 from femsense.loop.thresholds import DEFAULTS, Thresholds
 
-COLLINEAR = 0.95
-"""Cosine of two fields beyond which an experiment does not distinguish their effects."""
 ABSORBED = 1e-9
 """Share of its χ² below which a direction counts as fully absorbed."""
 

@@ -17,13 +17,10 @@ from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
 from femsense.loop.search.refit import beyond, evidence, tried
-from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
+from femsense.loop.search.screening import COLLINEAR, Candidate, confounding, jets_with, screen
 from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
 from femsense.model.robot import Robot
-
-COLLINEAR = 0.95
-"""Cosine of two fields beyond which their places count as one."""
 
 
 def located(
