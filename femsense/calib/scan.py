@@ -1,16 +1,18 @@
+# mypy: allow-untyped-decorators
 """The depth measurements of one frame: each point of the robot with its ray and the noise of its depth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
-from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, read_only
+from femsense.core.kernels import njit
+from femsense.io.clouds.frame_clouds import read_frame_parts
 from femsense.model.camera import CameraNoise
 from femsense.model.camera_frame import undo_depth
 from femsense.model.recording import Recording
@@ -32,7 +34,11 @@ too small."""
 SOME = 300
 """Number of rays from which the angle between neighbours is estimated."""
 MARGIN = 0.25
-"""Points farther from the body than this fraction of its diagonal are discarded."""
+"""Points farther from the body than this fraction of its diagonal are background."""
+ASIDE = 0.18
+"""Points of other things farther from the body than this fraction of its diagonal do not touch it."""
+SOME_FAR = 600
+"""Points of the background that are kept of each camera, about."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,6 +57,10 @@ class Scan:
     """Whether colour separated the robot from the rest; otherwise all points may belong to the robot."""
     count: FloatArray | None = None
     """How many measured points each point of the robot is the mean of, shape (k,); None: each is one (see `in_blocks`)."""
+    far: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """Some points farther from the body at rest than any of its own come, in the frame of their camera [m], shape (g, 3)."""
+    far_view: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Camera of each, shape (g,)."""
 
     @property
     def measured(self) -> FloatArray:
@@ -65,18 +75,17 @@ class Scan:
         """Return the points of everything else in the robot frame [m], shape (o, 3)."""
         return _placed(self.others, self.others_view, poses)
 
+    def background(self, poses: Sequence[FloatArray]) -> FloatArray:
+        """Return the points of the background in the robot frame [m], shape (g, 3)."""
+        return _placed(self.far, self.far_view, poses)
+
     def origins(self, poses: Sequence[FloatArray]) -> FloatArray:
         """Return where each ray begins in the robot frame [m], shape (k, 3)."""
         return np.array([T[:3, 3] for T in poses])[self.view]
 
     def ray_std(self, noises: Sequence[CameraNoise]) -> FloatArray:
-        """Return the noise of each measured point along its ray [m], shape (k,)."""
-        z = self.camera_points[:, 2]
-        std = np.empty(len(z))
-        for view, noise in enumerate(noises):
-            of = self.view == view
-            std[of] = noise.std(z[of])
-        return np.asarray(std * np.linalg.norm(self.camera_points, axis=1) / np.maximum(z, 1e-9))
+        """Return the noise of each measured point of the robot along its ray [m], shape (k,)."""
+        return ray_std(self.camera_points, self.view, noises)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -114,7 +123,9 @@ class RayRows:
         return result.reshape(len(own), 6 * view_count)
 
 
-def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatArray], positions: FloatArray) -> Scan | None:
+def read_scan(
+    robot: Robot, recording: Recording, k: int, poses: Sequence[FloatArray], positions: FloatArray, *, some: int = SOME_FAR
+) -> Scan | None:
     """Return the measured points near the body in frame k; None if the frame has no cloud.
 
     Colour separates the robot if robot and cloud have one. Otherwise all points may belong to the robot, and the residuals decide.
@@ -124,28 +135,46 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         k: index of the frame.
         poses: of the cameras, each (4, 4).
         positions: approximate nodes of the body [m], shape (n, 3).
+        some: points of the background that are kept of each camera, about.
     """
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    low, high = positions.min(axis=0) - MARGIN * size, positions.max(axis=0) + MARGIN * size
-    own, own_view, rest, rest_view = [], [], [], []
+    own, own_view, rest, rest_view, far, far_view = [], [], [], [], [], []
+    margin = MARGIN * size
     segmented = True
+    box = np.array([positions.min(axis=0) - margin, positions.max(axis=0) + margin])
     for view, T in enumerate(poses):
-        cloud = read_frame_cloud(recording, k, view=view, mixed=False)
-        if cloud is None:
+        parts = read_frame_parts(recording, k, view=view, T=T, box=box, some=some)
+        if parts is None:
             continue
+        cloud, sparse = parts
+        outside = undo_depth(sparse, robot.observation)
+        outside = outside[~in_box(outside @ T[:3, :3].T + T[:3, 3], robot.body.mesh.nodes, MARGIN * size) & (outside[:, 2] > 0)]
+        far.append(outside[:: max(1, len(outside) // some)])
+        far_view.append(np.full(len(far[-1]), view))
         points = undo_depth(cloud.points, robot.observation)
-        placed = points @ T[:3, :3].T + T[:3, 3]
-        inside = ((placed >= low) & (placed <= high)).all(axis=1) & (points[:, 2] > 0)
+        inside = in_box(points @ T[:3, :3].T + T[:3, 3], positions, MARGIN * size) & (points[:, 2] > 0)
         points, kept = points[inside], cloud.select(inside)
         segmented = segmented and kept.colors is not None and robot.color_rgb is not None
         mine = _of_robot(robot, kept)
         own.append(points[mine])
-        rest.append(points[~mine])
-        own_view.append(np.full(int(mine.sum()), view))
-        rest_view.append(np.full(int((~mine).sum()), view))
+        other = points[~mine]
+        rest.append(other[in_box(other @ T[:3, :3].T + T[:3, 3], positions, ASIDE * size)])
+        own_view.append(np.full(len(own[-1]), view))
+        rest_view.append(np.full(len(rest[-1]), view))
     if not own:
         return None
-    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), segmented)
+    near = (np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view))
+    return Scan(*near, segmented, far=np.vstack(far), far_view=np.concatenate(far_view))
+
+
+def ray_std(points: FloatArray, view: IntArray, noises: Sequence[CameraNoise]) -> FloatArray:
+    """Return the noise along their rays [m] of measured points (k, 3) in the frames of their cameras (k,), shape (k,)."""
+    z = points[:, 2]
+    std = np.empty(len(z))
+    for v, noise in enumerate(noises):
+        of = view == v
+        std[of] = noise.std(z[of])
+    return np.asarray(std * np.linalg.norm(points, axis=1) / np.maximum(z, 1e-9))
 
 
 def ray_rows(
@@ -208,6 +237,15 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     )
 
 
+def pixel_angles(recording: Recording, k: int, scan: Scan) -> list[float]:
+    """Return the angle between neighbouring rays of each camera in a frame [rad]: of depth images their own, of a cloud that of its points."""
+    result = []
+    for view, (file, camera) in enumerate(zip(recording.cloud_files[k], recording.cameras)):
+        whole = camera is not None and file is not None and file.suffix.lower() == ".png"
+        result.append(1.0 / camera.fx if camera is not None and whole else pixel_of(scan, view))
+    return result
+
+
 def pixel_of(scan: Scan, view: int) -> float:
     """Return the angle between neighbouring rays of a camera [rad], from the robot's points; 0 where there are too few.
 
@@ -226,13 +264,29 @@ def _of_robot(robot: Robot, cloud: PointCloud) -> BoolArray:
     if cloud.colors is None or robot.color_rgb is None:
         return np.ones(len(cloud.points), dtype=bool)
     mask = color_mask(cloud.colors, robot.color_rgb)
-    light = np.linalg.norm(cloud.colors, axis=1)
-    dim = np.flatnonzero(mask)[light[mask] < DIM * np.median(light[mask])] if mask.any() else np.zeros(0, dtype=np.int64)
+    robot_like = np.flatnonzero(mask)
+    light = np.linalg.norm(cloud.colors[robot_like], axis=1)
+    dim = robot_like[light < DIM * np.median(light)] if len(light) else robot_like
     if len(dim):
         tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
         around = tree.query(cloud.points[dim], k=min(AROUND, len(mask)))[1].reshape(len(dim), -1)
         mask[dim] = mask[around].mean(axis=1) > 0.5
     return mask
+
+
+def in_box(points: FloatArray, body: FloatArray, margin: float) -> BoolArray:
+    """Return which points (k, 3) lie within the box about a body (n, 3) and a margin [m], shape (k,)."""
+    inside = np.empty(len(points), dtype=np.bool_)
+    _in_box(read_only(points), body.min(axis=0) - margin, body.max(axis=0) + margin, inside)
+    return inside
+
+
+@njit(cache=True)
+def _in_box(points, low, high, inside):  # type: ignore[no-untyped-def]
+    for i in range(len(points)):
+        inside[i] = True
+        for c in range(3):
+            inside[i] &= low[c] <= points[i, c] <= high[c]
 
 
 def _placed(points: FloatArray, view: IntArray, poses: Sequence[FloatArray]) -> FloatArray:

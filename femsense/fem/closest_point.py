@@ -81,27 +81,42 @@ def feet(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def closest_of_surface(positions: FloatArray, triangles: IntArray, place: FloatArray, closest: FloatArray) -> None:
-    """Write the point (3,) of a surface, of triangles (t, 3), that is closest to a place (3,)."""
-    point, least = (place[0], place[1], place[2]), np.inf
-    for t in range(len(triangles)):
+def closest_on_surface(
+    positions: FloatArray, triangles: IntArray, points: FloatArray, triangle: IntArray, weights: FloatArray, gap: FloatArray
+) -> None:
+    """Write for each point (k, 3) the triangle of a surface that is closest, the barycentric weights there (k, 3), and how far that is (k,).
+
+    A triangle farther away than the sphere about another one cannot be closest.
+    """
+    count = len(triangles)
+    centre, radius, near = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for t in range(count):
         a, b, c = _vector(positions, triangles[t, 0]), _vector(positions, triangles[t, 1]), _vector(positions, triangles[t, 2])
-        u, v, w = _foot(a, b, c, point)
-        x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
-        distance = _length(_minus((x, y, z), point))
-        if distance < least:
-            least = distance
-            closest[0], closest[1], closest[2] = x, y, z
-
-
-@njit(cache=True, nogil=True)
-def gaps_of_faces(positions: FloatArray, faces: IntArray, place: FloatArray, gaps: FloatArray) -> None:
-    """Write how far the nearest corner of each face is from a place, less the length of its first side, shape (f,)."""
-    point = place[0], place[1], place[2]
-    for f in range(len(faces)):
-        a, b, c = _vector(positions, faces[f, 0]), _vector(positions, faces[f, 1]), _vector(positions, faces[f, 2])
-        near = min(_length(_minus(a, point)), _length(_minus(b, point)), _length(_minus(c, point)))
-        gaps[f] = near - _length(_minus(b, a))
+        m = (a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, (a[2] + b[2] + c[2]) / 3.0
+        centre[t, 0], centre[t, 1], centre[t, 2] = m
+        radius[t] = max(_length(_minus(a, m)), _length(_minus(b, m)), _length(_minus(c, m)))
+    for i in range(len(points)):
+        point, bound, best = _vector(points, i), np.inf, np.inf
+        for t in range(count):
+            dx, dy, dz = centre[t, 0] - point[0], centre[t, 1] - point[1], centre[t, 2] - point[2]
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            near[t] = distance - radius[t]
+            bound = min(bound, distance + radius[t])
+        for t in range(count):
+            if near[t] > bound:
+                continue
+            a, b, c = (
+                _vector(positions, triangles[t, 0]),
+                _vector(positions, triangles[t, 1]),
+                _vector(positions, triangles[t, 2]),
+            )
+            u, v, w = _foot(a, b, c, point)
+            x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
+            distance = _length(_minus((x, y, z), point))
+            if distance < best:
+                best, triangle[i], gap[i] = distance, t, distance
+                bound = min(bound, distance)
+                weights[i, 0], weights[i, 1], weights[i, 2] = u, v, w
 
 
 @njit(cache=True, nogil=True)

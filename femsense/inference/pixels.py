@@ -7,15 +7,17 @@ takes the closest point of the surface where that is nearer in standard deviatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
-from femsense.core.arrays import FloatArray, IntArray, read_only
+from femsense.core.arrays import FloatArray, IntArray, freeze, read_only
+from femsense.fem.closest_point import closest_on_surface
 from femsense.inference.error_field import ErrorField
 from femsense.inference.mixture import Others
 from femsense.inference.rows import Rows
+from femsense.pointcloud.casting import Rays, rays_through
 
 GRAZING = 0.25
 """Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
@@ -43,6 +45,17 @@ class Pixels:
     """1/T: how many independent measurements a pixel counts for."""
     coloured: bool
     """Whether colour separates the robot from the rest."""
+    rays: tuple[tuple[IntArray, Rays], ...] = field(init=False)
+    """Of each camera: which of the points are its own, and their rays."""
+    ways: FloatArray = field(init=False)
+    """Unit directions of the rays, shape (m, 3)."""
+
+    def __post_init__(self) -> None:
+        own = [np.flatnonzero(self.view == view) for view in np.unique(self.view)]
+        rays = tuple((index, rays_through(self.points[index], self.origins[index[0]])) for index in own)
+        ways = self.points - self.origins
+        object.__setattr__(self, "rays", rays)
+        object.__setattr__(self, "ways", freeze(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,52 +77,18 @@ class Skin:
 
 def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) -> Rows:
     """Return the rows of a frame at a state, node positions (n, 3) [m]."""
-    import open3d as o3d
-
-    def tensor(values: FloatArray):  # type: ignore[no-untyped-def]
-        return o3d.core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
-
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(tensor(positions), o3d.core.Tensor(np.ascontiguousarray(skin.triangles, dtype=np.uint32)))
-    rays = pixels.points - pixels.origins
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    answer = scene.cast_rays(tensor(np.hstack([pixels.origins, rays])))
-    m = len(rays)
-    residual, std, weights, direction = np.empty(m), np.empty(m), np.empty((m, 3)), np.empty((m, 3))
-    triangle, on = answer["primitive_ids"].numpy().astype(np.int64), np.empty(m, dtype=np.bool_)
-    positions = read_only(positions)
-    _along_rays(
-        positions,
-        read_only(skin.triangles),
-        pixels.points,
-        rays,
-        pixels.ray_std,
-        triangle,
-        answer["primitive_uvs"].numpy(),
-        residual,
-        std,
-        weights,
-        direction,
-        on,
-    )
+    m, positions, triangles = len(pixels.points), read_only(positions), read_only(skin.triangles)
+    residual, std, direction, on = np.empty(m), np.empty(m), np.empty((m, 3)), np.empty(m, dtype=np.bool_)
+    triangle, weights = np.empty(m, dtype=np.int64), np.empty((m, 3))
+    for index, rays in pixels.rays:
+        triangle[index], weights[index], _ = rays.cast(positions, triangles)
+    points, noise = read_only(pixels.points), read_only(pixels.ray_std)
+    _along_rays(positions, triangles, points, read_only(pixels.ways), noise, triangle, residual, std, direction, on)
     far = np.flatnonzero(~on | (residual > FAR * std))
     if len(far):
-        close = scene.compute_closest_points(tensor(pixels.points[far]))
-        _closest(
-            positions,
-            read_only(skin.triangles),
-            pixels.points,
-            pixels.ray_std,
-            far,
-            close["primitive_ids"].numpy().astype(np.int64),
-            close["primitive_uvs"].numpy(),
-            residual,
-            std,
-            weights,
-            direction,
-            triangle,
-            on,
-        )
+        found, at, gap = np.empty(len(far), dtype=np.int64), np.empty((len(far), 3)), np.empty(len(far))
+        closest_on_surface(positions, triangles, read_only(points[far]), found, at, gap)
+        _closest(positions, triangles, points, noise, far, found, at, gap, residual, std, weights, direction, triangle, on)
     other = pixels.others.log_odds(pixels.ray_std, skin.size, on & (residual < 0.0))
     return rows_on(
         skin,
@@ -175,15 +154,14 @@ def rows_on(
 
 
 @njit(cache=True)
-def _along_rays(x, triangles, points, rays, ray_std, triangle, uv, residual, std, weights, direction, on):  # type: ignore[no-untyped-def]
+def _along_rays(x, triangles, points, ways, ray_std, triangle, residual, std, direction, on):  # type: ignore[no-untyped-def]
     normal = np.empty(3)
     for j in range(len(points)):
         residual[j], std[j], on[j] = np.inf, ray_std[j], False
-        if triangle[j] >= len(triangles):  # Open3D's mark of a miss
+        if triangle[j] < 0:
             triangle[j] = 0
             continue
-        cosine = _normal_of(x, triangles[triangle[j]], rays[j], normal)
-        weights[j, 0], weights[j, 1], weights[j, 2] = 1.0 - uv[j, 0] - uv[j, 1], uv[j, 0], uv[j, 1]
+        cosine = _normal_of(x, triangles[triangle[j]], ways[j], normal)
         if abs(cosine) < GRAZING:
             continue
         a = triangles[triangle[j], 0]
@@ -195,25 +173,20 @@ def _along_rays(x, triangles, points, rays, ray_std, triangle, uv, residual, std
 
 
 @njit(cache=True)
-def _closest(x, triangles, points, ray_std, far, found, uv, residual, std, weights, direction, triangle, on):  # type: ignore[no-untyped-def]
+def _closest(x, triangles, points, ray_std, far, found, at, gap, residual, std, weights, direction, triangle, on):  # type: ignore[no-untyped-def]
     normal, off = np.empty(3), np.empty(3)
     for q in range(len(far)):
         j = far[q]
-        u, v = np.float64(uv[q, 0]), np.float64(uv[q, 1])
-        w = (1.0 - u - v, u, v)
-        corners = triangles[found[q]]
-        gap = 0.0
-        for c in range(3):
-            off[c] = points[j, c] - (w[0] * x[corners[0], c] + w[1] * x[corners[1], c] + w[2] * x[corners[2], c])
-            gap += off[c] ** 2
-        gap = np.sqrt(gap)
-        if on[j] and gap / ray_std[j] >= residual[j] / std[j]:
+        if on[j] and gap[q] / ray_std[j] >= residual[j] / std[j]:
             continue
+        corners = triangles[found[q]]
+        for c in range(3):
+            off[c] = points[j, c] - (at[q, 0] * x[corners[0], c] + at[q, 1] * x[corners[1], c] + at[q, 2] * x[corners[2], c])
         side = -1.0 if _normal_of(x, corners, off, normal) < 0.0 else 1.0
         for c in range(3):
-            direction[j, c] = side * off[c] / gap if gap > ON_SURFACE else normal[c]
-            weights[j, c] = w[c]
-        residual[j], std[j], triangle[j], on[j] = side * gap, ray_std[j], found[q], False
+            direction[j, c] = side * off[c] / gap[q] if gap[q] > ON_SURFACE else normal[c]
+            weights[j, c] = at[q, c]
+        residual[j], std[j], triangle[j], on[j] = side * gap[q], ray_std[j], found[q], False
 
 
 @njit(cache=True)

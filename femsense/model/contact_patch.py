@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Contact patches: the parts of the surface over which a contact force is spread."""
 
 from __future__ import annotations
@@ -7,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
-from femsense.fem.closest_point import closest_of_surface, gaps_of_faces
+from femsense.core.kernels import njit
+from femsense.fem.closest_point import closest_on_surface
 from femsense.fem.mesh import TetMesh, surface_triangles, triangle_normals
 
 
@@ -107,21 +109,52 @@ def patch_at(
         facing: the outward normal that was seen there, shape (3,): faces that look elsewhere do not count.
     """
     centre = closest_surface_point(surface, positions, place, facing=facing)
-    beyond = np.empty(len(surface.faces))
-    gaps_of_faces(read_only(positions), read_only(surface.faces), centre, beyond)
-    faces = surface.faces[beyond <= max(radius, float(beyond.min()) + surface.edge)]
-    values = _shape_values(LATTICE, faces.shape[1])  # of each point of a face, (p, 3 or 6)
-    distance = np.linalg.norm(np.einsum("pa,fac->fpc", values, positions[faces]) - centre, axis=2)
-    reach = max(radius, 1.01 * float(np.partition(distance, 2, axis=None)[2]))
-    area = np.linalg.norm(triangle_normals(positions, faces[:, :3]), axis=1)
-    pressed = area[:, None] * np.sqrt(np.maximum(1.0 - (distance / reach) ** 2, 0.0))
-    share = np.bincount(faces.ravel(), (pressed @ values).ravel(), minlength=len(positions))
+    values = _shape_values(LATTICE, surface.faces.shape[1])  # at each point of a face, (p, 3 or 6)
+    share = np.zeros(len(positions))
+    _press(read_only(positions), read_only(surface.faces), read_only(values), read_only(centre), radius, surface.edge, share)
     share[clamped] = 0.0
     if share.sum() <= 0.0:  # a place on the clamp: its nearest free node
         free = np.setdiff1d(surface.nodes, clamped)
         share[free[np.argmin(np.linalg.norm(positions[free] - centre, axis=1))]] = 1.0
     nodes = np.flatnonzero(share)
     return ContactPatch(nodes, share[nodes] / share.sum())
+
+
+@njit(cache=True)
+def _press(x, faces, values, centre, radius, edge, share):  # type: ignore[no-untyped-def]
+    """Write the nodal shares of Hertz's pressure about a centre, over the radius or what holds three points of the faces."""
+    corners, points = faces.shape[1], len(values)
+    beyond, nearest = np.empty(len(faces)), np.inf
+    for f in range(len(faces)):
+        near, side = np.inf, 0.0
+        for i in range(3):
+            near = min(near, _apart(x[faces[f, i]], centre))
+        side = _apart(x[faces[f, 0]], x[faces[f, 1]])
+        beyond[f] = near - side
+        nearest = min(nearest, beyond[f])
+    chosen = np.flatnonzero(beyond <= max(radius, nearest + edge))
+    distance, at = np.empty((len(chosen), points)), np.empty(3)
+    for k in range(len(chosen)):
+        for p in range(points):
+            at[:] = 0.0
+            for i in range(corners):
+                for c in range(3):
+                    at[c] += values[p, i] * x[faces[chosen[k], i], c]
+            distance[k, p] = _apart(at, centre)
+    reach = max(radius, 1.01 * np.partition(distance.ravel(), 2)[2])
+    for k in range(len(chosen)):
+        face = faces[chosen[k]]
+        u, v = x[face[1]] - x[face[0]], x[face[2]] - x[face[0]]
+        area = np.sqrt((u[1] * v[2] - u[2] * v[1]) ** 2 + (u[2] * v[0] - u[0] * v[2]) ** 2 + (u[0] * v[1] - u[1] * v[0]) ** 2)
+        for p in range(points):
+            pressure = area * np.sqrt(max(1.0 - (distance[k, p] / reach) ** 2, 0.0))
+            for i in range(corners):
+                share[face[i]] += pressure * values[p, i]
+
+
+@njit(cache=True)
+def _apart(a, b):  # type: ignore[no-untyped-def]
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 def closest_surface_point(
@@ -133,9 +166,9 @@ def closest_surface_point(
         normals = triangle_normals(positions, triangles)
         looks = normals @ facing > 0.35 * np.linalg.norm(normals, axis=1) * np.linalg.norm(facing)
         triangles = triangles[looks] if looks.any() else triangles
-    closest = np.empty(3)
-    closest_of_surface(read_only(positions), read_only(triangles), np.array(place, dtype=np.float64), closest)
-    return closest
+    triangle, weights, gap = np.zeros(1, dtype=np.int64), np.empty((1, 3)), np.empty(1)
+    closest_on_surface(read_only(positions), read_only(triangles), read_only(place[None]), triangle, weights, gap)
+    return np.asarray(weights[0] @ positions[triangles[triangle[0]]])
 
 
 def _faces(triangles: IntArray, *, quadratic: bool) -> IntArray:

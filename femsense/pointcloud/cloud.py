@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Point clouds, and the files and depth images they come from."""
 
 from __future__ import annotations
@@ -7,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, as_points, freeze
+from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
+from femsense.core.kernels import njit
 from femsense.pointcloud.grid import positive
 from femsense.pointcloud.rays import GRAZING
 
@@ -39,8 +41,10 @@ class PointCloud:
 
     def select(self, mask: npt.ArrayLike) -> PointCloud:
         """Return the points that a mask (n,) or indices (k,) choose, in that order."""
-        chosen = np.asarray(mask)
-        return PointCloud(self.points[chosen], None if self.colors is None else self.colors[chosen])
+        chosen, part = np.asarray(mask), object.__new__(PointCloud)  # without checks: what is right for all is right for some
+        object.__setattr__(part, "points", freeze(self.points[chosen]))
+        object.__setattr__(part, "colors", None if self.colors is None else freeze(self.colors[chosen]))
+        return part
 
 
 def cloud_from_depth(
@@ -54,6 +58,7 @@ def cloud_from_depth(
     *,
     color: npt.ArrayLike | None = None,
     distortion_model: str = "brown_conrady",
+    within: tuple[FloatArray, FloatArray, FloatArray] | None = None,
 ) -> PointCloud:
     """Return the points of a depth image in the camera frame (OpenCV: x right, y down, z forward).
 
@@ -64,10 +69,12 @@ def cloud_from_depth(
         fx, fy, cx, cy: focal lengths and principal point [px]; the centre of the first pixel is (0, 0).
         distortion: OpenCV's k1, k2, p1, p2, k3, shape (5,) or with k4, k5, k6 (8,); of a fisheye k1, k2, k3, k4 and zeros.
         depth_unit_m: metres per unit of depth.
-        color: bytes 0 … 255 or floats 0 … 1, shape (H, W, 3), registered to the depth image.
+        color: whole numbers up to the largest of their type or floats 0 … 1, shape (H, W, 3), registered to the depth image.
         distortion_model: "brown_conrady" (straight rays to bent ones),
             "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones, as in RealSense's SDK) or
             "kannala_brandt" (OpenCV's fisheye).
+        within: only points in a box, which is faster than to choose them afterwards: the pose of the camera in the frame of the box, shape (4, 4),
+            and two corners of the box, lower first [m], shapes (3,).
     Returns:
         The cloud in row-major order of the pixels, pixels without depth left out.
     Raises:
@@ -78,13 +85,38 @@ def cloud_from_depth(
         raise InputError("the depth image has the wrong shape", where="depth", found=image.shape, expected="(H, W)")
     focal = np.array([positive(fx, "fx"), positive(fy, "fy")])
     unit = positive(depth_unit_m, "depth_unit_m")
-    row, column = np.nonzero(np.isfinite(image) & (image > 0))
-    rays = (np.stack([column, row], axis=1) - [cx, cy]) / focal
     lens = np.asarray(distortion, dtype=np.float64).ravel()
-    rays = straight_rays(rays, lens, distortion_model)
-    z = image[row, column].astype(np.float64) * unit
-    colors = None if color is None else _pixel_colors(color, image.shape)[row, column]
-    return PointCloud(np.column_stack([rays * z[:, None], z]), colors)
+    T, low, high = EVERYWHERE if within is None or lens.any() else within
+    points, seen = _lifted(np.ascontiguousarray(image), cx, cy, focal[0], focal[1], unit, T[:3], low, high)
+    if lens.any():
+        points[:, :2] = straight_rays(points[:, :2] / points[:, 2:], lens, distortion_model) * points[:, 2:]
+    colors = None if color is None else _pixel_colors(color, image.shape, seen)
+    return PointCloud(points, colors)
+
+
+EVERYWHERE = (np.eye(4), np.full(3, -np.inf), np.full(3, np.inf))
+"""A box that holds everything, see `cloud_from_depth`."""
+
+
+@njit(cache=True)
+def _lifted(depth, cx, cy, fx, fy, unit, T, low, high):  # type: ignore[no-untyped-def]
+    """Return the points along straight rays that lie in a box, and their places in the flat image."""
+    height, width = depth.shape
+    points, seen, count = np.empty((height * width, 3)), np.empty(height * width, dtype=np.int64), 0
+    for v in range(height):
+        for u in range(width):
+            z = depth[v, u] * unit
+            if not 0.0 < z < np.inf:
+                continue
+            x, y = (u - cx) / fx * z, (v - cy) / fy * z
+            inside = True
+            for c in range(3):
+                placed = T[c, 0] * x + T[c, 1] * y + T[c, 2] * z + T[c, 3]
+                inside = inside and low[c] <= placed <= high[c]
+            if inside:
+                points[count, 0], points[count, 1], points[count, 2], seen[count] = x, y, z, v * width + u
+                count += 1
+    return points[:count].copy(), seen[:count].copy()
 
 
 def without_mixed_pixels(depth: npt.ArrayLike, fx: float, fy: float) -> FloatArray:
@@ -167,8 +199,10 @@ def _undistort(rays: FloatArray, distortion: FloatArray) -> FloatArray:
     return straight
 
 
-def _pixel_colors(color: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+def _pixel_colors(color: npt.ArrayLike, shape: tuple[int, ...], seen: IntArray) -> FloatArray:
+    """Return the colours of some pixels by their places in a flat image, 0 … 1, shape (k, 3)."""
     image = np.asarray(color)
     if image.shape != (*shape, 3):
         raise InputError("the colour image does not fit", where="color", found=image.shape, expected=(*shape, 3))
-    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
+    own = image.reshape(-1, 3)[seen]
+    return own / np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else own.astype(np.float64)

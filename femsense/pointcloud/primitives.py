@@ -308,7 +308,8 @@ def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
     """Return points that hang together, the largest group first."""
     if len(points) < 3:
         return []
-    gaps = np.asarray(cKDTree(points).query(points, k=min(4, len(points)))[0])
+    some = points[:: max(1, len(points) // MOST_POINTS)]
+    gaps = np.asarray(cKDTree(points, balanced_tree=False, compact_nodes=False).query(some, k=min(4, len(points)))[0])
     spacing = float(np.median(gaps[:, -1]))
     label = euclidean_clusters(points, max(2.5 * spacing, 3.0 * float(np.median(std))), 5)
     return [np.flatnonzero(label == i) for i in range(int(label.max(initial=-1)) + 1)]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.pointcloud.casting import rays_through
 
-ALTERNATIONS = 3
-"""Projections between a ray and the surface that it passes."""
 GRAZING = 0.25
 """Rays that meet the surface at a smaller |cos| say little and err at silhouettes:
 one pixel beside it they miss (METHODS section 3)."""
@@ -53,14 +53,16 @@ class Surface:
 
     def __init__(self, positions: FloatArray, triangles: IntArray) -> None:
         """positions: nodes [m], shape (n, 3); triangles: outward, shape (t, 3)."""
+        self.positions, self.triangles = positions, triangles
+
+    @cached_property
+    def _scene(self):  # type: ignore[no-untyped-def]
+        """Open3D's scene of it, whose boxes take a millisecond to build."""
         import open3d as o3d
 
-        self.positions, self.triangles = positions, triangles
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(positions, dtype=np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
-        )
+        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(_tensor(self.positions), o3d.core.Tensor(np.ascontiguousarray(self.triangles, dtype=np.uint32)))
+        return scene
 
     def cast(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
         """Return how measured points lie to what their rays meet.
@@ -89,23 +91,21 @@ class Surface:
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
         return hits.pick((gap <= reach) & looking)
 
-    def beside_rays(self, points: FloatArray, origins: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far the rays through points (k, 3) pass the surface near them [m], 0 where they meet it, and how far behind each point they do so
-        [m]; both of shape (k,).
+    def beside_rays(self, points: FloatArray, origin: FloatArray, *, within: float) -> tuple[FloatArray, FloatArray]:
+        """Return how far the rays of a camera through points (k, 3) pass the surface near them [m], 0 where they meet it, and how far behind each point they
+        do so [m]; both of shape (k,), inf where a ray passes beyond an angle `within` [rad].
 
-        The closest point of the surface is projected onto a ray that misses, and again from there (alternating projections).
+        Arguments:
+            origin: centre of the camera [m], shape (3,).
         """
-        ray = points - origins
-        ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
-        along = self._scene.cast_rays(_tensor(np.hstack([origins, ray])))["t_hit"].numpy().astype(np.float64)
-        beside, missed = np.zeros(len(points)), np.flatnonzero(~np.isfinite(along))
-        at, start, way = points[missed], origins[missed], ray[missed]
-        for _ in range(ALTERNATIONS):
-            closest = self._scene.compute_closest_points(_tensor(at))["points"].numpy().astype(np.float64)
-            along[missed] = np.einsum("kc,kc->k", closest - start, way)
-            at = start + along[missed, None] * way
-        beside[missed] = self.gap(at)
-        return beside, along - np.einsum("kc,kc->k", points - origins, ray)
+        if not len(points):
+            return np.zeros(0), np.zeros(0)
+        met, _, along = rays_through(points, origin).cast(self.positions, self.triangles)
+        passes, missed = np.zeros(len(points)), np.flatnonzero(met < 0)
+        if len(missed):
+            rays = rays_through(points[missed], origin)
+            passes[missed], along[missed] = rays.beside(self.positions, self.triangles, within=within)
+        return passes, along - np.linalg.norm(points - origin, axis=1)
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""

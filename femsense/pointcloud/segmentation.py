@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, read_only
 from femsense.core.errors import InputError
 from femsense.core.kernels import njit
 from femsense.pointcloud.cloud import PointCloud
@@ -116,10 +116,19 @@ def color_mask(
         raise InputError(
             "too dark to be told from shadow", where="color_rgb", found=color_rgb, expected=f"a length above {_DARK}"
         )
-    lengths = np.linalg.norm(rgb, axis=1)
-    cosine = rgb @ (wanted / length) / np.maximum(lengths, 1e-12)
-    in_light = (lengths >= max(shade[0] * length, _DARK)) & (lengths <= shade[1] * length)
-    return np.asarray(in_light & (cosine >= np.cos(np.deg2rad(tolerance_deg))))
+    mask = np.empty(len(rgb), dtype=np.bool_)
+    light = max(shade[0] * length, _DARK), shade[1] * length
+    _in_colour(read_only(rgb), wanted / length, *light, float(np.cos(np.deg2rad(tolerance_deg))), mask)
+    return mask
+
+
+@njit(cache=True)
+def _in_colour(rgb, wanted, dark, bright, cosine, mask):  # type: ignore[no-untyped-def]
+    """Write which colours are within an angle of a unit vector, and neither too dark nor too bright."""
+    for i in range(len(rgb)):
+        length = np.sqrt(rgb[i, 0] ** 2 + rgb[i, 1] ** 2 + rgb[i, 2] ** 2)
+        along = rgb[i, 0] * wanted[0] + rgb[i, 1] * wanted[1] + rgb[i, 2] * wanted[2]
+        mask[i] = dark <= length <= bright and along >= cosine * length
 
 
 def segment_robot(

@@ -108,7 +108,7 @@ def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | Non
 
 def _stood(model: Model, best: Fit) -> float | None:
     """Return J of the best hypothesis with the background from where the cameras stood."""
-    frame = replace(best.frame, objects=(), background=background_rows(model, best.frame.index))
+    frame = replace(best.frame, objects=(), background=background_rows(model, best.frame))
     again = fit(model, frame, best.contacts, best.forces, best.state, tau=best.tau, linearised=best.linearised)
     return None if again is None else again.criterion
 
@@ -127,7 +127,7 @@ def _at(model: Model, step: FloatArray) -> Model:
 
 def _seen_from(model: Model, frame: Frame) -> Frame:
     assert frame.scan is not None
-    return replace(frame, pixels=model.pixels(frame.scan), objects=(), background=background_rows(model, frame.index))
+    return replace(frame, pixels=model.pixels(frame.scan), objects=(), background=background_rows(model, frame))
 
 
 def _seen_at(model: Model, there: Model, contact: Touch) -> Touch:
@@ -140,7 +140,7 @@ def _seen_at(model: Model, there: Model, contact: Touch) -> Touch:
 
 
 def _misfit_of_background(model: Model, best: Fit) -> float:
-    rows = background_rows(model, best.frame.index)
+    rows = background_rows(model, best.frame)
     return 0.0 if rows is None else misfit(rows.residual, rows.log_other, rows.share)[0]
 
 

@@ -102,9 +102,9 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     elif given := given_touches(model.sensor):
         best = _at_given_places(model, frame, given, best, previous)
     else:
-        best = _with_objects_in_touch(model, _searched(model, best))
+        best = _with_objects_in_touch(model, *_searched(model, best))
     clock.lap("search")
-    before = rms_of(model.rows(frame, frame.predicted), inliers(best))
+    before = rms_of(_without_forces(best), inliers(best))
     clock.lap("state")
     return Estimate(best, before, clock.stages)
 
@@ -127,20 +127,32 @@ def rms_of(rows: Rows, robot: BoolArray) -> float:
     return float(np.sqrt((own**2).sum() / max(len(own), 1))) if len(own) else float("nan")
 
 
+def _without_forces(best: Fit) -> Rows:
+    """Return the rows of a fit with the residual of the predicted state, at the same points of the body."""
+    back = best.state.positions - best.frame.predicted.positions
+    return replace(best.rows, residual=best.rows.residual + best.rows.of(back[None])[:, 0])
+
+
 def measurements(rows: Rows) -> int:
     """Return the number of pixels, or of markers."""
     return int(rows.pixel.sum()) if rows.pixel.any() else len(rows) // 3
 
 
-def _searched(model: Model, best: Fit) -> Fit:
-    """Return the best fit after proposals have stopped to lower J."""
+def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
+    """Return the best fit after proposals have stopped to lower J, and where seen objects touch there."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
-        better = next((found for found in _fits(model, best) if found.criterion < best.criterion - TOLERANCE), None)
+        seen = _seen(model, best)
+        better = next((found for found in _fits(model, best, seen) if found.criterion < best.criterion - TOLERANCE), None)
         if better is None:
-            break
+            return best, seen
         best = better
-    return best
+    return best, _seen(model, best)
+
+
+def _seen(model: Model, best: Fit) -> list[Touch]:
+    """Return where seen objects touch the state of a fit."""
+    return away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.objects, best.state))
 
 
 def _with_objects(model: Model, best: Fit) -> Fit:
@@ -183,14 +195,13 @@ def _is_alike(first: Shape, second: Shape) -> bool:
     return first.kind == second.kind and float(np.linalg.norm(first.center - second.center)) < max(first.std_m, second.std_m)
 
 
-def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
+def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
     """Return the best hypothesis fitted again with all that touches and whose force the data do not determine, where there is any.
 
     Objects in touch that are no contacts have no significant force. Left out, they would bias those of their neighbours and make their intervals too narrow.
     An object whose surface lies at the body's becomes a contact with a wide interval, another one a latent force. So does a visible contact whose force is
     not significant: of two tips that squeeze a body the pixels tell the difference, and the smallest τ would call both forces zero.
     """
-    touching = away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.scan, best.frame.objects, best.state))
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
@@ -233,13 +244,13 @@ def _is_object(contact: Touch) -> bool:
     return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
 
 
-def _fits(model: Model, best: Fit) -> Iterator[Fit]:
-    """Yield fits of the most promising proposals, one after the other.
+def _fits(model: Model, best: Fit, seen: Sequence[Touch]) -> Iterator[Fit]:
+    """Yield fits of the most promising proposals, one after the other; seen: where seen objects touch.
 
     Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
     """
     most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
-    for one in [one for one in proposals(model, best) if len(one.contacts) <= most][:FITTED]:
+    for one in [one for one in proposals(model, best, seen) if len(one.contacts) <= most][:FITTED]:
         start = best.state if best.contacts and one.contacts else best.frame.predicted
         found = fit(model, best.frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
         if found is not None:
@@ -305,7 +316,7 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
     ):
         return None
     start = _expected(frame.predicted, previous)
-    seen = away_from_scenery(model.sensor, object_touches(model.sensor, frame.scan, frame.objects, start))
+    seen = away_from_scenery(model.sensor, object_touches(model.sensor, frame.objects, start))
     kept = [i for i, contact in enumerate(previous.touches) if not contact.undetermined]
     if not kept:
         return None

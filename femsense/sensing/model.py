@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from femsense.calib.condensed_scan import block_side, in_blocks
-from femsense.calib.scan import Scan, read_scan
+from femsense.calib.scan import Scan, pixel_angles, read_scan
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.fem.assembly import internal
@@ -139,8 +139,8 @@ class Model:
 
 def pixels_of(model: Model, k: int, state: Equilibrium) -> Scan | None:
     """Return what the cameras see in frame k near a state, the robot's pixels in blocks; None where the recording has no clouds. Raises FemsenseError."""
-    scan = scan_of(model.sensor, k, state)
-    return None if scan is None else in_blocks(scan, model.noises, model.block)
+    scan, recording = scan_of(model.sensor, k, state), model.sensor.recording
+    return None if scan is None else in_blocks(scan, model.noises, pixel_angles(recording, k, scan), model.block)
 
 
 def block_of(sensor: Sensor) -> int:

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray
 from femsense.inference.pixels import rows_on
 from femsense.inference.rows import Rows
 from femsense.pointcloud.primitives import Shape, same_object
@@ -113,31 +113,23 @@ def _closest(model: Model, shape: Shape, positions: FloatArray, near: FloatArray
         near: only surface within a zone about this place at rest [m], shape (3,).
     """
     sensor, surface = model.sensor, model.sensor.surface
-    rest = model.skin.rest
-    considered = _free_triangles(model)
+    considered = sensor.touchable
     if near is not None:
-        middle = rest[surface.triangles[considered]].mean(axis=1)
+        middle = model.skin.rest[surface.triangles[considered]].mean(axis=1)
         considered = considered[np.linalg.norm(middle - near, axis=1) < ZONE * surface.edge]
-    by_node = np.full(len(positions), np.inf)
-    nodes = np.unique(surface.triangles[considered])
-    if not len(nodes):
+    if not len(considered):
         return None
-    by_node[nodes] = shape.distance(positions[nodes], within=2.0 * surface.edge + 0.02 * sensor.size)
-    least = float(by_node[nodes].min())
+    by_node = np.full(len(positions), np.inf)
+    by_node[surface.nodes] = shape.distance(positions[surface.nodes], within=2.0 * surface.edge + 0.02 * sensor.size)
+    by_corner = by_node[surface.triangles[considered]].min(axis=1)
+    least = float(by_corner.min())
     if not np.isfinite(least):
         return None
-    close = considered[by_node[surface.triangles[considered]].min(axis=1) <= least + surface.edge]
+    close = considered[by_corner <= least + surface.edge]
     places = np.einsum("wi,tic->twc", LATTICE, positions[surface.triangles[close]])
     gap = shape.distance(places.reshape(-1, 3)).reshape(len(close), -1)
     t, w = np.unravel_index(int(np.argmin(gap)), gap.shape)
     return int(close[t]), LATTICE[w], float(gap[t, w])
-
-
-def _free_triangles(model: Model) -> IntArray:
-    """Return the triangles that are not on the clamp, where a holder always touches."""
-    clamped = np.zeros(len(model.skin.rest), dtype=bool)
-    clamped[model.sensor.robot.body.clamped] = True
-    return np.flatnonzero(~clamped[model.skin.triangles].any(axis=1))
 
 
 def _row(

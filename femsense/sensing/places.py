@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from femsense.calib.scan import Scan, pixel_of
+from femsense.calib.scan import Scan, in_box, pixel_of
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording_parts import Tool
 from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
-from femsense.pointcloud.primitives import FEWEST, OUTLIERS, Shape, find_shapes, fit_ball, fit_shape
+from femsense.pointcloud.primitives import FEWEST, OUTLIERS, Shape, find_shapes, fit_ball, fit_shape, same_object
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
@@ -37,10 +37,10 @@ WINDOWED = 2.0
 """A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
 BLEEDING = 3.0
 """Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
-ASKED = 100
-"""Points of an object that tell whether it is an edge of the body's."""
 AGAIN = 2.0
 """A ball is the one of the frame before where its points are nearer than so many radii to where that one's centre was."""
+SIXTHS = np.array([[i, j, 6 - i - j] for i in range(7) for j in range(7 - i)]) / 6.0
+"""Barycentric points of a triangle at which the distance of an object is taken, shape (28, 3)."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -65,8 +65,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
     if len(points) < 3:
         return []
     reach = (NEAR + LOCAL) * sensor.size
-    low, high = state.positions.min(axis=0) - reach, state.positions.max(axis=0) + reach
-    close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    close = np.flatnonzero(in_box(points, state.positions, reach))
     gap = np.full(len(points), np.inf)
     body = Surface(state.positions, sensor.surface.triangles)
     gap[close] = body.signed_gap(points[close], within=reach)
@@ -102,9 +101,9 @@ class Edges:
     halo: BoolArray
     """Whether stereo matching may have added it around the silhouette, shape (o,)."""
     passes: FloatArray
-    """How far its ray passes the body [m], 0 where it meets a face, shape (o,)."""
+    """How far its ray passes the body [m], 0 where it meets a face, inf where it passes it by more than a camera may add, shape (o,)."""
     behind: FloatArray
-    """How far behind the point that is [m], shape (o,)."""
+    """How far behind the point that is [m], inf where the ray passes farther, shape (o,)."""
     std: FloatArray
     """Of each point along its ray, times √T: neighbours err together [m], shape (o,)."""
     model: float
@@ -141,10 +140,12 @@ def _edges(
     std, width = known.depth_std(depth, view), BLEEDING * pixel[view] * depth
     matched = np.array([noise.kind == "stereo" for noise in noises])[view] & (known.together > WINDOWED)
     close = np.abs(gap) < width + 3.0 * std
-    asked = np.flatnonzero(matched | close)
-    passes, behind = np.full(len(points), np.inf), np.zeros(len(points))
-    passes[asked], behind[asked] = body.beside_rays(points[asked], origins[asked])
-    halo = matched & (behind < width) & ((gap < width) | ((passes > 0.0) & (passes < width)))
+    passes, behind = np.full(len(points), np.inf), np.full(len(points), np.inf)
+    for v in np.unique(view):
+        own = np.flatnonzero((matched | close) & (view == v))
+        origin = sensor.calibration.poses[v][:3, 3]
+        passes[own], behind[own] = body.beside_rays(points[own], origin, within=BLEEDING * pixel[v])
+    halo = matched & (behind < width) & ((gap < width) | (passes > 0.0))
     way = float(np.linalg.norm(state.positions - sensor.robot.body.mesh.nodes, axis=1).max())
     model = float(np.hypot(known.bias_m, known.model_share * way))
     return Edges(close, halo, passes, behind, np.sqrt(known.together) * std, model)
@@ -154,15 +155,6 @@ def _pixel_of(sensor: Sensor, scan: Scan, view: int) -> float:
     """Return the angle between neighbouring rays of a camera [rad]."""
     camera = sensor.recording.cameras[view]
     return pixel_of(scan, view) if camera is None else 1.0 / camera.fx
-
-
-def _is_edge(sensor: Sensor, scan: Scan, state: Equilibrium, body: Surface, shape: Shape) -> bool:
-    """Return whether the points of an object may be what a camera shows of the body's own edge in a state."""
-    points = shape.points[:: max(1, len(shape.points) // ASKED)]
-    view = np.full(len(points), int(np.argmax(shape.seen_by)))
-    origins = sensor.calibration.poses[view[0]][:3, 3] + np.zeros((len(points), 1))
-    edges = _edges(sensor, scan, state, body, points, body.gap(points), origins, view)
-    return edges.consist_of(np.arange(len(points)))
 
 
 def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
@@ -204,36 +196,37 @@ def _fit_of(tool: Tool, points: FloatArray, std: FloatArray, origins: FloatArray
     return register(known, points, std, origins)
 
 
-def object_touches(sensor: Sensor, scan: Scan | None, shapes: Sequence[Shape], state: Equilibrium) -> list[Touch]:
-    """Return where completed objects touch a state, the nearest part of each.
-
-    A force may have moved the body to where points of its own, at an edge or in a dark crease, were taken for an object.
-    """
-    body = Surface(state.positions, sensor.surface.triangles)
-    others = [shape for shape in shapes if scan is None or not _is_edge(sensor, scan, state, body, shape)]
-    found = [_touch(sensor, shape, state) for shape in others]
+def object_touches(sensor: Sensor, shapes: Sequence[Shape], state: Equilibrium) -> list[Touch]:
+    """Return where completed objects touch a state, the nearest part of each."""
+    found = [_touch(sensor, shape, state) for shape in shapes]
     return [touch for touch in found if touch is not None]
 
 
 def away_from_scenery(sensor: Sensor, touches: Sequence[Touch]) -> list[Touch]:
-    """Return the touches that are not where something seems to touch in a free frame too: a holder, the table."""
-    return [t for t in touches if not any(np.linalg.norm(t.place - place) < ZONE * sensor.size for place in sensor.scenery)]
+    """Return the touches that are not where something seems to touch in a free frame too, a holder or the table, nor with what passes through the body."""
+    return [
+        t
+        for t in touches
+        if not any(np.linalg.norm(t.place - place) < ZONE * sensor.size for place in sensor.scenery)
+        and not any(t.shape is not None and same_object(t.shape, one) for one in sensor.passing)
+    ]
 
 
 def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     triangles, corners = sensor.surface.triangles, state.positions[sensor.surface.nodes]
     shape = shape.towards(corners)
-    corner = shape.distance(corners, within=1.01 * NEAR * sensor.size + sensor.surface.edge)
-    if corner.min() > NEAR * sensor.size:
+    std = float(np.hypot(shape.std_m, FLOOR_STD))
+    touching = SLACK * std + shape.behind_m + (0.0 if shape.kind != "points" else 2.0 * shape.std_m)
+    corner = shape.distance(corners, within=touching + 3.0 * sensor.surface.edge)
+    if corner.min() > touching + 2.0 * sensor.surface.edge:  # too far for any point between the nodes
         return None
     by_node = np.full(len(state.positions), np.inf)
     by_node[sensor.surface.nodes] = corner
     closest = triangles[by_node[triangles].min(axis=1) <= corner.min() + sensor.surface.edge]
-    weights = _lattice(6)
+    weights = SIXTHS
     places = np.einsum("wi,tic->twc", weights, state.positions[closest]).reshape(-1, 3)
     distance = shape.distance(places)
-    std = float(np.hypot(shape.std_m, FLOOR_STD))
-    if distance.min() > SLACK * std + shape.behind_m + (0.0 if shape.kind != "points" else 2.0 * shape.std_m):
+    if distance.min() > touching:
         return None
     rest = np.einsum("wi,tic->twc", weights, sensor.robot.body.mesh.nodes[closest]).reshape(-1, 3)
     best = int(np.argmin(distance))
@@ -281,13 +274,6 @@ def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatA
     shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way)
     least = max(0.5 * min(shape.std_m, FLOOR_STD), TILT)
     return np.asarray(np.maximum(least, shared * np.minimum(1.0, apart / sensor.error_field.length)))
-
-
-def _lattice(parts: int) -> FloatArray:
-    """Return barycentric coordinates of a lattice in a triangle, shape (w, 3)."""
-    i, j = np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij")
-    keep = i + j <= parts
-    return np.column_stack([i[keep], j[keep], parts - i[keep] - j[keep]]) / parts
 
 
 def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:

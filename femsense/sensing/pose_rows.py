@@ -10,9 +10,9 @@ from femsense.core.arrays import FloatArray
 from femsense.inference.mixture import misfit
 from femsense.inference.nuisance import fit_nuisance
 from femsense.inference.rows import Rows, stacked
-from femsense.sensing.background import look, off_background
+from femsense.sensing.background import off_background
 from femsense.sensing.fit import whitened
-from femsense.sensing.model import Fit, Model
+from femsense.sensing.model import Fit, Frame, Model
 
 FAR = 0.1
 """Prior of a pose that has moved: one standard deviation in radians and in shares of the body's diagonal."""
@@ -27,15 +27,12 @@ def far(model: Model) -> FloatArray:
     return np.tile(np.repeat([FAR, FAR * model.sensor.size], 3), model.views)
 
 
-def background_rows(model: Model, k: int) -> Rows | None:
-    """Return the rows of the background of frame k, which move with the poses alone; None where no contact-free frame shows enough of it."""
+def background_rows(model: Model, frame: Frame) -> Rows | None:
+    """Return the rows of the background of a frame, which move with the poses alone; None where no contact-free frame shows enough of it."""
     sensor = model.sensor
-    if sensor.background is None:
+    if sensor.background is None or frame.scan is None or not len(frame.scan.far):
         return None
-    glance = look(sensor, k)
-    if not len(glance.view):
-        return None
-    off, by_pose = off_background(sensor, sensor.background, glance, sensor.calibration.poses)
+    off, by_pose = off_background(sensor, sensor.background, frame.scan, sensor.calibration.poses)
     told = by_pose.any(axis=1)
     off, by_pose, r = off[told], by_pose[told], int(told.sum())
     zeros = np.zeros((r, 3))
@@ -66,7 +63,7 @@ def pose_gain(model: Model, best: Fit) -> float:
     S = WX.T @ P
     Y = np.linalg.solve(np.eye(X.shape[1]) + WX.T @ X, np.column_stack([S, WX.T @ left - p]))
     gain = _lowered((P * W).T @ left - S.T @ Y[:, -1], P.T @ (P * W) - S.T @ Y[:, :-1])
-    background = background_rows(model, best.frame.index)
+    background = background_rows(model, best.frame)
     if background is not None:
         B = background.by_pose * far(model)
         weight = background.share / np.maximum(1.0, np.abs(background.residual) / HUBER)
@@ -93,7 +90,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
     P = best.C[:, : 6 * model.views] * far(model)
     rows, A = best.rows, np.hstack([best.N, J, P])
     start = np.concatenate([best.eta, at, np.zeros(P.shape[1])])
-    background = background_rows(model, best.frame.index)
+    background = background_rows(model, best.frame)
     before = best.evidence
     if background is not None:
         B = np.hstack([np.zeros((len(background), best.N.shape[1] + J.shape[1])), background.by_pose * far(model)])

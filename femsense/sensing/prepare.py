@@ -81,6 +81,7 @@ def make_sensor(
         surface,
         options,
         places,
+        np.flatnonzero(~np.isin(surface.triangles, robot.body.clamped).any(axis=1)),
         spread_features(robot.body, CANDIDATES, among=flat_nodes(surface, robot.body.mesh.nodes)),
         pose_pivot(robot),
         size,
@@ -196,7 +197,8 @@ def _with_scenery(sensor: Sensor) -> Sensor:
         except FemsenseError:
             continue
         corners = state.positions[sensor.surface.nodes]
-        inside = [one for one in shapes if one.kind != "points" and one.towards(corners).distance(corners).min() < 0.0]
-        touching = np.array([touch.place for touch in object_touches(sensor, scan, shapes, state)]).reshape(-1, 3)
-        return replace(sensor, scenery=touching, overlapping=tuple(inside))
+        deep = [0.0 if one.kind == "points" else float(one.towards(corners).distance(corners).min()) for one in shapes]
+        inside, passing = (tuple(one for one, gap in zip(shapes, deep) if gap < most) for most in (0.0, -sensor.surface.edge))
+        touching = np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
+        return replace(sensor, scenery=touching, overlapping=inside, passing=passing)
     return sensor

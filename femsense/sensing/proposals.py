@@ -16,13 +16,12 @@ from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
 from femsense.inference.rows import Rows
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, force_scale, whitened
+from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, fit, force_scale, whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
-from femsense.sensing.places import away_from_scenery, object_touches
 from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Touch
+from femsense.sensing.types import Sensor, Touch
 
 SIZES = (0.05, 0.2, 0.8)
 """Prior scales τ of a force for which the linearised evidence is taken [N]."""
@@ -47,10 +46,9 @@ class Proposal:
     tau: FloatArray
 
 
-def proposals(model: Model, best: Fit) -> list[Proposal]:
-    """Return hypotheses next to the best one so far, the most promising first."""
+def proposals(model: Model, best: Fit, seen: Sequence[Touch]) -> list[Proposal]:
+    """Return hypotheses next to the best one so far, the most promising first; seen: where seen objects touch."""
     near = vicinity(model, best)
-    seen = away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.scan, best.frame.objects, best.state))
     found = [*_dropped(best), *_at_objects(near, seen), *_at_candidates(near)]
     return sorted(found, key=lambda one: -one.gain)
 
@@ -58,7 +56,7 @@ def proposals(model: Model, best: Fit) -> list[Proposal]:
 def inferred_gain(model: Model, best: Fit) -> float:
     """Return by how much one more contact, pushing where no camera sees it, lowers J of a fit, marginalised over the candidates."""
     near = vicinity(model, best)
-    return _inferred(near, at_candidates(near), pulls=False)[0]
+    return _inferred(near, at_candidates(near), pulls=False).gain
 
 
 # --- the vicinity of a fit ------------------------------------------------------------------------------------------------
@@ -224,16 +222,17 @@ def _is_there(model: Model, best: Fit, seen: Touch) -> bool:
 
 def _at_candidates(near: Vicinity) -> list[Proposal]:
     """Return inferred contacts, pushing or hanging where there is gravity: added, and in place of each contact where they fit better without it."""
-    best, sites = near.fit, at_candidates(near)
+    best, at = near.fit, at_candidates(near)
     found = []
     for pulls in (False, True) if near.model.upward.any() else (False,):
-        gain, others = _inferred(near, sites, pulls=pulls)
-        if gain > 0.0:
-            found += [_added(best, contact, force, gain) for contact, force in others]
+        added = _inferred(near, at, pulls=pulls)
+        if added.gain > 0.0:
+            found += [_added(best, contact, force, added.gain) for contact, force in added.places(near.model.sensor)]
         for i, odds in enumerate(best.odds):
-            gain, others = _inferred(near, sites, pulls=pulls, without=i)
-            if gain + odds > 0.0:
-                found += [_replaced(best, i, contact, force, gain + odds) for contact, force in others]
+            moved = _inferred(near, at, pulls=pulls, without=i)
+            gain = moved.gain + float(odds)
+            if gain > 0.0:
+                found += [_replaced(best, i, contact, force, gain) for contact, force in moved.places(near.model.sensor)]
     return found
 
 
@@ -270,30 +269,50 @@ def at_candidates(near: Vicinity) -> AtCandidates:
     return AtCandidates(near.sites(model.answers_near(best.state)), normals, in_sight(model, best.rows, model.skin.rest[nodes]))
 
 
-def _inferred(
-    near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None = None
-) -> tuple[float, list[tuple[Touch, FloatArray]]]:
-    """Return by how much one more contact lowers J, marginalised over the candidates, and the best places with their forces.
+@dataclass(frozen=True, eq=False, slots=True)
+class Inferred:
+    """One more contact at any of the candidates."""
+
+    gain: float
+    """By how much it lowers J, marginalised over the candidates; relative to the place of the contact that it replaces."""
+    gains: FloatArray
+    """… at each candidate, shape (c,)."""
+    forces: FloatArray
+    """[N], shape (c, 3)."""
+    pulls: bool
+
+    def places(self, sensor: Sensor) -> list[tuple[Touch, FloatArray]]:
+        """Return contacts at the best candidates with their forces."""
+        std, top = float(np.sqrt(sensor.surface.area.sum() / (2.0 * np.pi))), float(self.gains.max())
+        found: list[tuple[Touch, FloatArray]] = []
+        for i in np.argsort(-self.gains):
+            place = sensor.robot.body.mesh.nodes[sensor.candidates[i]]
+            if len(found) == SEARCHED or self.gains[i] < top - CLOSE:
+                break
+            if all(np.linalg.norm(place - contact.place) > SAME * sensor.size for contact, _ in found):
+                contact = make_touch(sensor, place, source="shape", std_m=std)
+                found.append((replace(contact, pulls=self.pulls), self.forces[i]))
+        return found
+
+
+def _inferred(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None = None) -> Inferred:
+    """Return what one more contact at the candidates gains.
 
     Arguments:
         pulls: ask for hanging weights, whose forces keep to no cone.
         without: a contact of the fit that is removed; the gain is then relative to its own place.
     """
-    sensor = near.model.sensor
     gains, forces = _gains(near, at, pulls=pulls, without=without)
-    if not np.isfinite(gains).any():
-        return -np.inf, []
     top = float(gains.max())
-    total = top + 2.0 * np.log(np.exp(0.5 * (gains - top)).mean())  # all candidates are equally likely beforehand
-    std = float(np.sqrt(sensor.surface.area.sum() / (2.0 * np.pi)))
-    found: list[tuple[Touch, FloatArray]] = []
-    for i in np.argsort(-gains):
-        place = sensor.robot.body.mesh.nodes[sensor.candidates[i]]
-        if len(found) == SEARCHED or gains[i] < top - CLOSE:
-            break
-        if all(np.linalg.norm(place - contact.place) > SAME * sensor.size for contact, _ in found):
-            found.append((replace(make_touch(sensor, place, source="shape", std_m=std), pulls=pulls), forces[i]))
-    return (total if without is None else top - _gain_at_own_place(near, without)), found
+    if not np.isfinite(top):
+        return Inferred(-np.inf, gains, forces, pulls)
+    # All candidates are equally likely beforehand.
+    total = (
+        top + 2.0 * float(np.log(np.exp(0.5 * (gains - top)).mean()))
+        if without is None
+        else top - _gain_at_own_place(near, without)
+    )
+    return Inferred(total, gains, forces, pulls)
 
 
 def _gains(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None) -> tuple[FloatArray, FloatArray]:
@@ -308,8 +327,8 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
     """Return what the posterior probability of all other places adds to the covariance of each contact point [m²], shape (m, 3, 3); 0 where the place is
     seen or given.
 
-    A thin body hardly shows on which of its sides it is pushed or pulled: the Laplace approximation about the best place does not know of the other side.
-    The point on the other side has the Laplace volume of the place itself, each candidate its share of the surface.
+    A thin body hardly shows on which of its sides it is pushed or pulled: the Laplace approximation about the best place does not know of the other side,
+    where the contact is fitted again. That point has the Laplace volume of the place itself, each candidate its share of the surface.
     """
     added = np.zeros((len(best.contacts), 3, 3))
     inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
@@ -328,15 +347,11 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
         for pulls in ways:
             mass += share * _likelihood(_gains(near, at, pulls=pulls, without=i)[0] - own)
         mass[np.linalg.norm(points, axis=1) < np.sqrt(share)] = 0.0
-        if (other := _other_side(model, best, i)) is not None:
-            way = other.patch.mean(positions) - place
+        if (other := _on_other_side(model, best, i)) is not None:
+            way = other.contacts[i].patch.mean(other.state.positions) - place
             mass[np.linalg.norm(points - way, axis=1) < np.sqrt(share)] = 0.0
-            there = [replace(other, pulls=pulls) for pulls in ways]
-            axes = axes_at(model, there, best.state)
-            gains, _ = evidence_at(near, _at_touches(near, there), axes, np.array(ways), without=i)
-            odds = [odds_of(model, one, best.rows) for one in there]
             points = np.vstack([points, way])
-            mass = np.append(mass, volume * _likelihood(gains - odds - own).sum())
+            mass = np.append(mass, volume * _likelihood(np.array(best.criterion - other.criterion)))
         added[i] = (points * mass[:, None]).T @ points / (volume + mass.sum())
     return added
 
@@ -346,15 +361,21 @@ def _likelihood(gain: FloatArray) -> FloatArray:
     return np.asarray(np.exp(0.5 * np.minimum(gain, 0.0)))
 
 
-def _other_side(model: Model, best: Fit, i: int) -> Touch | None:
-    """Return an inferred contact where the line of the first axis of a force leaves the body on the other side."""
+def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
+    """Return the fit with an inferred contact where the line of its force leaves the body on the other side: a push in place of a weight that hangs there, a
+    weight in place of a push."""
     positions, contact = best.state.positions, best.contacts[i]
     axis, place = best.axes[i][0], contact.patch.mean(positions)
     body, within = Surface(positions, model.sensor.surface.triangles), FIRST * model.sensor.surface.edge
     for way in (-axis, axis):
         hits = body.cast((place + model.sensor.size * way)[None], (place + within * way)[None], reach=np.inf)
         if len(hits.nodes) and hits.normal[0] @ way > 0.0:
-            return make_touch(model.sensor, hits.place(model.skin.rest)[0], source="shape", std_m=contact.std_m)
+            touch = make_touch(model.sensor, hits.place(model.skin.rest)[0], source="shape", std_m=contact.std_m)
+            contacts = list(best.contacts)
+            contacts[i] = replace(touch, pulls=not contact.pulls)
+            if contacts[i].pulls and best.forces[i] @ model.upward >= 0.0:  # no weight pulls that way
+                return None
+            return fit(model, best.frame, contacts, best.forces, best.state, eta=best.eta, tau=best.tau)
     return None
 
 

@@ -258,6 +258,8 @@ class Sensor:
     options: SensingOptions
     places: FloatArray
     """Given places of contact at rest [m], shape (g, 3)."""
+    touchable: IntArray
+    """Triangles of the surface that are not on the clamp, where a holder always touches, shape (t,)."""
     candidates: IntArray
     """Surface nodes at which hidden contacts are searched, shape (c,)."""
     pivot: FloatArray
@@ -273,4 +275,6 @@ class Sensor:
     """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""
     overlapping: tuple[Shape, ...] = ()
     """Completed objects that overlap the body in a free frame: a floor that is said to pass through it."""
+    passing: tuple[Shape, ...] = ()
+    """Those that pass through it by more than an edge: they do not say where they touch."""
     background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it

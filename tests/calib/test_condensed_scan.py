@@ -26,7 +26,7 @@ def plate(tilt: float, step: float = 0.0) -> Scan:
 @pytest.mark.parametrize("tilt", [0.0, 1.0, 3.0])
 def test_means_lie_on_the_plane_and_stand_for_all_points(tilt: float) -> None:
     whole = plate(tilt)
-    few = in_blocks(whole, NOISES, block_side(len(whole.view), 2000))
+    few = in_blocks(whole, NOISES, [1.0 / FOCAL], block_side(len(whole.view), 2000))
     assert 1000 < len(few.view) < 3500 and few.measured.sum() == len(whole.view)
     off = few.camera_points[:, 2] - tilt * few.camera_points[:, 0] - 0.4
     assert np.abs(off).max() < 1e-12
@@ -35,10 +35,10 @@ def test_means_lie_on_the_plane_and_stand_for_all_points(tilt: float) -> None:
 
 def test_what_lies_on_both_sides_of_a_jump_is_not_averaged() -> None:
     scan = plate(0.0, step=0.05)
-    few = in_blocks(scan, NOISES, block_side(len(scan.view), 2000))
+    few = in_blocks(scan, NOISES, [1.0 / FOCAL], block_side(len(scan.view), 2000))
     assert np.minimum(np.abs(few.camera_points[:, 2] - 0.4), np.abs(few.camera_points[:, 2] - 0.45)).max() < 1e-12
 
 
 def test_few_points_stay_as_they_are() -> None:
     scan = plate(0.0)
-    assert in_blocks(scan, NOISES, block_side(len(scan.view), len(scan.view))) is scan
+    assert in_blocks(scan, NOISES, [1.0 / FOCAL], block_side(len(scan.view), len(scan.view))) is scan

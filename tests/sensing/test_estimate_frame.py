@@ -173,7 +173,7 @@ def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path)
     frame = replace(estimate_frame(model, 3, None).best.frame)
     start = fit(model, frame, (), np.zeros((0, 3)), frame.predicted)
     assert start is not None and not alone.contacts
-    best = max(proposals(model, start), key=lambda one: one.gain)
+    best = max(proposals(model, start, ()), key=lambda one: one.gain)
     found = fit(model, frame, best.contacts, best.forces, frame.predicted, tau=best.tau)
     assert found is not None
     gained = start.criterion - found.criterion

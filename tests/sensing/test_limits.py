@@ -159,7 +159,7 @@ def test_what_touches_in_a_free_frame_is_scenery(tmp_path):
     state = free_state(sensor, 3, None, None)
     scan = scan_of(sensor, 3, state)
     assert scan is not None
-    touches = object_touches(sensor, scan, objects_near(sensor, scan, state), state)
+    touches = object_touches(sensor, objects_near(sensor, scan, state), state)
     assert len(touches) == 1
     assert not away_from_scenery(sensor, touches)
     assert away_from_scenery(replace(sensor, scenery=np.zeros((0, 3))), touches) == touches

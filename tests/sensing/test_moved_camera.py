@@ -10,9 +10,10 @@ from arm import arm
 from touched_arm import PLACE, touched
 
 from femsense.calib.calibrate import calibrate
+from femsense.calib.scan import Scan, read_scan
 from femsense.core.pose import moved_poses
 from femsense.pointcloud.local_planes import local_planes
-from femsense.sensing.background import Glance, look, off_background
+from femsense.sensing.background import off_background
 from femsense.sensing.contact_free import learn
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
@@ -67,9 +68,13 @@ def test_points_off_the_background_move_with_the_pose_as_their_derivative_says(t
     seen = touched(tmp_path, np.zeros(3), ball=False, wall=True)
     sensor = learn(make_sensor(arm(), seen, calibrate(arm(), seen))).sensor
     assert sensor.background is not None
-    step, glance = 1e-4 * np.array([3.0, -2, 4, 1, 2, -1]), look(sensor, 2)
-    here, by_pose = off_background(sensor, sensor.background, glance, sensor.calibration.poses)
-    there, _ = off_background(sensor, sensor.background, glance, moved_poses(sensor.calibration.poses, step, sensor.pivot))
+    step, scan = (
+        1e-4 * np.array([3.0, -2, 4, 1, 2, -1]),
+        read_scan(arm(), seen, 2, sensor.calibration.poses, arm().body.mesh.nodes),
+    )
+    assert scan is not None
+    here, by_pose = off_background(sensor, sensor.background, scan, sensor.calibration.poses)
+    there, _ = off_background(sensor, sensor.background, scan, moved_poses(sensor.calibration.poses, step, sensor.pivot))
     assert np.median(np.abs(here)) < 1.0
     assert np.quantile(np.abs(there - here - by_pose @ step), 0.9) < 0.05 * np.abs(by_pose @ step).max()
 
@@ -84,6 +89,14 @@ def test_a_plane_that_is_seen_edge_on_says_nothing(tmp_path):
     facing = np.stack([y.ravel(), z.ravel() - 0.5, np.full(144, 0.5)], axis=1)
     for points, said in ((across, False), (facing, True)):
         planes = local_planes(points @ T[:3, :3].T + T[:3, 3])
-        glance = Glance(points + np.array([0.0, 1e-3, 1e-3]), np.zeros(144, dtype=np.int64))
-        off, by_pose = off_background(sensor, planes, glance, sensor.calibration.poses)
+        nothing = np.zeros(0, dtype=np.int64)
+        scan = Scan(
+            np.zeros((0, 3)),
+            nothing,
+            np.zeros((0, 3)),
+            nothing,
+            far=points + np.array([0.0, 1e-3, 1e-3]),
+            far_view=np.zeros(144, dtype=np.int64),
+        )
+        off, by_pose = off_background(sensor, planes, scan, sensor.calibration.poses)
         assert (np.abs(off) > 0).any() == said and (np.abs(by_pose) > 0).any() == said

@@ -38,7 +38,7 @@ def rod(tilt: float) -> Shape:
 def test_a_rod_is_placed_well_across_it_and_anywhere_along_it(sensor):
     state = replace(free_state(sensor, 0, None, None), positions=sensor.robot.body.mesh.nodes)
     for tilt in (0.0, 0.002, -0.002):  # as much as the model may be off between both ends
-        (touch,) = object_touches(sensor, None, [rod(tilt)], state)
+        (touch,) = object_touches(sensor, [rod(tilt)], state)
         ways, stds = ways_of(touch)
         assert abs(ways[0, 0]) > 0.98
         assert stds[0] > 0.012

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import arm
-from scipy.spatial import cKDTree
 from touched_arm import touched
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.pose import invert_pose, transform_points
-from femsense.pointcloud.primitives import Shape
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import sense
-from femsense.sensing.places import object_touches, objects_near
+from femsense.sensing.places import objects_near
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.touches import contact_radius, make_touch, pressed
 from femsense.sensing.types import SensedFrame, Sensor
@@ -32,32 +30,6 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sensor, SensedFram
     seen = touched(folder, FORCE, ball=True)
     model = learn(make_sensor(arm(), seen, calibrate(arm(), seen)))
     return model.sensor, sense(model, 3, None)
-
-
-def test_points_of_the_body_itself_touch_nothing_in_the_state_that_the_force_makes(pushed):
-    """A dark crease is not of the body's colour: in the state without forces its points lie beside the body."""
-    sensor, frame = pushed
-    upper = frame.state.positions[np.isclose(sensor.robot.body.mesh.nodes[:, 2], 0.01)]
-    crease = upper[np.linalg.norm(upper - frame.touches[0].place, axis=1) < 0.02]
-    shape = Shape("points", crease.mean(axis=0), np.eye(3), np.zeros(3), 0.0, 0.006, crease, cKDTree(crease))
-    scan = scan_of(sensor, 3, frame.state)
-    assert object_touches(sensor, scan, [shape], frame.free_state)
-    assert not object_touches(sensor, scan, [shape], frame.state)
-    assert object_touches(sensor, None, [shape], frame.state)
-
-
-def test_a_thin_plate_that_lies_on_the_body_is_an_object(pushed: tuple[Sensor, SensedFrame]) -> None:
-    """Its face lies within what a camera may add to an edge of the body, but in front of the body's own face."""
-    sensor, frame = pushed
-    u, v = np.meshgrid(np.linspace(0.04, 0.055, 20), np.linspace(-0.006, 0.006, 20))
-    body, scan = frame.free_state, scan_of(sensor, 3, frame.state)
-    top = np.interp(
-        u.ravel(), *np.sort(body.positions[np.isclose(sensor.robot.body.mesh.nodes[:, 2], 0.01)][:, [0, 2]], axis=0).T
-    )
-    for thickness, objects in ((0.001, 1), (0.0, 0)):
-        plate = np.column_stack([u.ravel(), v.ravel(), top + thickness])
-        shape = Shape("points", plate.mean(axis=0), np.eye(3), np.zeros(3), 0.0, 0.006, plate, cKDTree(plate))
-        assert len(object_touches(sensor, scan, [shape], body)) == objects
 
 
 def test_a_patch_is_as_wide_as_hertz_has_it(pushed: tuple[Sensor, SensedFrame]) -> None:

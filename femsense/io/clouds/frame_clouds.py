@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from femsense.core.arrays import IntArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.io.clouds.images import check_image_size, read_color, read_png
+from femsense.io.clouds.images import check_image_size, read_color_levels, read_png
 from femsense.io.tables import beside
 from femsense.model.camera import Camera
 from femsense.model.recording import Recording
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 FOLDERS = {"clouds": (".ply", ".pcd", ".xyz"), "depth": (".png",), "color": (".png", ".jpg", ".jpeg")}
 """Folders of a recording → suffixes of the files that are read there."""
+SPARSE = 4
+"""Pixels of a whole frame that are looked at for each point that is asked for: some show nothing, some the robot."""
 BESIDE = (".txt", ".md", ".json", ".toml", ".csv", ".yaml", ".yml")
 """Suffixes of other files that are allowed next to clouds and images."""
 
@@ -43,7 +46,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool
     if file is None:
         return None
     if file.suffix.lower() == ".png":
-        return _cloud_of_images(file, recording.color_files[k][view], recording.cameras[view], mixed)
+        return _cloud_of(*_images(file, recording.color_files[k][view], recording.cameras[view]), mixed=mixed)
     from femsense.io.clouds.cloud_files import read_cloud
     from femsense.pointcloud.pixel_grid import without_mixed_points
 
@@ -58,9 +61,35 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0, mixed: bool
         ) from None
 
 
-def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera | None, mixed: bool) -> PointCloud:
-    from femsense.pointcloud.cloud import cloud_from_depth, without_mixed_pixels
+def read_frame_parts(
+    recording: Recording, k: int, *, view: int, T: FloatArray, box: FloatArray, some: int
+) -> tuple[PointCloud, FloatArray] | None:
+    """Return the cloud of frame k about a body, without mixed pixels, and points of the whole frame [m], (m, 3); None where the frame has no cloud.
 
+    Of a depth image only what lies in a box becomes a cloud, and of the whole frame every so many-th pixel: a frame has ten times as many as are used.
+
+    Arguments:
+        recording, k, view: as for `read_frame_cloud`.
+        T: pose of the camera in the frame of the box, shape (4, 4).
+        box: lower and upper corner [m], shape (2, 3); the cloud may hold points outside.
+        some: points of the whole frame, at least, where it has as many.
+
+    Raises:
+        InputError: as for `read_frame_cloud`.
+    """
+    file = recording.cloud_files[k][view]
+    if file is None or file.suffix.lower() != ".png":
+        cloud = read_frame_cloud(recording, k, view=view, mixed=False)
+        return None if cloud is None else (cloud, cloud.points)
+    depth, color, camera = _images(file, recording.color_files[k][view], recording.cameras[view])
+    step = max(1, int(np.sqrt(depth.size / (SPARSE * some))))
+    every = replace(camera, fx=camera.fx / step, fy=camera.fy / step, cx=camera.cx / step, cy=camera.cy / step)
+    near = _cloud_of(depth, color, camera, mixed=False, within=(T, *box))
+    return near, _cloud_of(depth[::step, ::step], None, every, mixed=True).points
+
+
+def _images(depth_file: Path, color_file: Path | None, camera: Camera | None) -> tuple[Any, Any, Camera]:
+    """Return the depth image, the colour image or None, and their camera. Raises InputError."""
     if camera is None:
         raise InputError("a depth image without a camera", where=depth_file, expected="a table [camera] in recording.toml")
     depth = read_png(depth_file)
@@ -71,12 +100,18 @@ def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera |
     check_image_size(depth.shape[1], depth.shape[0], camera, depth_file)
     color = None
     if color_file is not None:
-        color = read_color(color_file)
+        color = read_color_levels(color_file)
         check_image_size(color.shape[1], color.shape[0], camera, color_file)
-    c = camera
-    lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
+    return depth, color, camera
+
+
+def _cloud_of(depth: Any, color: Any, camera: Camera, *, mixed: bool, within: Any = None) -> PointCloud:
+    from femsense.pointcloud.cloud import cloud_from_depth, without_mixed_pixels
+
+    c, model = camera, camera.distortion_model
     seen = depth if mixed else without_mixed_pixels(depth, c.fx, c.fy)
-    return cloud_from_depth(seen, *lens, color=color, distortion_model=c.distortion_model)
+    lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
+    return cloud_from_depth(seen, *lens, color=color, distortion_model=model, within=within)
 
 
 def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tuple[Any, Any]:

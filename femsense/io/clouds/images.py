@@ -24,11 +24,16 @@ def read_png(path: Path) -> npt.NDArray[Any]:
 
 def read_color(path: Path) -> FloatArray:
     """Return a colour image in 0 … 1, shape (H, W, 3), red first; grey becomes three equal channels. Raises InputError."""
+    image = read_color_levels(path)
+    return np.asarray(image / np.iinfo(image.dtype).max, dtype=np.float64)
+
+
+def read_color_levels(path: Path) -> npt.NDArray[Any]:
+    """Return a colour image in its own whole numbers of 8 or 16 bits, shape (H, W, 3), red first; grey becomes three equal channels. Raises InputError."""
     image = decoded_image(_bytes_of(path), path)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("not a colour image", where=path, found=str(image.dtype), expected="8 or 16 bits a channel")
-    rgb = np.stack([image] * 3, axis=2) if image.ndim == 2 else image
-    return np.asarray(rgb / np.iinfo(image.dtype).max, dtype=np.float64)
+    return np.stack([image] * 3, axis=2) if image.ndim == 2 else image
 
 
 def decoded_image(data: bytes, where: str | Path | None) -> npt.NDArray[Any]:
