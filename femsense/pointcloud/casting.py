@@ -55,15 +55,13 @@ class Rays:
         return met, weights, depth * np.sqrt(1.0 + (self.uv**2).sum(axis=1))
 
     def beside(self, positions: FloatArray, triangles: IntArray, *, within: float) -> tuple[FloatArray, FloatArray]:
-        """Return how far rays that miss a surface pass it [m], inf beyond `within` [rad], and how far from the centre that is [m], both of shape (k,).
-
-        Triangles that are partly behind the camera do not count.
+        """Return how far rays that miss a surface pass it [m], inf beyond an angle `within` [rad], and how far from the centre that is [m], both of
+        shape (k,). Triangles that are partly behind the camera do not count.
         """
         k = len(self.uv)
-        angle, depth = np.full(k, within), np.full(k, np.inf)
-        _beside(self._seen(positions), read_only(triangles), *self._cells(), angle, depth)
-        far = np.isinf(depth)
-        return np.where(far, np.inf, angle * np.where(far, 1.0, depth)), depth * np.sqrt(1.0 + (self.uv**2).sum(axis=1))
+        passes, depth = np.full(k, np.inf), np.full(k, np.inf)
+        _beside(self._seen(positions), read_only(triangles), *self._cells(), within, passes, depth)
+        return passes, depth * np.sqrt(1.0 + (self.uv**2).sum(axis=1))
 
     def _seen(self, positions: FloatArray) -> FloatArray:
         """Return nodes along the axes of the plane and its normal [m], shape (n, 3)."""
@@ -152,9 +150,8 @@ def _cast_in_space(a, b, c, t, uv, met, weights, depth):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def _beside(seen, triangles, uv, order, starts, corner, cell, columns, angle, depth):  # type: ignore[no-untyped-def]
+def _beside(seen, triangles, uv, order, starts, corner, cell, columns, reach, passes, depth):  # type: ignore[no-untyped-def]
     rows = (len(starts) - 1) // columns
-    reach = angle[0] if len(angle) else 0.0
     for t in range(len(triangles)):
         i, j, k = triangles[t]
         if min(seen[i, 2], seen[j, 2], seen[k, 2]) <= 0.0:
@@ -174,8 +171,6 @@ def _beside(seen, triangles, uv, order, starts, corner, cell, columns, angle, de
                     square = du * du + dv * dv
                     along = min(max((ru * du + rv * dv) / square, 0.0), 1.0) if square > 0.0 else 0.0
                     off = np.sqrt((ru - along * du) ** 2 + (rv - along * dv) ** 2)
-                    if off < angle[r]:
-                        angle[r], depth[r] = (
-                            off,
-                            1.0 / ((1.0 - along) / seen[triangles[t, p], 2] + along / seen[triangles[t, q], 2]),
-                        )
+                    here = 1.0 / ((1.0 - along) / seen[triangles[t, p], 2] + along / seen[triangles[t, q], 2])
+                    if off < reach and off * here < passes[r]:  # the ray is least far from the surface in space, not in the image
+                        passes[r], depth[r] = off * here, here

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.pointcloud.objects import euclidean_clusters
 from femsense.pointcloud.rays import Surface
-from femsense.pointcloud.round_fits import BALL, CYLINDER, ROUND_END, SPHERE, fit_round
+from femsense.pointcloud.round_fits import BALL, CYLINDER, ROUND_END, SPHERE, fit_plane, fit_round
 
 LONGER = {"cylinder": (True, False, False), "plate": (True, True, False)}
 """Along which of its axes a shape may go on beyond what was seen of it."""
@@ -447,20 +447,14 @@ def _huber(residual: FloatArray) -> float:
 
 
 def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
-    keep = np.ones(len(points), dtype=bool)
-    for _ in range(4):
-        middle = points[keep].mean(axis=0)
-        axes = np.linalg.svd(points[keep] - middle, full_matrices=False)[2]
-        normal = axes[2] * -np.sign(axes[2] @ ray.mean(axis=0))
-        residual = (points - middle) @ normal / (std * np.maximum(np.abs(ray @ normal), 0.2))
-        keep = np.abs(residual) < 3.0 * max(1.483 * float(np.median(np.abs(residual))), 1.0)
-        if keep.sum() < FEWEST:
-            return np.inf, None
+    middle, axes, residual, keep = fit_plane(points, std, ray)
+    if keep.sum() < FEWEST:
+        return np.inf, None
     low, high = np.quantile((points[keep] - middle) @ axes[:2].T, [0.01, 0.99], axis=0)
     center = middle + 0.5 * (low + high) @ axes[:2]
     half = np.append(0.5 * (high - low), 0.0)
     spread = float(np.median(std) / np.sqrt(keep.sum()))
-    return typical_square(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
+    return typical_square(residual), Shape("plate", center, axes, half, np.inf, spread, points)
 
 
 def _spread(curve: FloatArray, count: int) -> float:

@@ -1,14 +1,15 @@
 # mypy: allow-untyped-decorators
-"""Spheres, cylinders and round ends of rods fitted to noisy points: compiled.
+"""Spheres, cylinders, round ends of rods and planes fitted to noisy points: compiled.
 
-A robust fit (Huber's function, Levenberg's damping) of the distances of points from the surface, over their noise along the ray.
+A robust fit (Huber's function, Levenberg's damping) of the distances of points from the surface, over their noise along the ray; for planes least squares
+without what is left out.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, read_only
+from femsense.core.arrays import BoolArray, FloatArray, read_only
 from femsense.core.kernels import njit
 
 SPHERE, BALL, CYLINDER, ROUND_END = 0, 1, 2, 3
@@ -16,6 +17,8 @@ SPHERE, BALL, CYLINDER, ROUND_END = 0, 1, 2, 3
 with a round end: those of a cylinder, and where along the first axis the centre of the half ball at its end is."""
 CUT = 2.0
 """Whitened residuals beyond this count linearly."""
+TRIMMED, FARTHER = 4, 3.0
+"""Rounds of a fit of a plane, and whitened residuals, over their typical size or 1, beyond which a point is left out of the next."""
 GRAZING = 0.2
 """The noise of a point across the surface is that along its ray times the cosine, which counts as this at least."""
 
@@ -50,6 +53,55 @@ def fit_round(
     axes, origin = (np.eye(3) if frame is None else frame), (np.zeros(3) if middle is None else middle)
     cost = _fit(kind, *given, read_only(axes), read_only(origin), radius, x, residual, slopes, curve, steps)
     return x, curve, residual, float(cost)
+
+
+def fit_plane(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return a point of the plane [m], rows of two directions in it and the normal that looks at the camera, (3, 3), whitened residuals (k,), and which points
+    were used last, (k,). Arguments as for `fit_round`."""
+    residual, keep = np.empty(len(points)), np.ones(len(points), dtype=np.bool_)
+    middle, axes = np.empty(3), np.empty((3, 3))
+    _fit_plane(read_only(points), read_only(std), read_only(ray), middle, axes, residual, keep)
+    return middle, axes, residual, keep
+
+
+@njit(cache=True, nogil=True)
+def _fit_plane(
+    points: FloatArray,
+    std: FloatArray,
+    ray: FloatArray,
+    middle: FloatArray,
+    axes: FloatArray,
+    residual: FloatArray,
+    keep: BoolArray,
+) -> None:
+    """Write the results of `fit_plane`."""
+    look = np.zeros(3)
+    for i in range(len(points)):
+        look += ray[i]
+    for _ in range(TRIMMED):
+        middle[:], count, spread = 0.0, 0, np.zeros((3, 3))
+        for i in range(len(points)):
+            if keep[i]:
+                middle += points[i]
+                count += 1
+        if count < 3:
+            return
+        middle /= count
+        for i in range(len(points)):
+            if keep[i]:
+                off = points[i] - middle
+                for r in range(3):
+                    for c in range(3):
+                        spread[r, c] += off[r] * off[c]
+        axes[:] = np.linalg.eigh(spread)[1].T[::-1]
+        if (axes[2] * look).sum() > 0.0:
+            axes[2] *= -1.0
+        for i in range(len(points)):
+            slant = abs((ray[i] * axes[2]).sum())
+            residual[i] = ((points[i] - middle) * axes[2]).sum() / (std[i] * max(slant, GRAZING))
+        limit = FARTHER * max(1.483 * np.median(np.abs(residual)), 1.0)
+        for i in range(len(points)):
+            keep[i] = abs(residual[i]) < limit
 
 
 @njit(cache=True, nogil=True)

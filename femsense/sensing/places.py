@@ -131,8 +131,8 @@ def _edges(
 ) -> Edges:
     """Return how points at some gaps from the body (o,) [m] lie to its edges.
 
-    A pixel of the halo has a depth anywhere between the body and what is behind it, but its ray passes the body that closely. What lies in front of
-    the body by as much is none.
+    A pixel of the halo has a depth anywhere between the body and what is behind it, and its ray passes the body that closely; or it lies that close to the
+    body in space. What lies in front of a face of the body by as much is none.
     """
     known, noises = sensor.knowledge, sensor.knowledge.noises
     pixel = np.array([_pixel_of(sensor, scan, v) for v in range(len(noises))])
@@ -145,7 +145,8 @@ def _edges(
         own = np.flatnonzero((matched | close) & (view == v))
         origin = sensor.calibration.poses[v][:3, 3]
         passes[own], behind[own] = body.beside_rays(points[own], origin, within=BLEEDING * pixel[v])
-    halo = matched & (behind < width) & ((gap < width) | (passes > 0.0))
+    near = np.where(passes > 0.0, (gap < width) | (behind < width), (gap < width) & (behind < width))
+    halo = matched & near
     way = float(np.linalg.norm(state.positions - sensor.robot.body.mesh.nodes, axis=1).max())
     model = float(np.hypot(known.bias_m, known.model_share * way))
     return Edges(close, halo, passes, behind, np.sqrt(known.together) * std, model)

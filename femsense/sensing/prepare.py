@@ -198,7 +198,8 @@ def _with_scenery(sensor: Sensor) -> Sensor:
             continue
         corners = state.positions[sensor.surface.nodes]
         deep = [0.0 if one.kind == "points" else float(one.towards(corners).distance(corners).min()) for one in shapes]
-        inside, passing = (tuple(one for one, gap in zip(shapes, deep) if gap < most) for most in (0.0, -sensor.surface.edge))
+        inside = tuple(one for one, gap in zip(shapes, deep) if gap < 0.0)
+        passing = tuple(one for one, gap in zip(shapes, deep) if one.kind == "plate" and gap < -sensor.surface.edge)
         touching = np.array([touch.place for touch in object_touches(sensor, shapes, state)]).reshape(-1, 3)
         return replace(sensor, scenery=touching, overlapping=inside, passing=passing)
     return sensor

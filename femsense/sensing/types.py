@@ -276,5 +276,5 @@ class Sensor:
     overlapping: tuple[Shape, ...] = ()
     """Completed objects that overlap the body in a free frame: a floor that is said to pass through it."""
     passing: tuple[Shape, ...] = ()
-    """Those that pass through it by more than an edge: they do not say where they touch."""
+    """Plates among them through which the body reaches by more than an edge: these do not say where they touch."""
     background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it
