@@ -1,11 +1,15 @@
 """How old a force is when it comes: a software camera at 30 Hz and 848 × 480, actuation over MQTT, recording on.
 
     python benchmarks/live.py --robot FOLDER [--seconds 60] [--element tet4] [--load] [-o FOLDER]
+    python benchmarks/live.py --case bar-normal --seconds 600 [-o FOLDER]
 
 The virtual rig renders two seconds of a robot that is touched; a software camera in a process of its own repeats them at 30 Hz.
 Printed are the ages of answers (from the exposure of the frame to its forces), the sustained rate, what became of every frame,
 the memory of the session at its beginning and its end, and whether `estimate` gives the numbers of the session. `--load` keeps one
 core busy with something else. No camera takes part: exposure, transfer by USB and the driver are not in these figures.
+
+`--case` takes a scene of `benchmarks/independent` instead, made by another solver, at its own five frames a second again and again, and grades it as a
+recording is graded: forces, false alarms a minute, and by how much the median error of the last minute differs from that of the first.
 """
 
 from __future__ import annotations
@@ -24,6 +28,9 @@ from threading import Event, Thread
 
 import numpy as np
 import tomli_w
+from independent.cases import CASES
+from independent.grade import Row, grade, heading
+from independent.make import make
 
 from femsense.calib.calibrate import calibrate
 from femsense.calib.calibration import Calibration
@@ -45,12 +52,14 @@ from femsense.xr.stream.mqtt import EmbeddedBroker, broker_address, make_client
 
 FRAMES, FREE, RATE_HZ = 60, 24, 30.0
 TOPIC = "bench/inputs"
+SEED = 1
 
 
 def main() -> None:
     """Render, sense, replay, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robot", type=Path, required=True)
+    parser.add_argument("--robot", type=Path)
+    parser.add_argument("--case", choices=sorted(case.name for case in CASES if not case.name.startswith("diamond")))
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--element", choices=("tet4", "tet10"), default="tet4")
     parser.add_argument("--load", action="store_true", help="keep one core busy")
@@ -60,6 +69,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="femsense-bench-") as scratch:
         work = asked.output or Path(scratch)
         work.mkdir(parents=True, exist_ok=True)
+        if asked.case:
+            _print_graded(asked.case, work, asked.seconds)
+            return
+        if asked.robot is None:
+            parser.error("--robot or --case is needed")
         robot = _robot(asked.robot, asked.element, work)
         recording = _recording(robot, work)
         busy = multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
@@ -122,8 +136,38 @@ def _recording(robot: Path, work: Path) -> Path:
     return target
 
 
-def _session(robot: Path, recording: Path, work: Path, seconds: float) -> dict[str, object]:
-    """Run a session of so many seconds of sensing and return its figures."""
+def _print_graded(name: str, work: Path, seconds: float) -> None:
+    """Run a session on a scene of another solver, and print how far its forces are off."""
+    folder = work / "case"
+    if not (folder / "truth.json").exists():
+        make(next(case for case in CASES if case.name == name), folder, SEED)
+    figures = _session(folder / "robot", folder / "recording", work, seconds, with_frames=True)
+    run = read_run(work / "session" / "run")
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    own: dict[int, list[dict[str, object]]] = {}
+    for contact in truth["contacts"]:
+        own.setdefault(contact["frame"], []).append(contact)
+    numbers = [frame.frame for frame in run.frames if not np.isnan(frame.ms)]
+
+    def graded(chosen: list[int]) -> Row:
+        file = work / "truth.json"
+        again = [one | {"frame": number} for number in chosen for one in own.get(number % truth["frames"], ())]
+        file.write_text(json.dumps(truth | {"contacts": again, "numbers": chosen}), encoding="utf-8")
+        return grade(work / "session" / "run", file)
+
+    whole, minute = graded(numbers), int(60.0 / np.diff([frame.time_s for frame in run.frames]).mean())
+    first, last = (float(np.median(graded(part).size_error)) for part in (numbers[:minute], numbers[-minute:]))
+    print(heading(), whole.line(), whole.deviations(), sep="\n")
+    alarms = whole.false / (seconds / 60.0 * whole.calm / max(len(numbers), 1))
+    figures |= {
+        "false alarms a minute without touch": round(alarms, 2),
+        "median error of the first and the last minute": [first, last],
+    }
+    print(json.dumps(figures | {"replay": _replay(folder / "robot", work / "session")}, indent=2))
+
+
+def _session(robot: Path, recording: Path, work: Path, seconds: float, *, with_frames: bool = False) -> dict[str, object]:
+    """Run a session of so many seconds of sensing and return its figures; with_frames: inputs come with the frames, not over MQTT."""
     body, seen = load_robot(robot), load_recording(recording)
     hub, stop, scratch = Hub(), Event(), make_scratch()
     broker = EmbeddedBroker(hub, port=0)
@@ -144,8 +188,14 @@ def _session(robot: Path, recording: Path, work: Path, seconds: float) -> dict[s
         body,
         feed,
         scratch,
-        actuation=make_actuation(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}", body),
-        options=SessionOptions(calibration=calibration, folder=work / "session", contact_free_frames=12),
+        actuation=None if with_frames else make_actuation(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}", body),
+        options=SessionOptions(
+            calibration=calibration,
+            folder=work / "session",
+            actuation=seen.actuation,
+            actuation_zero=seen.actuation_zero,
+            contact_free_frames=int(seen.free.sum()) if with_frames and seen.free is not None else 12,
+        ),
         on_answer=answered,
     )
     begun, memory, before = None, 0.0, feed.counts

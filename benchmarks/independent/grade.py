@@ -133,14 +133,14 @@ def _vector(row: dict[str, str], *names: str) -> np.ndarray:
 
 
 def grade(run_folder: Path, truth_file: Path, *, note: str = "") -> Row:
-    """Compare contacts.csv and frames.csv of a run with truth.json."""
+    """Compare contacts.csv and frames.csv of a run with truth.json, in all its frames or those of its list `numbers`."""
     truth = json.loads(Path(truth_file).read_text(encoding="utf-8"))
     row = Row(truth["case"], note=note)
     frames = _rows(Path(run_folder) / "frames.csv")
     contacts = [c for c in _rows(Path(run_folder) / "contacts.csv") if float(c["force_n"]) > 0]
     status = {int(f["frame"]): f["status"] for f in frames}
     row.status = Counter(status.values())
-    for frame in range(truth["frames"]):
+    for frame in truth.get("numbers", range(truth["frames"])):
         true = [c for c in truth["contacts"] if c["frame"] == frame]
         found = [c for c in contacts if int(c["frame"]) == frame]
         if not true:
