@@ -13,11 +13,10 @@ import numpy as np
 from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, freeze, read_only
-from femsense.fem.closest_point import closest_on_surface
 from femsense.inference.error_field import ErrorField
 from femsense.inference.mixture import Others
 from femsense.inference.rows import Rows
-from femsense.pointcloud.casting import Rays, rays_through
+from femsense.pointcloud.casting import Rays, closest_points, rays_through
 
 GRAZING = 0.25
 """Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
@@ -86,8 +85,7 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
     _along_rays(positions, triangles, points, read_only(pixels.ways), noise, triangle, residual, std, direction, on)
     far = np.flatnonzero(~on | (residual > FAR * std))
     if len(far):
-        found, at, gap = np.empty(len(far), dtype=np.int64), np.empty((len(far), 3)), np.empty(len(far))
-        closest_on_surface(positions, triangles, read_only(points[far]), found, at, gap)
+        found, at, gap = closest_points(positions, triangles, points[far])
         _closest(positions, triangles, points, noise, far, found, at, gap, residual, std, weights, direction, triangle, on)
     other = pixels.others.log_odds(pixels.ray_std, skin.size, on & (residual < 0.0))
     return rows_on(
