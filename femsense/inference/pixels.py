@@ -7,7 +7,7 @@ takes the closest point of the surface where that is nearer in standard deviatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -22,6 +22,8 @@ GRAZING = 0.25
 """Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
 FAR = 6.0
 """Pixels in front of the surface by more than this many σ are compared with its closest point."""
+ANCHORED = 30.0
+"""Pixels farther from the surface than this many σ stay tied to its closest point: whatever they are, they are not of the robot here."""
 ON_SURFACE = 1e-5
 """Nearer than this the direction to the closest point is the face's normal [m]."""
 
@@ -44,6 +46,8 @@ class Pixels:
     """1/T: how many independent measurements a pixel counts for."""
     coloured: bool
     """Whether colour separates the robot from the rest."""
+    anchors: tuple[IntArray, FloatArray] | None = None
+    """Of points far from the body: the triangle that was closest, −1 for others, shape (m,), and the barycentric weights there, (m, 3); None: of no point."""
     rays: tuple[tuple[IntArray, Rays], ...] = field(init=False)
     """Of each camera: which of the points are its own, and their rays."""
     ways: FloatArray = field(init=False)
@@ -55,6 +59,12 @@ class Pixels:
         ways = self.points - self.origins
         object.__setattr__(self, "rays", rays)
         object.__setattr__(self, "ways", freeze(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)))
+
+    def anchored(self, skin: Skin, positions: FloatArray) -> Pixels:
+        """Return the pixels with those far from the body in a state, nodes (n, 3) [m], tied to its closest points: these change too little to be looked for
+        again in each state."""
+        triangle, weights, gap = closest_points(positions, skin.triangles, self.points)
+        return replace(self, anchors=(np.where(gap > ANCHORED * self.ray_std, triangle, -1), weights))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,7 +95,7 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
     _along_rays(positions, triangles, points, read_only(pixels.ways), noise, triangle, residual, std, direction, on)
     far = np.flatnonzero(~on | (residual > FAR * std))
     if len(far):
-        found, at, gap = closest_points(positions, triangles, points[far])
+        found, at, gap = _closest_points(pixels, far, positions, triangles)
         _closest(positions, triangles, points, noise, far, found, at, gap, residual, std, weights, direction, triangle, on)
     other = pixels.others.log_odds(pixels.ray_std, skin.size, on & (residual < 0.0))
     return rows_on(
@@ -103,6 +113,17 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
         views,
         pixel=True,
     )
+
+
+def _closest_points(pixels: Pixels, far: IntArray, x: FloatArray, triangles: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return triangle, barycentric weights and distance [m] of the points of a surface closest to some pixels (k,); of anchored ones where they are tied."""
+    if pixels.anchors is None:
+        return closest_points(x, triangles, pixels.points[far])
+    found, at = pixels.anchors[0][far], pixels.anchors[1][far]
+    gap, near = np.empty(len(far)), np.flatnonzero(found < 0)
+    found[near], at[near], _ = closest_points(x, triangles, pixels.points[far[near]])
+    _distances(x, triangles, read_only(pixels.points), far, found, at, gap)
+    return found, at, gap
 
 
 def rows_on(
@@ -185,6 +206,16 @@ def _closest(x, triangles, points, ray_std, far, found, at, gap, residual, std, 
             direction[j, c] = side * off[c] / gap[q] if gap[q] > ON_SURFACE else normal[c]
             weights[j, c] = at[q, c]
         residual[j], std[j], triangle[j], on[j] = side * gap[q], ray_std[j], found[q], False
+
+
+@njit(cache=True)
+def _distances(x, triangles, points, far, found, at, gap):  # type: ignore[no-untyped-def]
+    for q in range(len(far)):
+        corners, total = triangles[found[q]], 0.0
+        for c in range(3):
+            place = at[q, 0] * x[corners[0], c] + at[q, 1] * x[corners[1], c] + at[q, 2] * x[corners[2], c]
+            total += (points[far[q], c] - place) ** 2
+        gap[q] = np.sqrt(total)
 
 
 @njit(cache=True)

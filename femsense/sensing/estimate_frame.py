@@ -275,7 +275,10 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
             f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
         )
     seen = () if previous is None else previous.objects
-    frame = Frame(k, model.pixels(scan), scan, predicted, tensions, seen_before=seen)
+    pixels = model.pixels(scan)
+    if not pixels.coloured:  # most pixels are of something else
+        pixels = pixels.anchored(model.skin, expected.positions)
+    frame = Frame(k, pixels, scan, predicted, tensions, seen_before=seen)
     objects: tuple[Shape, ...] = ()
     objects_at: FloatArray | None = None
     if not len(model.sensor.places) and not said_free(model.sensor, k):
