@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,12 @@ def test_what_lies_on_both_sides_of_a_jump_is_not_averaged() -> None:
     scan = plate(0.0, step=0.05)
     few = in_blocks(scan, NOISES, [1.0 / FOCAL], block_side(len(scan.view), 2000))
     assert np.minimum(np.abs(few.camera_points[:, 2] - 0.4), np.abs(few.camera_points[:, 2] - 0.45)).max() < 1e-12
+
+
+def test_what_stands_around_the_robot_is_averaged_as_it_is() -> None:
+    whole = plate(1.0)
+    few = in_blocks(replace(whole, others=whole.camera_points, others_view=whole.view), NOISES, [1.0 / FOCAL], 3)
+    assert few.others == pytest.approx(few.camera_points) and len(few.others_view) == len(few.others) < len(whole.view) / 7
 
 
 def test_few_points_stay_as_they_are() -> None:

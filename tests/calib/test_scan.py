@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from arm import T_ROBOT_CAMERA, arm, record
 
-from femsense.calib.scan import Scan, read_scan
+from femsense.calib.scan import MARGIN, Scan, read_scan
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.clouds.cloud_files import write_cloud
+from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.model.camera import Camera
 from femsense.pointcloud.cloud import PointCloud, cloud_from_depth
 
@@ -70,3 +71,26 @@ def test_pixels_that_saw_two_surfaces_are_no_points_of_a_scan(tmp_path, name):
     assert scan is not None
     heights = np.unique(scan.points((above,))[:, 2].round(6))
     assert heights.tolist() == [-0.01, 0.01] and len(scan.view) == 16 * 39
+
+
+@pytest.mark.parametrize("lens", [np.zeros(5), np.array([0.1, -0.05, 0.001, 0.0, 0.0])])
+def test_of_a_depth_image_what_is_near_the_body_is_read_and_some_of_the_rest(tmp_path: Path, lens: FloatArray) -> None:
+    """A wall 0.3 m behind the arm fills the image; its points are background, and all points in the box about the body are those of the whole cloud."""
+    robot, T = arm(), T_ROBOT_CAMERA
+    camera = Camera("", 320, 240, 220.0, 220.0, 160.0, 120.0, lens, 1e-4)
+    depth = np.full((240, 320), int(1e4 * (np.linalg.norm(T[:3, 3]) + 0.3)), dtype=np.uint16)
+    depth[90:150, 120:200] = int(1e4 * np.linalg.norm(T[:3, 3]))
+    cv2.imwrite(str(tmp_path / "0.png"), depth)
+    recording, _ = record(np.zeros((1, 4)), noise=0.0)
+    recording = replace(recording, cloud_files=((tmp_path / "0.png",),), color_files=((None,),), cameras=(camera,))
+    scan = read_scan(robot, recording, 0, (T,), robot.body.mesh.nodes)
+    cloud = read_frame_cloud(recording, 0, mixed=False)
+    assert scan is not None and cloud is not None
+    size = np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0))
+    placed, nodes = transform_points(T, cloud.points), robot.body.mesh.nodes
+    inside = ((placed >= nodes.min(axis=0) - MARGIN * size) & (placed <= nodes.max(axis=0) + MARGIN * size)).all(axis=1)
+    assert 500 < inside.sum() < 0.3 * len(placed)
+    np.testing.assert_allclose(scan.points((T,)), placed[inside], atol=1e-12)
+    far = scan.background((T,))
+    beyond = ((far < nodes.min(axis=0) - MARGIN * size) | (far > nodes.max(axis=0) + MARGIN * size)).any(axis=1)
+    assert 300 < len(far) < 1500 and beyond.all()

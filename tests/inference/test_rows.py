@@ -56,6 +56,16 @@ def test_a_pixel_beside_the_body_takes_its_closest_point(skin: Skin):
     assert rows.residual == pytest.approx([0.004], abs=1e-6) and rows.direction[0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-4)
 
 
+def test_pixels_far_from_the_body_may_stay_tied_to_its_closest_point(skin: Skin):
+    """Where the body bends, the rows of those near it are the same, and the others are about as far off, and still not its own."""
+    far = np.array([[0.05, 0.045, 0.005], [0.02, -0.06, 0.0], [0.09, 0.0, -0.07]])
+    pixels = pixels_of(np.vstack([upper_points(2e-3), far]))
+    x = BODY.mesh.nodes + np.column_stack([np.zeros((len(BODY.mesh.nodes), 2)), 4e-3 * np.sin(30.0 * BODY.mesh.nodes[:, 0])])
+    exact, tied = (pixel_rows(one, skin, x, 1) for one in (pixels, pixels.anchored(skin, BODY.mesh.nodes)))
+    assert (exact.residual[:40] == tied.residual[:40]).all()
+    assert tied.residual[40:] == pytest.approx(exact.residual[40:], rel=0.05) and (tied.residual >= exact.residual - 1e-12).all()
+
+
 def test_pixels_behind_the_body_are_hardly_something_else(skin: Skin):
     front, behind = (pixel_rows(pixels_of(upper_points(d)), skin, BODY.mesh.nodes, 1).log_other for d in (2e-3, -2e-3))
     assert np.exp(behind - front) == pytest.approx(1e-3)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from arm import arm
+from arm import T_ROBOT_CAMERA, arm
 from touched_arm import INPUTS, PLACE, touched
 
 from femsense.calib.calibrate import calibrate
+from femsense.core.pose import invert_pose, transform_points
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.model.recording import with_marker_table
 from femsense.pointcloud.cloud import PointCloud
@@ -163,6 +165,30 @@ def test_what_touches_in_a_free_frame_is_scenery(tmp_path):
     assert len(touches) == 1
     assert not away_from_scenery(sensor, touches)
     assert away_from_scenery(replace(sensor, scenery=np.zeros((0, 3))), touches) == touches
+
+
+def test_a_floor_that_the_body_reaches_through_touches_nowhere(tmp_path: Path):
+    """Where the origin of the robot is said to lie on the floor, and the arm half below it, the only contact is that with the ball."""
+    seen = touched(tmp_path, np.array([0.0, 0.0, -0.15]), ball=True)
+    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(0.03, 0.13, 100), np.linspace(-0.06, 0.06, 120)))
+    beside = np.abs(v) > 0.012
+    floor = np.column_stack([u, v, np.zeros(len(u))])[beside]
+    for k, (file,) in enumerate(seen.cloud_files):
+        cloud = read_cloud(file)
+        noisy = floor + np.random.default_rng(k).normal(scale=1e-4, size=floor.shape)
+        points = np.vstack([cloud.points, transform_points(invert_pose(T_ROBOT_CAMERA), noisy)])
+        write_cloud(file, PointCloud(points, np.vstack([cloud.colors, np.full((len(floor), 3), 0.6)])))
+    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    assert [one.kind for one in sensor.passing] == ["plate"]
+    elsewhere, state = replace(sensor, scenery=np.zeros((0, 3))), free_state(sensor, 3, None, None)
+    touches = object_touches(sensor, objects_near(sensor, scan_of(sensor, 3, state), state), state)
+    kinds = [
+        [one.shape.kind for one in some if one.shape is not None] for some in (touches, away_from_scenery(elsewhere, touches))
+    ]
+    assert sorted(kinds[0]) == ["plate", "sphere"] and kinds[1] == ["sphere"]
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [(c.frame, c.source) for c in run.contacts] == [(3, "cloud")] and [f.status for f in run.frames] == ["ok"] * 4
+    assert run.contacts[0].force_n == pytest.approx(0.15, rel=0.2)
 
 
 def test_an_object_that_is_gone_touches_no_more(tmp_path):
