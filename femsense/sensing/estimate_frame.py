@@ -22,7 +22,7 @@ from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
-from femsense.sensing.no_penetration import COMPLETED, in_touch, is_rigid, is_with
+from femsense.sensing.no_penetration import COMPLETED, gap_std, in_touch, is_rigid, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
 from femsense.sensing.proposals import SAME, elsewhere, proposals
 from femsense.sensing.run_arrays import sensed
@@ -169,7 +169,7 @@ def _with_objects(model: Model, best: Fit) -> Fit:
         best = replace(best, frame=frame)
     else:
         return best
-    if len(objects) == len(frame.objects) and all(_is_alike(a, b) for a, b in zip(objects, frame.objects)):
+    if len(objects) == len(frame.objects) and all(_is_alike(model, a, b) for a, b in zip(objects, frame.objects)):
         return best
     seen = replace(frame, objects=objects)
     again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
@@ -190,9 +190,11 @@ def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: E
     return tuple(objects_near(model.sensor, scan, state, frame.seen_before))
 
 
-def _is_alike(first: Shape, second: Shape) -> bool:
-    """Return whether two shapes are one up to what is not known of it."""
-    return first.kind == second.kind and float(np.linalg.norm(first.center - second.center)) < max(first.std_m, second.std_m)
+def _is_alike(model: Model, first: Shape, second: Shape) -> bool:
+    """Return whether two shapes are one up to what is not known of where its surface is: how far a plate or rod was seen to reach does not matter."""
+    ways = {"plate": first.axes[2:], "cylinder": first.axes[1:]}.get(first.kind, first.axes)
+    apart = float(np.linalg.norm(ways @ (first.center - second.center)))
+    return first.kind == second.kind and apart < max(gap_std(model, first), gap_std(model, second))
 
 
 def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
