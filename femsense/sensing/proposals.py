@@ -362,8 +362,8 @@ def _likelihood(gain: FloatArray) -> FloatArray:
 
 
 def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
-    """Return the fit with an inferred contact where the line of its force leaves the body on the other side: a push in place of a weight that hangs there, a
-    weight in place of a push."""
+    """Return the fit with an inferred contact where the line of its force leaves the body on the other side: a push where the force points into the body
+    there, else a weight that hangs; None where neither may be."""
     positions, contact = best.state.positions, best.contacts[i]
     axis, place = best.axes[i][0], contact.patch.mean(positions)
     body, within = Surface(positions, model.sensor.surface.triangles), FIRST * model.sensor.surface.edge
@@ -372,7 +372,7 @@ def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
         if len(hits.nodes) and hits.normal[0] @ way > 0.0:
             touch = make_touch(model.sensor, hits.place(model.skin.rest)[0], source="shape", std_m=contact.std_m)
             contacts = list(best.contacts)
-            contacts[i] = replace(touch, pulls=not contact.pulls)
+            contacts[i] = replace(touch, pulls=bool(best.forces[i] @ hits.normal[0] >= 0.0))
             if contacts[i].pulls and best.forces[i] @ model.upward >= 0.0:  # no weight pulls that way
                 return None
             return fit(model, best.frame, contacts, best.forces, best.state, eta=best.eta, tau=best.tau)
