@@ -28,7 +28,8 @@ from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, w
 
 if TYPE_CHECKING:
     from femsense.loop.improve import ImproveOptions
-    from femsense.sensing.types import Run, SensingOptions
+    from femsense.sensing.options import SensingOptions
+    from femsense.sensing.types import Run
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]

@@ -23,6 +23,7 @@ from femsense.loop.data.dataset import MESH, Data, prepare
 from femsense.loop.design.next_experiment import next_experiment
 from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
+from femsense.loop.options import Measured, SearchOptions
 from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
@@ -45,15 +46,9 @@ MOST_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ImproveOptions:
-    """Options of `improve`: further effects, which measurements are used, and how the work is done."""
+class ImproveOptions(SearchOptions):
+    """Options of `improve`: those of the search, its references, and how the work is done."""
 
-    user_effects: Sequence[str | Path] = ()
-    """Python files with user-defined effects (docs/effects/own.md); "all" includes them."""
-    measured: str = "auto"
-    """Which measurements are fitted: "markers", "clouds" or "both"; "auto": the markers of a recording, or its clouds if it has no markers."""
-    correct: bool = False
-    """Also learn an empirical correction of the remaining residual, judged on held-out data. It is neither a cause nor an effect."""
     references: Sequence[Recording] = ()
     """Recordings of the same inputs without the load of interest (a weight, for example). Their residuals are subtracted from all other
     recordings (`femsense/calib/reference.py`)."""
@@ -143,7 +138,7 @@ def _split(
     recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions
 ) -> tuple[list[Recording], list[Recording]]:
     """Return the recordings that are searched for effects, and the others; none of the latter with `validation` or `references`."""
-    if validation or options.references or options.measured not in ("auto", "markers"):
+    if validation or options.references or options.measured not in (Measured.auto, Measured.markers):
         return list(recordings), []
     return recordings_to_search(recordings, options.effort.recordings)
 

@@ -37,6 +37,7 @@ from femsense.loop.fit.joint_fit import Prior, fit_jointly
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.normal_equations import Block, NormalEquations, Squares
+from femsense.loop.options import Measured
 from femsense.loop.result.records import AllRecordings
 from femsense.loop.search.calibration import calibrated_pose
 from femsense.loop.search.effect_fields import candidates_for, effect_fields
@@ -116,7 +117,7 @@ def normal_equations(question: Question, recording: Recording, forms: Sequence[E
 def _normal_equations(question: Question, recording: Recording, forms: Sequence[Effect]) -> NormalEquations:
     at = question.hypothesis.robot_at(question.coordinates)
     data = replace(
-        prepare(question.hypothesis.robot, [recording], [], "markers"),
+        prepare(question.hypothesis.robot, [recording], [], Measured.markers),
         placement_std=question.placement_std,
         forms=tuple(forms),
         thresholds=question.thresholds,
