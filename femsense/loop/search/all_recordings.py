@@ -29,17 +29,16 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.io.files import file_hash, json_text, plain
 from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import NUISANCE, Data, prepare
-from femsense.loop.data.outliers import without_outliers
 from femsense.loop.data.sampled_states import Sampled, drive_table
 from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, own_of, problem_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, without_effect
 from femsense.loop.fit.joint_fit import Prior, fit_jointly
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.normal_equations import Block, NormalEquations, Squares
 from femsense.loop.options import Measured
 from femsense.loop.result.records import AllRecordings
-from femsense.loop.search.calibration import calibrated_pose
+from femsense.loop.search.calibration import calibrated_pose, calibrated_without_outliers
 from femsense.loop.search.effect_fields import candidates_for, effect_fields
 from femsense.loop.search.screening import best_step, penalty, whitened_columns
 from femsense.loop.search.search_state import Progress, Search
@@ -123,9 +122,7 @@ def _normal_equations(question: Question, recording: Recording, forms: Sequence[
         thresholds=question.thresholds,
         mesh_as_shown=question.mesh_as_shown,
     )
-    placed = calibrated_pose(data, at, question.noise)
-    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
-        data, placed = fewer, calibrated_pose(fewer, at, question.noise)
+    data, placed = calibrated_without_outliers(data, at, question.noise)
     before = calibrated_pose(data, question.declared, question.noise, placed)
     if question.mesh_moves is not None:
         moves = question.mesh_moves
@@ -297,7 +294,7 @@ def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise
     verdicts = dict[str, str]()
     for name in reversed([effect.name for effect, _, _ in fitted.fit.hypothesis.terms if effect.name not in NUISANCE]):
         with contextlib.suppress(FemsenseError):  # no equilibrium without it: it stays
-            without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
+            without = without_effect(data, fitted, name, noise)
             cost = next((c.cost for c in (*search.last, *search.first) if c.effect.name == name), 0.0)
             gain = without.fit.chi2 - fitted.fit.chi2
             if gain - cost <= data.thresholds.evidence:

@@ -34,9 +34,7 @@ Ready = tuple[Data, FittedModel, History]
 def calibrated(data: Data, progress: Progress) -> Ready:
     """Return the data without outliers, the declared model with its camera calibrated, and the fully calibrated model; preceded by the same on the
     declared mesh if the search uses another one."""
-    placed = calibrated_pose(data, data.robot, START)
-    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
-        data, placed = fewer, calibrated_pose(fewer, data.robot, START)
+    data, placed = calibrated_without_outliers(data, data.robot, START)
     progress("fitting the nuisance parameters")
     base = calibrated_on(data, data.robot, placed)
     if "clouds" in data.measured:
@@ -56,6 +54,19 @@ def calibrated_pose(data: Data, robot: Robot, noise: Noise, start: FittedModel |
     nothing = Prior(np.zeros(0), np.zeros(0))
     own = None if start is None else own_of(start)
     return fit_model(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
+
+
+def calibrated_without_outliers(data: Data, robot: Robot, noise: Noise) -> tuple[Data, FittedModel]:
+    """Return the data without outliers, and a robot with its camera poses and initial inputs calibrated to them."""
+    placed = calibrated_pose(data, robot, noise)
+    while (fewer := without_outliers_of(data, placed)) is not data:
+        data, placed = fewer, calibrated_pose(fewer, robot, noise)
+    return data, placed
+
+
+def without_outliers_of(data: Data, fitted: FittedModel) -> Data:
+    """Return the data without the outliers of a fitted model; the same object if there are none."""
+    return without_outliers(data, [jet.residual for jet in fitted.fit.jets], fitted.held_residuals)
 
 
 def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
