@@ -33,6 +33,7 @@ PACKAGES = {
     "pypcd4": "pypcd4",
     "qpsolvers": "qpsolvers",
     "daqp": "daqp",
+    "onnx": "onnx",
     "osqp": "osqp",
     "matplotlib": "matplotlib",
     "cv2": "opencv-python-headless",

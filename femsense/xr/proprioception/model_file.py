@@ -24,7 +24,7 @@ from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.network import KINDS, Network
-from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, read_onnx, write_onnx
+from femsense.xr.proprioception.onnx_file import network_nodes, read_onnx, write_onnx
 from femsense.xr.proprioception.spread import Spread
 
 FORMAT = "femsense-proprioception-1"
@@ -40,6 +40,8 @@ CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
     """Write a model as an ONNX file and return its path. Raises InputError if a foreign file exists there."""
+    from onnx.helper import make_node
+
     check_target(path, folder=False, kind=MODEL)
     width = len(model.channels)
     inputs = {"readings": width}
@@ -47,7 +49,7 @@ def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
     source = "readings"
     if model.memory_s:
         inputs["filtered"] = width * len(model.memory_s)
-        nodes.append(Node("Concat", ("readings", "filtered"), "inputs", {"axis": 1}))
+        nodes.append(make_node("Concat", ["readings", "filtered"], ["inputs"], axis=1))
         source = "inputs"
     networks = {"markers": model.network} | ({"bones": model.bones} if model.bones is not None else {})
     numbers: dict[str, npt.NDArray[np.float32]] = {}
@@ -57,9 +59,9 @@ def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
         stored = _stored(network)
         numbers |= {f"{name}.{key}": stored[key] for key in constants}
     outputs = {name: len(network.d) for name, network in networks.items()}
-    target = Path(path)
-    write_onnx(target, Graph(tuple(nodes), inputs, outputs, numbers), {KEY: json_text(_document(model, networks), indent=None)})
-    return target
+    text = {KEY: json_text(_document(model, networks), indent=None)}
+    write_onnx(path, nodes, numbers, inputs=inputs, outputs=outputs, text=text)
+    return Path(path)
 
 
 def load_model(path: str | Path) -> ProprioceptiveModel:

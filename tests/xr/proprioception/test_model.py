@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from femsense.core.errors import InputError
@@ -57,7 +58,7 @@ def test_a_model_comes_back_from_its_file(kind: str, memory: tuple[float, ...], 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_another_runtime_computes_the_same(kind: str, tmp_path: Path) -> None:
-    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    runtime = pytest.importorskip("onnxruntime")
     model = some_model(kind, memory=(0.5,), end_to_end=True)
     path = save_model(model, tmp_path / "model.onnx")
     onnx.checker.check_model(onnx.load(path), full_check=True)
