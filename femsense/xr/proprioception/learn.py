@@ -21,6 +21,7 @@ from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
 from femsense.xr.proprioception.selection import (
     MEMORIES,
     MOST_ROWS,
+    Kind,
     Progress,
     compare_plans,
     marker_rms,
@@ -31,9 +32,7 @@ from femsense.xr.proprioception.selection import (
 )
 from femsense.xr.proprioception.spread import coverage, growth, held_out, make_spread
 
-KINDS = ("ridge", "radial", "network", "mlp")
-"""In the order of simplicity."""
-NEEDED = {"mlp": "sklearn"}
+NEEDED = {Kind.MLP: "sklearn"}
 """Kinds that need a package of the extra `learn`."""
 FEWEST_ROWS = 60
 TRAINED_ROWS = 3000
@@ -53,7 +52,7 @@ DISTINCT = 20
 class LearnOptions:
     """Problems of the data."""
 
-    kinds: tuple[str, ...] = KINDS
+    kinds: tuple[Kind, ...] = tuple(Kind)
     """Maps that are tried, simple ones first."""
     memories: tuple[tuple[float, ...], ...] = MEMORIES
     """Candidate time constants [s] of filters in addition to the readings; ((),): none."""
@@ -87,7 +86,7 @@ def learn(
     check_frame(data.frame, data.frame if test is None else test.frame)
     held = rows_kept(len(data))
     work, kept = data.select(~held), data.select(held)
-    kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
+    kinds = tuple(Kind(kind) for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
     memories = tuple(taus for taus in options.memories if data.spacing_s <= longest_gap(taus)) or ((),)
     compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
     chosen = simplest_good(compared)
@@ -217,8 +216,8 @@ def _check(data: Labelled, options: LearnOptions) -> None:
         if span(data.markers) > FARTHEST:
             raise DataError(f"{doubt}\n  try:      x_m, y_m and z_m in metres")
         warnings.warn(doubt, stacklevel=3)
-    if not options.kinds or not set(options.kinds) <= set(KINDS):
-        raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(KINDS))
+    if not options.kinds or not set(options.kinds) <= set(Kind):
+        raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(Kind))
     if len(data) < FEWEST_ROWS:
         raise DataError(
             f"{len(data)} rows have readings and all markers; at least {FEWEST_ROWS} are needed to learn and to hold some out"

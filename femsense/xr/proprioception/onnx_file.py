@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from femsense.core.errors import InputError
 from femsense.io.files import write_beside
+from femsense.xr.proprioception.network import Units
 
 if TYPE_CHECKING:
     from onnx import NodeProto, ValueInfoProto
@@ -67,14 +68,14 @@ def read_onnx(path: str | Path) -> tuple[dict[str, npt.NDArray[np.float32]], dic
     return numbers, {item.key: item.value for item in model.metadata_props}
 
 
-def network_nodes(name: str, kind: str, source: str) -> tuple[list[NodeProto], list[str]]:
+def network_nodes(name: str, units: Units, source: str) -> tuple[list[NodeProto], list[str]]:
     """Return the operators of one network of `proprioception.network` on the array `source`, and the names of its constants.
 
     The output is called `name`; its constants are `name.centre`, `name.scale`, `name.B` and so on.
     """
     from onnx.helper import make_node
 
-    steps = list(_steps(kind))
+    steps = list(_steps(units))
     arrays = {"x": source, "y": name}
     nodes = [
         make_node(kind, [arrays.get(key, f"{name}.{key}") for key in of], [arrays.get(to, f"{name}.{to}")])
@@ -84,23 +85,23 @@ def network_nodes(name: str, kind: str, source: str) -> tuple[list[NodeProto], l
     return nodes, list(dict.fromkeys(key for _, _, *of in steps for key in of if key not in made))
 
 
-def _steps(kind: str) -> Iterator[tuple[str, ...]]:
+def _steps(units: Units) -> Iterator[tuple[str, ...]]:
     """Yield the operators of a network with inputs x and outputs y: result, operator, operands."""
     yield "moved", "Sub", "x", "centre"
     yield "z", "Mul", "moved", "scale"
     yield "linear", "MatMul", "z", "C"
-    if kind == "linear":
+    if units == Units.LINEAR:
         yield "y", "Add", "linear", "d"
         return
     yield "straight", "Add", "linear", "d"
     yield "Bz", "MatMul", "z", "B"
     yield "a", "Add", "Bz", "b"
-    if kind == "radial":
+    if units == Units.RADIAL:
         yield "zz", "Mul", "z", "z"
         yield "own", "MatMul", "zz", "half"
         yield "exponent", "Add", "a", "own"
         yield "phi", "Exp", "exponent"
     else:
-        yield "phi", "Relu" if kind == "relu" else "Sigmoid", "a"
+        yield "phi", "Relu" if units == Units.RELU else "Sigmoid", "a"
     yield "curved", "MatMul", "phi", "A"
     yield "y", "Add", "curved", "straight"
