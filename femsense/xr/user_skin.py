@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze, spread_evenly
 from femsense.core.errors import InputError
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles
 from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
@@ -145,7 +145,7 @@ def export_skin(
     used = np.unique(surface_triangles(mesh))
     own = fit_skin(mesh.nodes[used], frames[:, used], bones=bones)
     poses = fit_poses(own, frames[:, used])
-    some = np.unique(np.linspace(0, len(frames) - 1, SHOWN).astype(int))
+    some = spread_evenly(len(frames), SHOWN)
     carried = np.array([ties.positions(frame) for frame in frames[some]])
     worn = weigh_points(own, poses[some], skin.rest, carried)
     look = color_rgb if skin.colors is None else skin.colors

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, spread_evenly
 from femsense.core.errors import DataError
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import drive_rows, tangent_at
@@ -120,11 +120,6 @@ def _inputs(body: BodyModel) -> list[Load]:
     cables = [Load(LoadKind.CABLE, cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
     chambers = [Load(LoadKind.CHAMBER, chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
     return [(cables + chambers)[i] for i in spread_evenly(len(cables) + len(chambers), MOST_INPUTS)]
-
-
-def spread_evenly(count: int, most: int) -> list[int]:
-    """Return at most `most` indices of a list, spread evenly."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def drive_of_load(load: Load) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from femsense.calib.calibrate import calibrated_start, usable_frames
 from femsense.calib.first_poses import first_poses
 from femsense.calib.inputs import first_inputs, input_bounds
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, spread_evenly
 from femsense.core.errors import DataError, InputError
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.surface_rows import (
@@ -168,14 +168,8 @@ def _frames_of(recording: Recording, measured: Measured) -> tuple[IntArray, IntA
     if not len(marked) and not len(cloudy):
         raise DataError(_nothing(recording, measured))
     rows = int(np.isin(recording.marker_frame, marked).sum())
-    return marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))], _evenly(recording, cloudy, 2 * MAX_ROWS // SURFACE_POINTS)
-
-
-def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:
-    """Return at most `most` of the frames, evenly spread."""
-    return (
-        frames[np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))] if len(frames) else frames
-    )
+    thinned = marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))]
+    return thinned, cloudy[spread_evenly(len(cloudy), 2 * MAX_ROWS // SURFACE_POINTS)]
 
 
 def _nothing(recording: Recording, measured: Measured) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
@@ -223,7 +223,7 @@ def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) ->
         if trial.scene.crossings is not None:
             continue
         frames = trial.scene.frames
-        some = frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).round().astype(int))]
+        some = frames[spread_evenly(len(frames), COMPARED)]
         scene, starts = trial.scene.pick(some), dict(held.jet.states)
         jet = evaluate_robot(robot, scene, held.poses, initial, starts)
         gaps.append(jet.residual - held.jet.residual[np.isin(trial.scene.frame, some)])

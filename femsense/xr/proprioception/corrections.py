@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.calib.rigid import fit_rigid
-from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, spread_evenly
 from femsense.core.errors import DataError
 from femsense.core.pose import make_pose, transform_points
 from femsense.xr.proprioception.linear import train_ridge
@@ -72,7 +72,7 @@ class Frames:
     reach: FloatArray
     """How far each channel ranged when the model was learnt, shape (c,)."""
 
-    def select(self, rows: BoolArray) -> Frames:
+    def select(self, rows: BoolArray | IntArray) -> Frames:
         """Return some of the frames."""
         return replace(self, inputs=self.inputs[rows], targets=self.targets[rows])
 
@@ -142,7 +142,7 @@ def shifts_of(frames: Frames, *, moved: bool = False) -> tuple[Shift, ...]:
     """
     from scipy.optimize import minimize_scalar
 
-    some = frames.select(np.isin(np.arange(len(frames.inputs)), np.linspace(0, len(frames.inputs) - 1, SCAN_ROWS).astype(int)))
+    some = frames.select(spread_evenly(len(frames.inputs), SCAN_ROWS))
     shares = np.linspace(-1.0, 1.0, 2 * SCANNED + 1)
     scans = [(*min((_left(some, Shift(i, s * wide), moved), s * wide) for s in shares), i) for i, wide in enumerate(frames.reach)]
     found = []

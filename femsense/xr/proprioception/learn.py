@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import DataError, InputError
 from femsense.model.marker_units import FARTHEST, doubt_of_size, span
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
@@ -27,7 +27,6 @@ from femsense.xr.proprioception.selection import (
     marker_rms,
     rows_kept,
     simplest_good,
-    thinned_rows,
     train,
 )
 from femsense.xr.proprioception.spread import coverage, growth, held_out, make_spread
@@ -91,7 +90,7 @@ def learn(
     compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
     chosen = simplest_good(compared)
     chain = _chain(data.markers[options.rest_row], options.bones)
-    rows = thinned_rows(len(work), TRAINED_ROWS)
+    rows = spread_evenly(len(work), TRAINED_ROWS)
     networks = {
         item.plan.kind: train(item.plan, work.inputs(item.plan.memory_s)[rows], work.targets[rows], options.seed)
         for item in compared
@@ -107,7 +106,7 @@ def learn(
         }
     network, plan = networks[chosen.plan.kind], chosen.plan
     inputs = kept.inputs(plan.memory_s)
-    some = thinned_rows(len(work), MOST_ROWS)
+    some = spread_evenly(len(work), MOST_ROWS)
     out = held_out(
         lambda x, y: train(plan, x, y, options.seed), work.inputs(plan.memory_s)[some], work.targets[some], work.part[some]
     )
@@ -133,7 +132,7 @@ def learn(
     }
     bones = None
     if options.end_to_end and chain is not None:
-        some = thinned_rows(len(work), BONE_ROWS)
+        some = spread_evenly(len(work), BONE_ROWS)
         wanted = np.array([bone_numbers(chain(markers)) for markers in work.markers[some]])
         bones = train_bayesian(work.inputs(plan.memory_s)[some], wanted, rng=np.random.default_rng(options.seed))
         report["bones_mm"] = _bone_error(bones(inputs), chain, kept)

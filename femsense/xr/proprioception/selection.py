@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, spread_evenly
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.labelled import Labelled
 from femsense.xr.proprioception.linear import train_radial, train_ridge
@@ -93,11 +93,6 @@ def folds(count: int, number: int = FOLDS) -> Iterator[BoolArray]:
         yield block == held
 
 
-def thinned_rows(count: int, most: int) -> IntArray:
-    """Return at most `most` rows, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
-
-
 def compare_plans(
     data: Labelled,
     kinds: tuple[Kind, ...],
@@ -110,7 +105,7 @@ def compare_plans(
 
     Memory and channels are chosen with ridge and radial maps, which cost little; the networks follow their choice.
     """
-    rows = thinned_rows(len(data), MOST_ROWS)
+    rows = spread_evenly(len(data), MOST_ROWS)
     targets = data.targets[rows]
     inputs = {taus: data.inputs(taus)[rows] for taus in ((), *memories)}
     everything = np.ones(len(data.channels), dtype=bool)
