@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points
+from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points, rms
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles, vertex_normals
 from femsense.io.files import write_beside
-from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, rms, skin_vertices
+from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, skin_vertices
 
 T_GLTF_ROBOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Maps the robot frame (Z up) to glTF's (Y up): (x, y, z) → (x, z, −y)."""

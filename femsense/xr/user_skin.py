@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, freeze, spread_evenly
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze, rms, spread_evenly
 from femsense.core.errors import InputError
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles
 from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
-from femsense.xr.skinning import as_states, fit_poses, fit_skin, rms, skin_vertices, weigh_points
+from femsense.xr.skinning import as_states, fit_poses, fit_skin, skin_vertices, weigh_points
 
 BUDGET = 100_000
 """Maximum number of vertices: what headsets draw at their frame rate."""
@@ -96,7 +96,7 @@ def decimated(skin: UserSkin, budget: int, *, baked: FloatArray | None = None) -
 def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
     """Embed a surface in a body. Raises InputError if most of it is far from the body, for example in another unit or frame."""
     ties = embed_points(mesh, skin.rest)
-    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    size = diagonal(mesh.nodes)
     far = float(np.median(ties.outside))
     if far > FAR * size:
         raise InputError(

@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, spread_evenly
+from femsense.core.arrays import BoolArray, FloatArray, rms, spread_evenly
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.labelled import Labelled
 from femsense.xr.proprioception.linear import train_radial, train_ridge
@@ -183,7 +183,7 @@ def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
 
 def marker_rms(errors: FloatArray) -> float:
     """Return the root mean square distance of markers [m] of errors, shape (n, 3 m)."""
-    return float(np.sqrt((errors.reshape(len(errors), -1, 3) ** 2).sum(axis=2).mean()))
+    return rms(errors.reshape(len(errors), -1, 3))
 
 
 def _cheap_plans(taus: tuple[float, ...], used: BoolArray, kinds: tuple[Kind, ...]) -> Iterator[Plan]:
