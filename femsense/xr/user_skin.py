@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze, rms, spread_evenly
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze, spread_evenly
 from femsense.core.errors import InputError
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles
-from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
+from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, export_states, report_of, write_glb
 from femsense.xr.skinning import as_states, fit_poses, fit_skin, skin_vertices, weigh_points
 
 BUDGET = 100_000
@@ -112,6 +112,26 @@ def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
     return ties
 
 
+def export_surface(
+    rest_nodes: npt.ArrayLike | None,
+    tets: npt.ArrayLike,
+    time_s: npt.ArrayLike,
+    nodes_m: npt.ArrayLike,
+    path: str | Path,
+    *,
+    skin: UserSkin | None,
+    bones: int | None = None,
+    color_rgb: npt.ArrayLike | None = None,
+    name: str = "robot",
+) -> ExportReport:
+    """Write the frames of a run as the body's own surface (`gltf.export_states`), or as the user's (`export_skin`)."""
+    if skin is None:
+        return export_states(rest_nodes, tets, time_s, nodes_m, path, bones=bones, color_rgb=color_rgb, name=name)
+    rest = np.asarray(nodes_m)[0] if rest_nodes is None else rest_nodes
+    mesh = TetMesh(np.asarray(rest, dtype=float), np.asarray(tets))
+    return export_skin(mesh, time_s, nodes_m, path, skin, bones=bones, color_rgb=color_rgb, name=name)
+
+
 def export_skin(
     mesh: TetMesh,
     time_s: npt.ArrayLike,
@@ -150,9 +170,7 @@ def export_skin(
     worn = weigh_points(own, poses[some], skin.rest, carried)
     look = color_rgb if skin.colors is None else skin.colors
     written = write_glb(path, skin.rest, skin.triangles, worn, poses, time_s, color_rgb=look, texture=skin.texture, name=name)
-    off = skin_vertices(worn, poses[some]) - carried
-    farthest = float(np.sqrt((off**2).sum(axis=2).max()))
-    return ExportReport(written, len(worn.skeleton), len(skin.rest), len(frames), rms(off), farthest)
+    return report_of(written, worn, len(frames), skin_vertices(worn, poses[some]) - carried)
 
 
 def _extent(points: FloatArray) -> str:
