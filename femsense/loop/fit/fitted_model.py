@@ -17,7 +17,7 @@ from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
 from femsense.model.effects.base import range_units
-from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.observation import Hypothesis, SceneJet, Term
 from femsense.model.robot import Robot
 
 ROUGHLY = 4
@@ -50,7 +50,7 @@ class FittedModel:
 def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
     """Return a robot, by default that of the data, with the nuisance effects: the modulus and, if the inputs are absolute, the input offsets. With a
     reference there are none."""
-    terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
+    terms: list[Term] = []
     std: list[float] = []
     for name in () if data.relative else NUISANCE:
         effect, seed = by_session(find_effect(name), [t.scene.recording for t in data.train])
@@ -98,7 +98,7 @@ def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
 
     A time constant of which the data contain only the beginning would otherwise drift to the end of its range when the rest is refitted.
     """
-    fit, terms, keep = fitted.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
+    fit, terms, keep = fitted.fit, list[Term](), list[bool]()
     for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
         own = {p.key for p in effect.parameters(data.robot, data.control)}
         mask = [p.key in own for p in parameters]

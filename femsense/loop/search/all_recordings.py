@@ -43,8 +43,8 @@ from femsense.loop.search.effect_fields import candidates_for, effect_fields
 from femsense.loop.search.screening import best_step, penalty, whitened_columns
 from femsense.loop.search.search_state import Progress, Search
 from femsense.loop.thresholds import Thresholds
-from femsense.model.effects import FORMS, Effect, Entry, Parameter, load_own_effect
-from femsense.model.observation import Hypothesis
+from femsense.model.effects import FORMS, Effect, load_own_effect
+from femsense.model.observation import Hypothesis, Term
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_points
 
@@ -170,7 +170,7 @@ def _squares(data: Data, fitted: FittedModel) -> Squares:
     return Squares(sum(float((r**2).sum()) for r in fitted_rows), counts[0], sum(float((r**2).sum()) for r in held), counts[1])
 
 
-def _key(one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> str:
+def _key(one: Term) -> str:
     """Return the key of a candidate, the same in all recordings."""
     effect, seed, parameters = one
     whole = json_text(

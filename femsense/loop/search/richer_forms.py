@@ -19,9 +19,8 @@ from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.refit import evidence, within
 from femsense.loop.search.search_state import Setting, no_equilibrium
-from femsense.model.effects import FORMS, Effect, Entry, Parameter
-
-Term = tuple[Effect, Entry, tuple[Parameter, ...]]
+from femsense.model.effects import FORMS
+from femsense.model.observation import Term
 
 
 def with_all_parts(setting: Setting, fitted: FittedModel) -> tuple[FittedModel, list[RefitRecord]]:
