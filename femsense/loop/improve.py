@@ -24,7 +24,7 @@ from femsense.loop.design.next_experiment import next_experiment
 from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
 from femsense.loop.options import Measured, SearchOptions
-from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
+from femsense.loop.result.loop_result import LoopResult, Verdict
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
@@ -105,7 +105,7 @@ def improve(
         result = conclude(data, search, rng, correct=options.correct)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
-        if result.verdict == UNEXPLAINED or (result.confounded and not record):
+        if result.verdict == Verdict.UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t) or ELSE
     result = replace(result, next_experiment=record, data=replace(result.data, seed=options.seed))

@@ -17,7 +17,7 @@ from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.model_error import Excess, excess_of, model_error
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability, repeatability
-from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
+from femsense.loop.result.loop_result import LoopResult, Verdict
 from femsense.loop.result.records import Left, NamedEffect, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded
@@ -131,10 +131,10 @@ def _verdict(data: Data, returned: Returned, remaining: Remaining, found: Sequen
     excess = remaining.excess
     explained = not returned.drifted and excess.explained >= data.thresholds.explained
     if remaining.lacks or excess.is_large or (found and not effects):
-        return UNEXPLAINED
+        return Verdict.UNEXPLAINED
     if (remaining.tests.significant or remaining.surprise) and not explained:
-        return UNEXPLAINED
-    return FOUND if effects else NONE
+        return Verdict.UNEXPLAINED
+    return Verdict.FOUND if effects else Verdict.NONE
 
 
 def improved_name(name: str) -> str:
