@@ -30,10 +30,10 @@ from femsense.io.files import file_hash, json_text, plain
 from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import NUISANCE, Data, prepare
 from femsense.loop.data.sampled_states import Sampled, drive_table
-from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
+from femsense.loop.fit.discretisation_error import with_mesh_errors_of
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, without_effect
 from femsense.loop.fit.joint_fit import Prior, fit_jointly
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.normal_equations import Block, NormalEquations, Squares
 from femsense.loop.options import Measured
@@ -127,7 +127,7 @@ def _normal_equations(question: Question, recording: Recording, forms: Sequence[
     if question.mesh_moves is not None:
         moves = question.mesh_moves
         data = with_mesh_errors_of(data, data.with_trials(lambda t: replace(t, mesh_moves=moves)), placed)
-    data = with_turning_placements(as_shown(data, placed), placed)
+    data = with_errors_as_shown(data, placed)
     placed = calibrated_pose(data, at, question.noise, placed)
     free = Prior(question.coordinates, np.full(len(question.coordinates), np.inf))
     fit = fit_jointly(

@@ -12,10 +12,10 @@ import numpy as np
 from femsense.core.errors import DataError, FemsenseError
 from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
-from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
+from femsense.loop.fit.discretisation_error import representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
 from femsense.loop.fit.joint_fit import FitOptions, Prior
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown
 from femsense.loop.fit.noise_components import UNTOLD, Noise
 from femsense.loop.search.search_state import Progress
 from femsense.loop.search.swaps import History
@@ -87,7 +87,7 @@ def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:
         plain = base
-    return with_turning_placements(as_shown(with_mesh_errors(data, plain, names), base), base)
+    return with_errors_as_shown(with_mesh_errors(data, plain, names), base)
 
 
 def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps: int) -> FittedModel:

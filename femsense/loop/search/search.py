@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import as_shown, same_mesh_error, with_mesh_errors
+from femsense.loop.fit.discretisation_error import same_mesh_error, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown, with_turning_placements
 from femsense.loop.fit.model_error import excess_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import repeatability
@@ -130,7 +130,10 @@ def _add(state: SearchProgress, best: Refit, progress: Progress) -> None:
     state.history, state.refits = swapped(state.setting(progress), history, state.refits)
     last = state.history[-1][1]
     state.earlier, state.fitted = data, last
-    state.data = with_turning_placements(as_shown(with_mesh_errors(data, last, state.names), last) if recompute else data, last)
+    if recompute:
+        state.data = with_errors_as_shown(with_mesh_errors(data, last, state.names), last)
+    else:
+        state.data = with_turning_placements(data, last)
 
 
 def _tell_parts_apart(state: SearchProgress, progress: Progress) -> None:

@@ -14,9 +14,9 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.representative_states import spread_states
-from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
+from femsense.loop.fit.discretisation_error import with_mesh_errors_of
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown, with_turning_placements
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.calibration import START, calibrated_pose, fitted_again, without_outliers_of
@@ -59,7 +59,7 @@ def in_all_states(every: Data, state: SearchProgress, search: Search, progress: 
     while (fewer := without_outliers_of(data, fitted[-1])) is not data:
         data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
     before = calibrated_pose(data, data.robot_as_declared, START)
-    data = with_turning_placements(as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1]), fitted[-1])
+    data = with_errors_as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
     refits = list(search.refits)
