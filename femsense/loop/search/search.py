@@ -40,20 +40,23 @@ def search_effects(state: SearchProgress, checkpoint: Checkpoint, progress: Prog
         weights = noise_of(state.data, state.fitted, None, state.noise)[0]
         state.begin_again(with_turning_placements(state.data, state.base), weights)
         _seek(state, checkpoint, progress)
+    return state.data, _completed(state, progress)
+
+
+def _completed(state: SearchProgress, progress: Progress) -> Search:
+    """Return the search with its last tests: does a simpler effect suffice next to a model error, and does one fit better than the input offsets?"""
     setting, data, history, refits, before = state.setting(progress), state.data, state.history, state.refits, state.before
-    noise = setting.noise
     if state.holds_error:
         history, refits = simplest(setting, history, refits, state.names)
-    fitted = history[-1][1]
-    swap = instead_of_offsets(setting, fitted, state.names) if _most_effects(data) else None
+    swap = instead_of_offsets(setting, history[-1][1], state.names) if _most_effects(data) else None
     if swap is not None:
         refits = [*refits, *at_step(swap.records, len(history))]
-        if swap.fitted is not None:
-            fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
+        history = history if swap.fitted is None else [*history, (swap.name, swap.fitted)]
     if len(history) > 1 and "clouds" in data.measured:
-        before = calibrated_pose(data, data.robot_as_declared, noise, before)  # before and after on the same rows
+        before = calibrated_pose(data, data.robot_as_declared, setting.noise, before)  # before and after on the same rows
     tables = state.first, state.table, refits
-    return data, Search(before, history, state.base, fitted, noise, state.n_effective, *tables, swap, state.outweighed)
+    final, noise = history[-1][1], setting.noise
+    return Search(before, history, state.base, final, noise, state.n_effective, *tables, swap, state.outweighed)
 
 
 def _seek(state: SearchProgress, checkpoint: Checkpoint, progress: Progress) -> None:
