@@ -199,7 +199,7 @@ def _explained(error: Exception) -> tuple[str, int]:
     if isinstance(error, TyperException):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "femsense"
-        message = one_line(error.format_message()).rstrip(".")
+        message = one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
         return f"{message}{'' if message.endswith('?') else '.'} See: {command} --help", 2
     if isinstance(error, ImportError) and not (error.name or "").startswith("femsense"):
         return (

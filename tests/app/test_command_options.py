@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,11 +25,17 @@ def lengths(texts: list[str]) -> tuple[float, ...]:
     return tuple(map(float, texts))
 
 
+class Shape(StrEnum):
+    round = "round"
+    flat = "flat"
+
+
 @dataclass(frozen=True)
 class Wanted:
     size: Annotated[float, Flag("-s --size", "MM", "How large.", min=0.5)] = 1.0
     lengths: Annotated[tuple[float, ...], Flag("--length", "MM", "How long.", read=lengths)] = ()
     files: Annotated[Sequence[Path], Flag("--file", "FILE", "Which files.")] = ()
+    shape: Annotated[Shape, Flag("--shape", help="Which shape.")] = Shape.round
     quick: bool = False
 
 
@@ -59,6 +66,7 @@ def test_a_field_with_a_flag_is_an_option_and_others_keep_their_defaults() -> No
         (["work"], "Missing argument 'PLACE'"),
         (["work", "here", "--size", "0"], "greater than or equal to 0.5"),
         (["work", "here", "--length", "x"], "--length: not a length"),
+        (["work", "here", "--shape", "x"], "Invalid value for '--shape': 'x' is not one of 'round', 'flat'. See: "),
         (["work", "here", "--quick"], "No such option: --quick"),
     ],
 )
