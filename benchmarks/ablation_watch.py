@@ -16,9 +16,9 @@ SEEN = list[dict[str, Any]]()
 """Calls of `simplest` in the current case, and the changes that it made."""
 
 
-def simplest_watched(data: Any, history: History, refits: list[RefitRecord], *given: Any) -> Any:
+def simplest_watched(setting: Any, history: History, refits: list[RefitRecord], *given: Any) -> Any:
     """Return what `simplest` returns, and note it."""
-    found = simplest(data, history, refits, *given)
+    found = simplest(setting, history, refits, *given)
     SEEN.append({"named": [name for name, _ in history[1:]], "changed": found[0] is not history})
     return found
 

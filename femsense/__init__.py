@@ -54,9 +54,10 @@ if TYPE_CHECKING:
     from femsense.report.write import write_report
     from femsense.rig.simulate import simulate
     from femsense.sensing.comparison import Comparison, compare
+    from femsense.sensing.options import SensingOptions
     from femsense.sensing.pipeline import estimate
     from femsense.sensing.run_files import read_run, run_inputs, write_run
-    from femsense.sensing.types import ContactForce, Run, SensingOptions
+    from femsense.sensing.types import ContactForce, Run
     from femsense.xr.armature import Armature, ArmatureOptions, local_poses, make_armature
     from femsense.xr.export import export_glb
     from femsense.xr.notebook import show_run
@@ -243,11 +244,8 @@ _HOMES = {
         "run_inputs",
         "write_run",
     ),
-    "sensing.types": (
-        "ContactForce",
-        "Run",
-        "SensingOptions",
-    ),
+    "sensing.options": ("SensingOptions",),
+    "sensing.types": ("ContactForce", "Run"),
     "xr.armature": ("Armature", "ArmatureOptions", "local_poses", "make_armature"),
     "xr.export": ("export_glb",),
     "xr.notebook": ("show_run",),

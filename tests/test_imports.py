@@ -35,7 +35,7 @@ ROOMS = (
     ("__main__",),
 )
 """Each sees its own room and those before it. Rooms on one floor take arrays and see nothing of each other."""
-LOOP = ("thresholds", "result", "data", "fit", "search", "verdict", "design", "files", "improve")
+LOOP = ("thresholds", "options", "result", "data", "fit", "search", "verdict", "design", "files", "improve")
 """The same inside `loop/`."""
 RIG_IS_FOR = {"rig", "design", "app"}
 """What estimates never sees the virtual rig; `loop/design` proposes experiments on it, and `app` runs it."""

@@ -25,6 +25,7 @@ from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import repeat_options
 from femsense.app.compiling import announced_compiling
 from femsense.core.errors import FemsenseError
+from femsense.core.text import one_line, with_type
 
 if TYPE_CHECKING:
     from femsense.many.jobs import Job
@@ -198,21 +199,16 @@ def _explained(error: Exception) -> tuple[str, int]:
     if isinstance(error, TyperException):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "femsense"
-        message = " ".join(error.format_message().split()).rstrip(".")
+        message = one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
         return f"{message}{'' if message.endswith('?') else '.'} See: {command} --help", 2
     if isinstance(error, ImportError) and not (error.name or "").startswith("femsense"):
         return (
-            f"a part of the installation does not load: {' '.join(str(error).split())}. femsense doctor lists what is missing",
+            f"a part of the installation does not load: {one_line(error)}. femsense doctor lists what is missing",
             2,
         )
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}", 2
-    return f"internal error: {_one_line(error)}; the details are in {_write_details(error)} (please report it)", 2
-
-
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text[:160]}" if text else type(error).__name__
+    return f"internal error: {with_type(error)}; the details are in {_write_details(error)} (please report it)", 2
 
 
 def _write_details(error: Exception) -> str:
@@ -230,7 +226,7 @@ def _calm_warnings(notes: list[str], as_json: bool) -> Iterator[None]:
     """Show each warning once, in one line on standard error; keep it for the JSON object too."""
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        text = " ".join(str(message).split())
+        text = one_line(message)
         if text not in notes:
             notes.append(text)
             typer.echo(f"warning: {text}", err=True)

@@ -16,6 +16,7 @@ from femsense.app.input_checks import warn_of_pictures
 from femsense.calib.files import read_calibration
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside
+from femsense.core.text import one_line
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import file_hash
 from femsense.io.folder_lock import only_writer
@@ -28,7 +29,8 @@ from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, w
 
 if TYPE_CHECKING:
     from femsense.loop.improve import ImproveOptions
-    from femsense.sensing.types import Run, SensingOptions
+    from femsense.sensing.options import SensingOptions
+    from femsense.sensing.types import Run
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
@@ -207,7 +209,7 @@ def written_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], 
 
         return (write or write_report)(folder)
     except (ImportError, FemsenseError) as error:
-        say(f"no report: {' '.join(str(error).split())}")
+        say(f"no report: {one_line(error)}")
         return None
 
 

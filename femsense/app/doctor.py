@@ -20,6 +20,7 @@ from typing import Any
 
 import femsense
 from femsense.core.parallel import available_cores
+from femsense.core.text import with_type
 
 PACKAGES = {
     "numpy": "numpy",
@@ -33,6 +34,7 @@ PACKAGES = {
     "pypcd4": "pypcd4",
     "qpsolvers": "qpsolvers",
     "daqp": "daqp",
+    "onnx": "onnx",
     "osqp": "osqp",
     "matplotlib": "matplotlib",
     "cv2": "opencv-python-headless",
@@ -123,7 +125,7 @@ def _guarded(part: Callable[[], Finding]) -> Finding:
     try:
         return part()
     except Exception as error:  # a broken installation may fail in any way
-        return bad(_short(error), "reinstall: pip install --force-reinstall femsense")
+        return bad(with_type(error), "reinstall: pip install --force-reinstall femsense")
 
 
 def _python() -> Finding:
@@ -136,7 +138,7 @@ def _package(module: str, package: str) -> Finding:
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # OSError, ImportError, and errors of a broken binary
-        return bad(_short(error), import_hint(str(error), package))
+        return bad(with_type(error), import_hint(str(error), package))
     return good(_version(package) or str(getattr(loaded, "__version__", "version not known")))
 
 
@@ -306,8 +308,3 @@ def _version(package: str) -> str | None:
         return version_of(package)
     except PackageNotFoundError:
         return None
-
-
-def _short(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text[:120]}"

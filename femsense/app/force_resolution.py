@@ -6,6 +6,7 @@ from typing import Any
 
 from femsense.calib.calibration import Calibration
 from femsense.core.errors import FemsenseError
+from femsense.core.text import one_line
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -19,6 +20,10 @@ def force_resolution(robot: Robot, recording: Recording, calibration: Calibratio
     try:
         found = recorded_forces(robot, recording, calibration)
     except FemsenseError as error:
-        reason = " ".join(str(error).split())
-        return {"unknown": reason}, f"forces that this camera resolves: not known. {reason}"
+        return unknown_resolution(one_line(error))
     return resolution_document(found), resolution_text(found)
+
+
+def unknown_resolution(reason: str) -> tuple[dict[str, Any], str]:
+    """Return the result where the forces are not known, for a reason."""
+    return {"unknown": reason}, f"forces that this camera resolves: not known. {reason}"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import warnings
 
-import numpy as np
-
 from femsense.calib.from_images import find_tags
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.io.clouds.cloud_checks import CLOUDS_READ, cloud_doubts, cloud_problems, doubts_of_cloud_poses, some_clouds
 from femsense.io.clouds.images import read_color
 from femsense.io.robot_tables import DICTIONARIES
@@ -44,8 +42,7 @@ def warn_of_tags(robot: Robot, recording: Recording) -> None:
 def _some_colors(recording: Recording) -> list[FloatArray]:
     """Return some colour images, shape (H, W, 3) in 0 … 1."""
     files = [file for files in recording.color_files for file in files if file is not None]
-    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, CLOUDS_READ).astype(int))] if files else []
-    return [read_color(file) for file in chosen]
+    return [read_color(files[i]) for i in spread_evenly(len(files), CLOUDS_READ)]
 
 
 def _tags(image: FloatArray, dictionary: str) -> set[int | None]:

@@ -25,7 +25,7 @@ from femsense.app.inspection.results import (
 from femsense.app.inspection.robots import inspect_mesh, inspect_robot, inspect_scene, inspect_surface
 from femsense.app.inspection.text import bullet, section_lines
 from femsense.core.errors import FemsenseError, InputError
-from femsense.core.text import did_you_mean
+from femsense.core.text import did_you_mean, one_line
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import check_no_pipe, plain
 from femsense.io.importers.formats import CAPTURE_ENDINGS
@@ -107,16 +107,15 @@ def _compare(target: Path, report: Report, robot: str | Path) -> None:
 
 def _resolution(robot: Robot, recording: Recording) -> Report:
     """Return the forces that the recording resolves; the camera's pose is found first."""
-    from femsense.app.force_resolution import force_resolution
+    from femsense.app.force_resolution import force_resolution, unknown_resolution
     from femsense.calib.calibrate import calibrate
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # calibrate prints them itself
         try:
-            calibration = calibrate(robot, recording)
+            document, text = force_resolution(robot, recording, calibrate(robot, recording))
         except FemsenseError as error:
-            return {"unknown": f"the camera's pose was not found: {' '.join(str(error).split())}"}
-        document, text = force_resolution(robot, recording, calibration)
+            document, text = unknown_resolution(f"the camera's pose was not found: {one_line(error)}")
     return document | {"text": text}
 
 
@@ -154,7 +153,7 @@ def describe(report: Mapping[str, Any]) -> str:
         2,
     )
     if forces := report.get("force_resolution"):
-        lines += ["", forces.get("text") or f"forces that this camera resolves: not known. {forces['unknown']}"]
+        lines += ["", forces["text"]]
     for title in ("problems", "warnings"):
         texts = report.get(title, [])
         if texts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import time
 import warnings
@@ -34,7 +33,6 @@ from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 from femsense.xr.view import PAGE, live_page_files
 
-PASSWORD = "FEMSENSE_PASSWORD"
 TELL_S = 0.2
 """Period at which the state of the session is sent."""
 KEEPER_S = 10.0
@@ -159,7 +157,7 @@ def summary_text(document: dict[str, Any]) -> str:
 
 def _serve(hub: Hub, name: str, options: LiveOptions) -> tuple[str, list[MqttSink]]:
     """Attach page, brokers and file to a hub; return the address of the page, or "", and clients of brokers elsewhere."""
-    password = read_password(options.password_file, os.environ.get(PASSWORD))
+    password = read_password(options.password_file)
     access, url, brokers = Access(options.host, password), "", []
     if options.page:
         url = WebSocketServer(hub, live_page_files(PAGE), access=access, options=ServerOptions(port=options.port)).url

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from femsense.app.command_line.parameters import three_numbers
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, write_json
 from femsense.io.own_files import MOTION
@@ -84,7 +84,7 @@ def _amount(value: float, unit: str) -> str:
 def _check_size(robot: Robot, wanted: Mapping[Any, FloatArray]) -> None:
     """Raise InputError where a target is so far away that it is in another unit."""
     low, high = robot.body.mesh.nodes.min(axis=0), robot.body.mesh.nodes.max(axis=0)
-    far = FAR * float(np.linalg.norm(high - low))
+    far = FAR * diagonal(robot.body.mesh.nodes)
     for name, place in wanted.items():
         if np.nanmax(np.maximum(low - place, place - high), initial=-np.inf) > far:
             raise InputError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from femsense.xr.stream.readings import Readings
     from femsense.xr.user_skin import UserSkin
 
-PASSWORD = "FEMSENSE_PASSWORD"
 WATCH_S = 0.05
 """Period at which a source is checked for a stop."""
 MEASURED_HZ = 100.0
@@ -240,7 +238,7 @@ def show_stream(
     """Serve the page on this machine for the stream at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
     files = live_page_files(page)
     hub = Hub()
-    bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)), authority=authority)
+    bridge = Bridge(hub, url, password=read_password(password_file), authority=authority)
     try:
         server = WebSocketServer(hub, files, options=ServerOptions(port=port))
     except BaseException:
@@ -292,7 +290,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
     """Start the server, and a broker or a client of one where the options name it; `stop` ends the sources."""
-    password = read_password(options.password_file, os.environ.get(PASSWORD))
+    password = read_password(options.password_file)
     access = Access(options.host, password, options.certificate, options.key, tuple(options.names))
     address = None if options.mqtt is None else broker_address(options.mqtt, password=password, authority=options.authority)
     if options.commands and not options.insecure:

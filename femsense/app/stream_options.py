@@ -21,7 +21,7 @@ class StreamOptions:
     commands: Annotated[bool, Flag("--commands", help="With --drag: publish commands once a viewer arms them.")] = False
     insecure: Annotated[bool, Flag("--insecure", help="With --commands: also over a broker that lets anybody in.")] = False
     host: Annotated[str, Flag("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1"
-    names: Annotated[Sequence[str], Flag("--name", "NAME", "By which others know this machine.", read=tuple)] = ()
+    names: Annotated[Sequence[str], Flag("--name", "NAME", "By which others know this machine.")] = ()
     port: Annotated[int, Flag("--port", help="Of the page and its WebSocket; 0: a free one.", min=0, max=65535)] = 8010
     mqtt: Annotated[str | None, Flag("--mqtt", "HOST[:PORT]", "Send to this broker; mqtts:// encrypts.")] = None
     broker: Annotated[bool, Flag("--broker", help="Serve a broker for this machine.")] = False

@@ -30,6 +30,21 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return view
 
 
+def diagonal(points: FloatArray) -> float:
+    """Return the diagonal of the bounding box of points (n, d), in their unit."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def rms(vectors: FloatArray) -> float:
+    """Return the root mean square length of vectors, shape (…, d)."""
+    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))
+
+
+def spread_evenly(count: int, most: int) -> IntArray:
+    """Return at most `most` indices of `count` items, spread evenly, the first and the last among them; shape (k,)."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))
+
+
 def as_numbers(values: npt.ArrayLike, name: str, *, expected: object = "numbers", hint: str | None = None) -> FloatArray:
     """Coerce to numbers of any shape. Raises InputError with what was expected and a hint."""
     try:

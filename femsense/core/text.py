@@ -43,6 +43,16 @@ def short(value: object, width: int = 90) -> str:
     return text if len(text) <= width else text[: width - 1] + "…"
 
 
+def one_line(text: object, most: int | None = None) -> str:
+    """Return a message, or that of an error, in one line, cut to `most` characters."""
+    return " ".join(str(text).split())[:most]
+
+
+def with_type(error: BaseException, most: int = 160) -> str:
+    """Return the type of an error and its message in one line."""
+    return f"{type(error).__name__}: {one_line(error, most)}".removesuffix(": ")
+
+
 def key_path(location: Sequence[int | str]) -> str:
     """Return a place in a document as text: ("cables", 1, "path_m") is cables[1].path_m."""
     text = ""

@@ -15,15 +15,12 @@ from femsense.io.provenance import recording_input, robot_input, versions
 from femsense.io.result_folder import check_folder, read_document, results_folder
 from femsense.io.robot_toml import robot_document, save_robot
 from femsense.io.tables import validated
-from femsense.loop.result.loop_result import SavedLoop
+from femsense.loop.result.loop_result import FORMAT, SavedLoop
 
 if TYPE_CHECKING:
     from femsense.loop.result.loop_result import LoopResult
     from femsense.model.recording import Recording
     from femsense.model.robot import Robot
-
-
-LOOP_FORMAT = "femsense-loop-1"
 
 
 def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], **options: Any) -> dict[str, Any]:
@@ -86,7 +83,7 @@ def check_loop_folder(folder: str | Path, robot: Robot | None = None) -> None:
 def read_loop(path: str | Path) -> dict[str, Any]:
     """Return the content of loop.json, or of the one in a folder. Raises InputError."""
     file = Path(path).expanduser()
-    return read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)
+    return read_document(file / "loop.json" if file.is_dir() else file, FORMAT)
 
 
 def saved_loop(document: Mapping[str, Any], file: str | Path = "loop.json") -> SavedLoop:

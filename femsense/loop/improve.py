@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from femsense.loop.data.dataset import MESH, Data, prepare
 from femsense.loop.design.next_experiment import next_experiment
 from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
-from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
+from femsense.loop.options import Measured, SearchOptions
+from femsense.loop.result.loop_result import LoopResult, Verdict
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.all_recordings import Ask, Spread, asked_elsewhere, asked_here, in_all_recordings, recordings_to_search
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
@@ -45,15 +46,9 @@ MOST_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ImproveOptions:
-    """Options of `improve`: further effects, which measurements are used, and how the work is done."""
+class ImproveOptions(SearchOptions):
+    """Options of `improve`: those of the search, its references, and how the work is done."""
 
-    user_effects: Sequence[str | Path] = ()
-    """Python files with user-defined effects (docs/effects/own.md); "all" includes them."""
-    measured: str = "auto"
-    """Which measurements are fitted: "markers", "clouds" or "both"; "auto": the markers of a recording, or its clouds if it has no markers."""
-    correct: bool = False
-    """Also learn an empirical correction of the remaining residual, judged on held-out data. It is neither a cause nor an effect."""
     references: Sequence[Recording] = ()
     """Recordings of the same inputs without the load of interest (a weight, for example). Their residuals are subtracted from all other
     recordings (`femsense/calib/reference.py`)."""
@@ -99,19 +94,18 @@ def improve(
     work, options = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     searched: Sequence[Recording]
     searched, others = _split(recordings, validation, options)
-    names, forms = _asked(robot, searched, effects, without, options, apart=not others)
-    searched, validation = _less_references(robot, searched, validation, options, work)
+    task = _task(robot, searched, validation, effects, without, options, work, apart=not others)
     rng = np.random.default_rng(options.seed)
-    with Checkpoint(options.keep, forms) as checkpoint, work.watching():
-        data, search = _search(robot, searched, validation, (names, forms), options, checkpoint, work)
+    with Checkpoint(options.keep, task.forms) as checkpoint, work.watching():
+        data, search = _searched(task, checkpoint, work)
         if others:
-            search = in_all_recordings(data, search, others, names, _ask(options, forms), work)
+            search = in_all_recordings(data, search, others, task.names, _ask(options, task.forms), work)
         work.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
         work("testing the remaining residual")
         result = conclude(data, search, rng, correct=options.correct)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
-        if result.verdict == UNEXPLAINED or (result.confounded and not record):
+        if result.verdict == Verdict.UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t) or ELSE
     result = replace(result, next_experiment=record, data=replace(result.data, seed=options.seed))
@@ -132,18 +126,30 @@ def search_recordings(
     options: ImproveOptions | None = None,
 ) -> tuple[Data, Search]:
     """Return the data and the completed search, without the conclusion that `conclude` draws; arguments and errors as of `improve`."""
-    options = options or ImproveOptions()
-    names, forms = _asked(robot, recordings, effects, without, options)
-    recordings, validation = _less_references(robot, recordings, validation, options, lambda text: None)
-    with Checkpoint(options.keep, forms) as checkpoint:
-        return _search(robot, recordings, validation, (names, forms), options, checkpoint, WorkPlan(lambda text: None))
+    options, work = options or ImproveOptions(), WorkPlan(lambda text: None)
+    task = _task(robot, recordings, validation, effects, without, options, work)
+    with Checkpoint(options.keep, task.forms) as checkpoint:
+        return _searched(task, checkpoint, work)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Task:
+    """A search: the declared robot, the data, and the effects to try."""
+
+    robot: Robot
+    recordings: Sequence[Recording]
+    validation: Sequence[Recording]
+    names: list[str]
+    forms: tuple[Effect, ...]
+    """Of all effects."""
+    options: ImproveOptions
 
 
 def _split(
     recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions
 ) -> tuple[list[Recording], list[Recording]]:
     """Return the recordings that are searched for effects, and the others; none of the latter with `validation` or `references`."""
-    if validation or options.references or options.measured not in ("auto", "markers"):
+    if validation or options.references or options.measured not in (Measured.auto, Measured.markers):
         return list(recordings), []
     return recordings_to_search(recordings, options.effort.recordings)
 
@@ -155,126 +161,108 @@ def _ask(options: ImproveOptions, forms: Sequence[Effect]) -> Ask:
     return asked_elsewhere(options.spread, forms, options.user_effects, folder)
 
 
-def _less_references(
-    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], options: ImproveOptions, work: Progress
-) -> tuple[Sequence[Recording], Sequence[Recording]]:
-    """Return the recordings with the residuals of the references subtracted; unchanged if there are none."""
-    if not options.references:
-        return recordings, validation
-    work("comparing with the reference")
-    every = less_reference(robot, [*recordings, *validation], options.references)
-    return every[: len(recordings)], every[len(recordings) :]
-
-
-def _asked(
+def _task(
     robot: Robot,
     recordings: Sequence[Recording],
+    validation: Sequence[Recording],
     effects: Sequence[str] | None,
     without: Sequence[str] | None,
     options: ImproveOptions,
+    work: Progress,
     *,
     apart: bool = True,
-) -> tuple[list[str], tuple[Effect, ...]]:
-    """Return the names of the effects to try, and all their forms, with one value per recording too if `apart`. Raises InputError."""
+) -> Task:
+    """Return the search that is asked for, the residuals of references subtracted; effects have one value per recording too if `apart`. Raises InputError."""
     own = tuple(load_own_effect(file) for file in options.user_effects)
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
-    names = (
-        [name for name in names if name != MESH.name] if options.references else names
-    )  # references cancel the discretisation error of the declared mesh only
+    if options.references:  # they cancel the discretisation error of the declared mesh only
+        names = [name for name in names if name != MESH.name]
     if not names:
         raise InputError(
             "no effect is left to try", where="effects, without", expected="one of those that femsense docs effects lists"
         )
     _require_one_that_acts(names if effects else [], own, robot, recordings)
-    return names, (*FORMS, *(forms_by_recording(FORMS, recordings) if apart else ()), *own)
+    forms = (*FORMS, *(forms_by_recording(FORMS, recordings) if apart else ()), *own)
+    if options.references:
+        work("comparing with the reference")
+        every = less_reference(robot, [*recordings, *validation], options.references)
+        recordings, validation = every[: len(recordings)], every[len(recordings) :]
+    return Task(robot, recordings, validation, names, forms, options)
 
 
-def _search(
-    robot: Robot,
-    recordings: Sequence[Recording],
-    validation: Sequence[Recording],
-    asked: tuple[list[str], tuple[Effect, ...]],
-    options: ImproveOptions,
-    checkpoint: Checkpoint,
-    work: WorkPlan,
-) -> tuple[Data, Search]:
-    names, forms = asked
-
-    def calibrated_search(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
-        with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
-            data, before, start = calibrated(data, work)
-            finer_is_made()
-        data = with_discretisation_error(data, start[-1][1], names, work)
-        work.next_stage()
-        return new_search((data, before, start), names, refits, quadratic=quadratic)
-
-    def prepare_data(body: Robot) -> Data:
-        work("reading and calibrating")
-        every = prepare(body, recordings, validation, options.measured)
-        return replace(
-            every,
-            forms=forms,
-            declared=robot,
-            thresholds=options.thresholds,
-            effort=options.effort,
-            relative=bool(options.references),
-        )
-
-    def prepare_search(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
-        elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)
-        some = some_states(every)
-        with contextlib.suppress(FemsenseError):  # if an effect has no equilibrium in some state, the search runs in all states
-            if some is not None:
-                work.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
-                state = calibrated_search(some, names, quadratic, refits)
-                search = search_effects(state, Checkpoint(None), work)[1]
-                work.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
-                state = in_all_states(every, state, search, work)
-                work.next_stage()
-                return state
-        work.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
-        return calibrated_search(every, names, quadratic, refits)
-
-    return _searched(robot, names, prepare_data, prepare_search, checkpoint, work)
+def _data_on(body: Robot, task: Task, work: Progress) -> Data:
+    """Return the data of a search on a robot: as declared, or with quadratic elements."""
+    work("reading and calibrating")
+    options = task.options
+    return replace(
+        prepare(body, task.recordings, task.validation, options.measured),
+        forms=task.forms,
+        declared=task.robot,
+        thresholds=options.thresholds,
+        effort=options.effort,
+        relative=bool(options.references),
+    )
 
 
-def _searched(
-    robot: Robot,
-    names: list[str],
-    prepare_data: Callable[[Robot], Data],
-    prepare_search: Callable[..., SearchProgress],
-    checkpoint: Checkpoint,
-    work: WorkPlan,
-) -> tuple[Data, Search]:
+def _begun(every: Data, names: Sequence[str], work: WorkPlan, *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    """Return the state of a search in all states: calibrated, or as far as a search in representative states came."""
+    elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)
+    some = some_states(every)
+    with contextlib.suppress(FemsenseError):  # if an effect has no equilibrium in some state, the search runs in all states
+        if some is not None:
+            work.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
+            state = _calibrated_search(some, names, work, quadratic, refits)
+            search = search_effects(state, Checkpoint(None), work)[1]
+            work.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
+            state = in_all_states(every, state, search, work)
+            work.next_stage()
+            return state
+    work.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
+    return _calibrated_search(every, names, work, quadratic, refits)
+
+
+def _calibrated_search(
+    data: Data, names: Sequence[str], work: WorkPlan, quadratic: bool, refits: list[RefitRecord]
+) -> SearchProgress:
+    with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
+        data, before, start = calibrated(data, work)
+        finer_is_made()
+    data = with_discretisation_error(data, start[-1][1], names, work)
+    work.next_stage()
+    return new_search((data, before, start), names, refits, quadratic=quadratic)
+
+
+def _searched(task: Task, checkpoint: Checkpoint, work: WorkPlan) -> tuple[Data, Search]:
     """Return the data and the search: on quadratic elements if the robot declares linear ones and the data need quadratic ones, else on the declared
     mesh. An interrupted search resumes."""
-    refits: list[RefitRecord] = []
+    robot, names, refits = task.robot, task.names, list[RefitRecord]()
+    linear_names = [name for name in names if name != MESH.name]
     asks = seeks_with_quadratic(robot, names)
     kept = checkpoint.kept(SearchProgress)
     if kept is not None:
         work(f"resuming the search (effects found: {kept.found})")
     if asks and kept is None:
-        data = prepare_data(robot)
+        data = _data_on(robot, task, work)
         work.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
         work("testing whether linear elements suffice")
         record = linear_suffice(data)
         if record is not None:
-            names = [name for name in names if name != MESH.name]
-            state = prepare_search(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
+            state = _begun(replace(data, mesh_as_shown=True), linear_names, work, quadratic=False, refits=[record])
             return search_effects(state, checkpoint, work)
     if asks and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and converge in states where quadratic ones fold
-            state = kept or prepare_search(prepare_data(with_quadratic(robot)), names, quadratic=True, refits=[])
+            state = kept or _begun(_data_on(with_quadratic(robot), task, work), names, work, quadratic=True, refits=[])
             data, search = search_effects(state, checkpoint, work)
             work("testing whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
             if needed:
                 return data, replace(search, refits=[*refits, *search.refits])
-            names = [name for name in names if name != MESH.name]
+            names = linear_names
         kept = None
-    return search_effects(kept or prepare_search(prepare_data(robot), names, quadratic=False, refits=refits), checkpoint, work)
+    state = kept or _begun(_data_on(robot, task, work), names, work, quadratic=False, refits=refits)
+    return search_effects(state, checkpoint, work)
 
 
 def states_of(data: Data) -> int:

@@ -75,13 +75,16 @@ class Scene:
         )
 
 
+Term = tuple[Effect, Entry, tuple[Parameter, ...]]
+"""An effect of a hypothesis, the fixed keys of its entry, and its fitted parameters."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Hypothesis:
     """A robot with effects whose parameters are fitted."""
 
     robot: Robot
-    terms: tuple[tuple[Effect, Entry, tuple[Parameter, ...]], ...] = ()
-    """(effect, fixed keys of its entry, fitted parameters)."""
+    terms: tuple[Term, ...] = ()
     settled: tuple[tuple[Effect, Entry], ...] = ()
     """Effects without parameters, which the robot has already."""
 

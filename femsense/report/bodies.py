@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, diagonal
 from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.report.drawing import INK, MANY, SIZE, SOFT, WIDTH, nice
 
@@ -115,7 +115,7 @@ def exaggeration(points: FloatArray, fields: Sequence[FloatArray], *, share: flo
     """Return a round factor by which vectors (k, 3) [m] are drawn longer on a body of some points (n, 3) [m], at least 1: the longest
     then has about this share of the size of the body."""
     largest = largest_of(fields)
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    size = diagonal(points)
     return max(1.0, nice(share * size / largest)) if largest > 0 else 1.0
 
 

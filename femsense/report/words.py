@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import Verdict
 
 NOTHING = "–"
-VERDICTS = {
-    FOUND: "the data name what the model lacks",
-    NONE: "the model explains the data to their noise",
-    UNEXPLAINED: "a residual remains that no effect explains",
+VERDICTS: dict[str, str] = {
+    Verdict.FOUND: "the data name what the model lacks",
+    Verdict.NONE: "the model explains the data to their noise",
+    Verdict.UNEXPLAINED: "a residual remains that no effect explains",
 }
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), "1": (1.0, "")}

@@ -25,6 +25,7 @@ from femsense.sensing.baseline.published_method import sense_as_published
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import Clock, sense
 from femsense.sensing.model import Candidates
+from femsense.sensing.options import SensingMethod, SensingOptions
 from femsense.sensing.places import near_places
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.states import free_state
@@ -36,7 +37,6 @@ from femsense.sensing.types import (
     LoadComparison,
     Run,
     SensedFrame,
-    SensingOptions,
     Sensor,
     States,
 )
@@ -122,7 +122,7 @@ def _method(
     robot: Robot, recording: Recording, calibration: Calibration, at: npt.ArrayLike | None, options: SensingOptions
 ) -> _Method:
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
-    if options.method == "paper":
+    if options.method == SensingMethod.paper:
         return _Method(sensor, partial(sense_as_published, sensor))
     model = learn(sensor)
     return _Method(model.sensor, partial(sense, model), model.candidates)

@@ -27,8 +27,9 @@ from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
+from femsense.sensing.options import SensingOptions
 from femsense.sensing.places import near_places, object_touches, objects_near
-from femsense.sensing.types import Knowledge, SensingOptions, Sensor
+from femsense.sensing.types import Knowledge, Sensor
 
 POSE_STD = 0.3 * DECLARED_STD
 """How well a declared pose is known beforehand beside clouds: 0.15° and 0.3 mm along each axis. What the model sags too much or too little looks like

@@ -23,8 +23,8 @@ from femsense.io.own_files import RUN
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
 from femsense.io.result_folder import RUN_FILES, check_folder, read_document, results_folder, table_of
 from femsense.io.tables import read_csv
+from femsense.sensing.options import SensingOptions
 from femsense.sensing.run_arrays import count_of, undetermined, undetermined_text
-from femsense.sensing.types import SensingOptions
 
 if TYPE_CHECKING:
     from femsense.model.recording import Recording

@@ -22,28 +22,7 @@ from femsense.model.robot import Robot
 from femsense.pointcloud.local_planes import LocalPlanes
 from femsense.pointcloud.primitives import Shape
 from femsense.sensing import run_arrays
-
-
-@dataclass(frozen=True, slots=True)
-class SensingOptions:
-    """What the data cannot say."""
-
-    method: str = "rays"
-    """"rays": every point a measurement, one objective (docs/method/estimator.md); "paper": the published method, feature points along their normals and one
-    linear step."""
-    friction: float | None = 1.0
-    """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
-    push: bool = False  # what acts at a given place keeps to its cone, too
-    smooth_s: float = 0.0
-    """Time constant over which the forces of one track are averaged [s]; they lag by so much. 0: each frame speaks for itself."""
-    modulus_std: float = 0.03
-    """What is not known of the modulus before the free frames are seen, relative."""
-    marker_std_m: float | None = None
-    """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    marker_model_std: float = 0.015
-    """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
-    correct: bool = False
-    """Use the robot's empirical correction of its markers, with its standard deviation."""
+from femsense.sensing.options import SensingOptions
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -67,14 +67,6 @@ def local_poses(poses: BonePoses) -> BonePoses:
     return poses_from_matrices(np.concatenate([T[:1], np.linalg.inv(T[:-1]) @ T[1:]]))
 
 
-def flat_poses(local: BonePoses) -> BonePoses:
-    """Return bones in the robot frame from a hierarchical chain; undoes `local_poses`."""
-    chain = [np.eye(4)]
-    for T_parent_bone in local.T_robot_bone:
-        chain.append(chain[-1] @ T_parent_bone)
-    return poses_from_matrices(np.array(chain[1:]))
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class ArmatureOptions:
     """How bones are placed on a chain of points."""

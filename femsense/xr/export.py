@@ -12,16 +12,15 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.fem.mesh import TetMesh
 from femsense.io.files import check_target, write_beside
 from femsense.io.own_files import GLB, USDZ
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.glb_arrows import with_arrows
-from femsense.xr.gltf import ExportReport, export_states
+from femsense.xr.gltf import ExportReport
 from femsense.xr.run_contents import export_run
 from femsense.xr.usdz_export import write_usdz
-from femsense.xr.user_skin import UserSkin, export_skin
+from femsense.xr.user_skin import UserSkin, export_surface
 
 ENDINGS = (".glb", ".usdz")
 """Supported formats."""
@@ -94,12 +93,8 @@ def export_glb(
         return export_run(run, target, bones=bones, color_rgb=color_rgb, skin=skin)
     states, robot = run.states, run.robot
     color = robot.color_rgb if color_rgb is None else color_rgb
-    if skin is not None:
-        mesh = TetMesh(states.rest_nodes_m, states.tets)
-        return export_skin(mesh, states.time_s, states.nodes_m, target, skin, bones=bones, color_rgb=color, name=robot.name)
-    return export_states(
-        states.rest_nodes_m, states.tets, states.time_s, states.nodes_m, target, bones=bones, color_rgb=color, name=robot.name
-    )
+    body = states.rest_nodes_m, states.tets, states.time_s, states.nodes_m
+    return export_surface(*body, target, skin=skin, bones=bones, color_rgb=color, name=robot.name)
 
 
 def _with_arrows(run: RunLike | str | Path, report: ExportReport) -> ExportReport:

@@ -19,7 +19,7 @@ from femsense.model.robot import Robot
 from femsense.sensing.run_arrays import identities_of, tracks_of
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.glb_reader import parts_of
-from femsense.xr.gltf import INDEX_DATA, VERTEX_DATA, Buffer, container
+from femsense.xr.gltf import INDEX_DATA, VERTEX_DATA, Buffer, container, without_jumps
 
 LONGEST = 0.42
 """Length of the arrow of the largest force, relative to the body's size."""
@@ -123,13 +123,12 @@ def _track(contacts: Sequence[ContactForce], frames: IntArray, count: int, metre
     sizes = np.linalg.norm(forces, axis=1)
     along = forces / np.maximum(sizes, 1e-12)[:, None]
     turn = np.array([Rotation.align_vectors(way[None], [[0.0, 1.0, 0.0]])[0].as_quat() for way in along])[nearest]
-    turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))[:, None]
     there = np.isin(np.arange(count), frames).astype(float)
     std = np.nan_to_num([one.force_std_n_xyz for one in contacts])
     across = np.sqrt(np.maximum((std**2).sum(axis=1) - ((std * along) ** 2).sum(axis=1), 0.0) / 2.0)
     return _Track(
         place=np.array([one.position_m for one in contacts])[nearest],
-        turn=turn,
+        turn=without_jumps(turn),
         length=there * metres_per_newton * sizes[nearest],
         aside=there * metres_per_newton * across[nearest],
         blur=there[:, None] * np.nan_to_num([one.position_std_m for one in contacts])[nearest],

@@ -4,6 +4,7 @@ and the surface."""
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,12 +16,12 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
-from femsense.xr.gltf import T_GLTF_ROBOT
+from femsense.xr.gltf import COMPONENT, SHAPE, T_GLTF_ROBOT
 from femsense.xr.skeleton import Skeleton
 from femsense.xr.skinning import Skin
 
-COMPONENTS = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+COMPONENTS = {code: dtype.newbyteorder("<") for dtype, code in COMPONENT.items()}
+WIDTHS = {name: math.prod(shape) for shape, name in SHAPE.items()}
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -17,16 +17,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points
+from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points, rms
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles, vertex_normals
 from femsense.io.files import write_beside
-from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, rms, skin_vertices
+from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, skin_vertices
 
 T_GLTF_ROBOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Maps the robot frame (Z up) to glTF's (Y up): (x, y, z) → (x, z, −y)."""
 DEFAULT_COLOR = (0.20, 0.45, 0.80)
-COMPONENT = {np.dtype(np.uint8): 5121, np.dtype(np.uint16): 5123, np.dtype(np.uint32): 5125, np.dtype(np.float32): 5126}
+COMPONENT: dict[np.dtype[Any], int] = {
+    np.dtype(name): code for name, code in (("u1", 5121), ("u2", 5123), ("u4", 5125), ("f4", 5126))
+}
 SHAPE = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 VERTEX_DATA, INDEX_DATA = 34962, 34963
 
@@ -101,9 +103,13 @@ def export_states(
     skin = fit_skin(rest, surface, bones=bones)
     poses = fit_poses(skin, surface)
     written = write_glb(path, rest, corners.reshape(-1, 3), skin, poses, times, color_rgb=color_rgb, name=name)
-    off = skin_vertices(skin, poses) - surface
-    farthest = float(np.sqrt((off**2).sum(axis=2).max()))
-    return ExportReport(written, len(skin.skeleton), len(rest), len(frames), rms(off), farthest)
+    return report_of(written, skin, len(frames), skin_vertices(skin, poses) - surface)
+
+
+def report_of(path: Path, skin: Skin, frames: int, errors: FloatArray) -> ExportReport:
+    """Return the report of an export; `errors` [m] are those of the vertices, shape (F, V, 3)."""
+    farthest = float(np.linalg.norm(errors, axis=2).max())
+    return ExportReport(path, len(skin.skeleton), len(skin.rest), frames, rms(errors), farthest)
 
 
 def write_glb(
@@ -207,10 +213,13 @@ def quaternions(rotations: FloatArray) -> FloatArray:
     """
     from scipy.spatial.transform import Rotation
 
-    q = np.asarray(Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat()).reshape(*rotations.shape[:2], 4)
+    return without_jumps(np.asarray(Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat()).reshape(*rotations.shape[:2], 4))
+
+
+def without_jumps(q: FloatArray) -> FloatArray:
+    """Return quaternions, shape (F, …, 4), with signs such that the product of each with the one before is not negative."""
     flips = np.where((q[1:] * q[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
-    q[1:] *= np.cumprod(flips, axis=0)[..., None]
-    return q
+    return np.concatenate([q[:1], q[1:] * np.cumprod(flips, axis=0)[..., None]])
 
 
 # ---- parts of the file ---------------------------------------------------------------------------------------------------

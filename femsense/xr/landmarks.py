@@ -32,9 +32,7 @@ class Landmarks:
 
 def landmarks_of_run(run: Path) -> Landmarks:
     """Return the markers of the run's robot and the cameras of its calibration, as far as their files exist."""
-    document = _document(run / "run.json")
-    calibration = _document(run / "calibration.json")
-    told = _markers(_folder(document))
+    calibration, told = _document(run / "calibration.json"), _markers(robot_table(run))
     seats = calibration.get("placements_m")
     if isinstance(seats, dict):
         told |= {name: seats[name] for name in told.keys() & seats.keys()}
@@ -43,29 +41,24 @@ def landmarks_of_run(run: Path) -> Landmarks:
     return Landmarks(tuple(Landmark(name, freeze(place)) for name, place in told.items()), cameras)
 
 
+def run_document(run: Path) -> dict[str, Any]:
+    """Return the content of run.json; empty if it cannot be read."""
+    return _document(run / "run.json")
+
+
 def robot_table(run: Path) -> dict[str, Any]:
     """Return the content of robot.toml of the run's robot; empty if it no longer exists."""
-    folder = _folder(_document(run / "run.json"))
     try:
-        return {} if folder is None else tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-
-
-def _markers(folder: Path | None) -> dict[str, Any]:
-    try:
-        table = {} if folder is None else tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))
-        return {str(row["name"]): np.asarray(row["position_m"], dtype=float).reshape(3) for row in table.get("markers", [])}
+        return tomllib.loads(Path(run_document(run)["inputs"]["robot"]["path"], "robot.toml").read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
-def _folder(document: dict[str, Any]) -> Path | None:
+def _markers(robot: dict[str, Any]) -> dict[str, Any]:
     try:
-        path = document["inputs"]["robot"]["path"]
-    except (KeyError, TypeError):
-        return None
-    return Path(path) if isinstance(path, str) else None
+        return {str(row["name"]): np.asarray(row["position_m"], dtype=float).reshape(3) for row in robot.get("markers", [])}
+    except (ValueError, KeyError, TypeError):
+        return {}
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 from collections.abc import Iterable
@@ -16,10 +15,10 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.xr.glb_reader import read_glb
-from femsense.xr.gltf import ExportReport, export_states
-from femsense.xr.landmarks import landmarks_of_run, robot_table
+from femsense.xr.gltf import ExportReport
+from femsense.xr.landmarks import landmarks_of_run, robot_table, run_document
 from femsense.xr.surface_stress import SurfaceStress, nodal_strain, surface_stress
-from femsense.xr.user_skin import BUDGET, GLTF, UserSkin, export_skin, read_skin
+from femsense.xr.user_skin import BUDGET, GLTF, UserSkin, export_surface, read_skin
 
 FORMAT = "femsense-contacts-1"
 CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "force_n", "std_n", "source")
@@ -35,20 +34,8 @@ def export_run(
     """
     run = run_folder(folder)
     states = load_states(run)
-    if skin is not None:
-        mesh = TetMesh(np.asarray(states.get("rest_nodes_m", states["nodes_m"][0]), dtype=float), states["tets"])
-        name = name_of_run(run)
-        return export_skin(mesh, states["time_s"], states["nodes_m"], path, skin, bones=bones, color_rgb=color_rgb, name=name)
-    return export_states(
-        states.get("rest_nodes_m"),
-        states["tets"],
-        states["time_s"],
-        states["nodes_m"],
-        path,
-        bones=bones,
-        color_rgb=color_rgb,
-        name=name_of_run(run),
-    )
+    body = states.get("rest_nodes_m"), states["tets"], states["time_s"], states["nodes_m"]
+    return export_surface(*body, path, skin=skin, bones=bones, color_rgb=color_rgb, name=name_of_run(run))
 
 
 def skin_for_run(folder: str | Path, file: str | Path, *, unit: str | None = None, budget: int = BUDGET) -> UserSkin:
@@ -269,10 +256,6 @@ def load_states(run: Path) -> dict[str, Any]:
 
 def name_of_run(run: Path) -> str:
     """Return the robot's name from run.json, else the folder's."""
-    try:
-        known = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        known = {}
-    robot = known.get("robot") if isinstance(known, dict) else None
+    robot = run_document(run).get("robot")
     name = robot.get("name") if isinstance(robot, dict) else robot
     return Path(name).name if isinstance(name, str) and name else run.resolve().name

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.core.arrays import FloatArray, IntArray, as_points, diagonal, freeze, rms
 from femsense.core.errors import InputError
 from femsense.xr.skeleton import MAX_BONES, Skeleton, farthest_points, skeleton_at
 from femsense.xr.skinning_kernels import sweep_poses, weights_of_vertices
@@ -219,11 +219,6 @@ def as_states(states: npt.ArrayLike, vertices: int) -> FloatArray:
     return frames
 
 
-def rms(difference: FloatArray) -> float:
-    """Return the root mean square length of vectors, shape (…, 3)."""
-    return float(np.sqrt((difference**2).sum(axis=-1).mean()))
-
-
 # ---- how many bones -------------------------------------------------------------------------------------------------
 
 
@@ -367,4 +362,4 @@ def _poses_of_frames(fit: PoseFit, frames: FloatArray, sweeps: int) -> FloatArra
 
 def _size(rest: FloatArray) -> float:
     """Return the diagonal of the bounding box [m], never 0."""
-    return float(np.linalg.norm(np.ptp(rest, axis=0))) or 1.0
+    return diagonal(rest) or 1.0

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze, spread_evenly
 from femsense.core.errors import InputError
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles
-from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
-from femsense.xr.skinning import as_states, fit_poses, fit_skin, rms, skin_vertices, weigh_points
+from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, export_states, report_of, write_glb
+from femsense.xr.skinning import as_states, fit_poses, fit_skin, skin_vertices, weigh_points
 
 BUDGET = 100_000
 """Maximum number of vertices: what headsets draw at their frame rate."""
@@ -96,7 +96,7 @@ def decimated(skin: UserSkin, budget: int, *, baked: FloatArray | None = None) -
 def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
     """Embed a surface in a body. Raises InputError if most of it is far from the body, for example in another unit or frame."""
     ties = embed_points(mesh, skin.rest)
-    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    size = diagonal(mesh.nodes)
     far = float(np.median(ties.outside))
     if far > FAR * size:
         raise InputError(
@@ -110,6 +110,26 @@ def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
             hint="its unit, or its axes: robot frame as in robot.toml, glTF with Y up",
         )
     return ties
+
+
+def export_surface(
+    rest_nodes: npt.ArrayLike | None,
+    tets: npt.ArrayLike,
+    time_s: npt.ArrayLike,
+    nodes_m: npt.ArrayLike,
+    path: str | Path,
+    *,
+    skin: UserSkin | None,
+    bones: int | None = None,
+    color_rgb: npt.ArrayLike | None = None,
+    name: str = "robot",
+) -> ExportReport:
+    """Write the frames of a run as the body's own surface (`gltf.export_states`), or as the user's (`export_skin`)."""
+    if skin is None:
+        return export_states(rest_nodes, tets, time_s, nodes_m, path, bones=bones, color_rgb=color_rgb, name=name)
+    rest = np.asarray(nodes_m)[0] if rest_nodes is None else rest_nodes
+    mesh = TetMesh(np.asarray(rest, dtype=float), np.asarray(tets))
+    return export_skin(mesh, time_s, nodes_m, path, skin, bones=bones, color_rgb=color_rgb, name=name)
 
 
 def export_skin(
@@ -145,14 +165,12 @@ def export_skin(
     used = np.unique(surface_triangles(mesh))
     own = fit_skin(mesh.nodes[used], frames[:, used], bones=bones)
     poses = fit_poses(own, frames[:, used])
-    some = np.unique(np.linspace(0, len(frames) - 1, SHOWN).astype(int))
+    some = spread_evenly(len(frames), SHOWN)
     carried = np.array([ties.positions(frame) for frame in frames[some]])
     worn = weigh_points(own, poses[some], skin.rest, carried)
     look = color_rgb if skin.colors is None else skin.colors
     written = write_glb(path, skin.rest, skin.triangles, worn, poses, time_s, color_rgb=look, texture=skin.texture, name=name)
-    off = skin_vertices(worn, poses[some]) - carried
-    farthest = float(np.sqrt((off**2).sum(axis=2).max()))
-    return ExportReport(written, len(worn.skeleton), len(skin.rest), len(frames), rms(off), farthest)
+    return report_of(written, worn, len(frames), skin_vertices(worn, poses[some]) - carried)
 
 
 def _extent(points: FloatArray) -> str:

@@ -13,7 +13,7 @@ from helpers import write_block_robot
 from femsense.app import cli
 from femsense.app.accuracy.assess import SPACES, assess_accuracy, observed_points
 from femsense.app.accuracy.errors import Answer, errors_of, reference_of
-from femsense.app.accuracy.loads import contact_patches, felt_features, sized_loads, spread_evenly
+from femsense.app.accuracy.loads import contact_patches, felt_features, sized_loads
 from femsense.app.accuracy.report import AccuracyOptions, accuracy_text, advice_on
 from femsense.core.errors import DataError
 from femsense.fem.body import BodyModel
@@ -172,7 +172,6 @@ def test_inputs_move_the_body_neither_too_far_nor_beyond_their_limit(tmp_path: P
     assert [load.name for load in loads] == ["own weight", "top", "side"] and loads[1].size <= 2.5 and np.isfinite(loads[2].size)
     small = sized_loads(block(tmp_path / "b", cables__0__max_tension_n=0.02).body)
     assert small[1].size == 0.01
-    assert spread_evenly(10, 4) == [0, 3, 6, 9] and spread_evenly(2, 4) == [0, 1] and spread_evenly(0, 4) == []
 
 
 def test_a_body_without_an_equilibrium_is_said(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from femsense.core.arrays import as_indices, as_points, freeze
+from femsense.core.arrays import as_indices, as_points, freeze, spread_evenly
 from femsense.core.errors import InputError
 
 
@@ -54,3 +54,8 @@ def test_indices_are_whole_numbers_in_range() -> None:
 def test_what_are_no_indices(values: list[float], text: str) -> None:
     with pytest.raises(InputError, match=text):
         as_indices(values, 5, "nodes")
+
+
+@pytest.mark.parametrize(("count", "most", "chosen"), [(10, 4, [0, 3, 6, 9]), (2, 4, [0, 1]), (5, 1, [0]), (0, 4, [])])
+def test_indices_are_spread_from_the_first_to_the_last(count: int, most: int, chosen: list[int]) -> None:
+    assert spread_evenly(count, most).tolist() == chosen

@@ -22,11 +22,12 @@ from femsense.sensing.fit import fit
 from femsense.sensing.model import Candidates, Model
 from femsense.sensing.no_penetration import gap_rows, in_touch
 from femsense.sensing.odds import VISIBLE, odds_of
+from femsense.sensing.options import SensingOptions
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.proposals import proposals
 from femsense.sensing.status import Status, checked, verdict
-from femsense.sensing.types import Run, SensingOptions
+from femsense.sensing.types import Run
 
 PUSH = np.array([0.0, 0.0, -0.15])
 

@@ -18,14 +18,14 @@ from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.contact_free import check_values, learn
 from femsense.sensing.estimate_frame import estimate_frame
 from femsense.sensing.fit import fit
+from femsense.sensing.options import SensingMethod, SensingOptions
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.places import away_from_scenery, object_touches, objects_near
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.states import free_state
 from femsense.sensing.status import checked
-from femsense.sensing.types import SensingOptions
 
-PAPER = SensingOptions(method="paper")
+PAPER = SensingOptions(method=SensingMethod.paper)
 
 
 def test_a_touch_that_no_camera_sees_is_betrayed_by_the_shape(tmp_path):

@@ -18,7 +18,7 @@ from femsense.io.provenance import robot_input
 from femsense.model.marker_correction import SEPARATE, Correction, corrected
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.sensing.types import SensingOptions
+from femsense.sensing.options import SensingOptions
 
 MARKERS = tuple(f"m{i}" for i in range(12))
 TIP = MARKERS[8]

@@ -18,9 +18,9 @@ from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
+from femsense.sensing.options import SensingOptions
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.run_arrays import sensed
-from femsense.sensing.types import SensingOptions
 
 TIP = np.array([0.1, 0.0, 0.01])
 FORCE = np.array([0.01, 0.08, -0.15])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, diagonal, spread_evenly
 from femsense.core.errors import DataError
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import drive_rows, tangent_at
@@ -103,8 +103,8 @@ def sized_loads(body: BodyModel) -> list[Load]:
     rest = rest_of(pilot)
     pulls = drive_rows(pilot, rest.positions)[[row_of(pilot, load) for load in chosen]]
     moves = np.linalg.norm(tangent_at(pilot, rest).respond(pulls.reshape(len(chosen), -1, 3)), axis=2).max(axis=1)
-    diagonal = float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0)))
-    limits = [float(f"{USUAL_MOTION * diagonal / max(move, 1e-300):.2g}") for move in moves]
+    most = USUAL_MOTION * diagonal(body.mesh.nodes)
+    limits = [float(f"{most / max(move, 1e-300):.2g}") for move in moves]
     loads = [replace(load, size=min(load.size, limit)) for load, limit in zip(chosen, limits)]
     return weight + loads
 
@@ -120,11 +120,6 @@ def _inputs(body: BodyModel) -> list[Load]:
     cables = [Load(LoadKind.CABLE, cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
     chambers = [Load(LoadKind.CHAMBER, chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
     return [(cables + chambers)[i] for i in spread_evenly(len(cables) + len(chambers), MOST_INPUTS)]
-
-
-def spread_evenly(count: int, most: int) -> list[int]:
-    """Return at most `most` indices of a list, spread evenly."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def drive_of_load(load: Load) -> dict[str, Any]:
@@ -165,7 +160,7 @@ def contact_patches(robot: Robot, finest: TetMesh, features: IntArray) -> Patche
 
 def _patch_radius(body: BodyModel) -> float:
     """Return the radius of the contact patch [m]."""
-    return max(PATCH * float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0))), 1.5 * body_surface(body.mesh).edge)
+    return max(PATCH * diagonal(body.mesh.nodes), 1.5 * body_surface(body.mesh).edge)
 
 
 def _facing(middles: FloatArray, area: FloatArray, centre: FloatArray, radius: float) -> FloatArray:

@@ -7,10 +7,10 @@ that carries a `Flag`, and adds the options of many jobs where a command takes s
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from inspect import Parameter
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -70,20 +70,26 @@ def _shown(parameter: Parameter, of: Several | None) -> Parameter:
 
 
 def _of_options(type_: Any) -> Iterator[Parameter]:
-    """Yield a parameter for each field of an options type that carries a `Flag`."""
-    flags, types = _flags(type_), get_type_hints(type_)
-    for field in fields(type_):
-        if (flag := flags.get(field.name)) is not None:
-            limits = {name: limit for name, limit in (("min", flag.min), ("max", flag.max)) if limit is not None}
-            said = option(flag.flags, flag.metavar, flag.help, **limits)
-            taken, default = (types[field.name], field.default) if flag.read is None else (list[str] | None, None)
-            yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[taken, said])
+    """Yield a parameter for each field of an options type that carries a `Flag`; one that is read or a sequence may be repeated."""
+    types, defaults = get_type_hints(type_), {field.name: field.default for field in fields(type_)}
+    for name, flag in _flags(type_).items():
+        limits = {name: limit for name, limit in (("min", flag.min), ("max", flag.max)) if limit is not None}
+        said = option(flag.flags, flag.metavar, flag.help, **limits)
+        taken, default = types[name], defaults[name]
+        if flag.read is not None:
+            taken, default = list[str] | None, None
+        elif get_origin(taken) is Sequence:
+            taken, default = list[get_args(taken)] | None, None  # type: ignore[misc]
+        yield Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[taken, said])
 
 
 def _filled(type_: Any, given: dict[str, Any]) -> Any:
     """Return an options type made of the values on the command line. Raises InputError where a text cannot be read."""
-    flags = _flags(type_)
-    return type_(**{n: given[n] if flag.read is None else flag.read(given[n] or []) for n, flag in flags.items()})
+    types, values = get_type_hints(type_), {}
+    for name, flag in _flags(type_).items():
+        read = flag.read or (tuple if get_origin(types[name]) is Sequence else None)
+        values[name] = given[name] if read is None else read(given[name] or [])
+    return type_(**values)
 
 
 def _flags(type_: Any) -> dict[str, Flag]:

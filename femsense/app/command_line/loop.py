@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +10,18 @@ import typer
 
 from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import RobotPath, argument, filled, missing, option, split_names
+from femsense.app.command_line.parameters import RobotPath, argument, missing, option, split_names
 from femsense.app.command_line.several import Dask, Memory, Several, spread_over
 from femsense.core.errors import InputError
 from femsense.io.importers.options import Inputs
+from femsense.loop.options import SearchOptions
 
 
 @command(Several.TOGETHER)
 def improve(
     context: typer.Context,
     robot: RobotPath,
+    *,
     recordings: Annotated[list[Path] | None, argument("RECORDING", "Recordings in which effects are searched.")] = None,
     output: Annotated[Path | None, option("-o --output", "OUT", "The folder to write; with --plan a script (TOML).")] = None,
     validation: Annotated[
@@ -35,20 +37,7 @@ def improve(
     ] = None,
     effects: Annotated[list[str] | None, option("--effects", "NAME,…", "Try these effects only.")] = None,
     without: Annotated[list[str] | None, option("--without", "NAME,…", "Do not try these effects.")] = None,
-    user_effect: Annotated[
-        list[Path] | None, option("--user-effect", "FILE", "Try an effect of your own (femsense docs own).")
-    ] = None,
-    measured: Annotated[
-        str,
-        option(
-            "--from",
-            "auto|markers|clouds|both",
-            "Measurements to use; auto: markers, or clouds without markers.",
-        ),
-    ] = "auto",
-    correct: Annotated[
-        bool, option("--correct", help="Also fit an empirical correction of the remaining residual, tested on held-out data.")
-    ] = False,
+    search: SearchOptions,
     again: Annotated[bool, option("--again", help="Repeat the computation even if OUT contains its result.")] = False,
     workers: Annotated[
         int | None,
@@ -98,7 +87,7 @@ def improve(
         raise missing(context, "output")
     recordings = expanded(recordings)
     references = [load_recording(path) for path in reference or []]
-    options = filled(ImproveOptions, locals(), user_effects=user_effect or [])
+    options = ImproveOptions(**asdict(search), references=references)
     with (
         progress_bar("improve") as progress,
         spread_over(len(recordings), options.effort.recordings, workers, dask, memory) as spread,

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 from typer.exceptions import TyperException
 
 from femsense.core.errors import InputError
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-    OptionsType = TypeVar("OptionsType", bound=DataclassInstance)
 SEVERAL = ("--at", "--validation", "--reference", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
 FREE = ("", "*")
@@ -32,17 +27,6 @@ def option(flags: str, metavar: str | None = None, help: str = "", **limits: Any
 def argument(metavar: str, help: str) -> Any:
     """Return an argument of a command, for `Annotated`."""
     return typer.Argument(metavar=metavar, help=help, show_default=False)
-
-
-def filled(type_: type[OptionsType], values: Mapping[str, Any], **others: Any) -> OptionsType:
-    """Return options of the library made from the parameters of a command that have the names of its fields.
-
-    Arguments:
-        type_: a dataclass.
-        values: the parameters by name; those that are no fields are not used.
-        others: fields whose values are not those of a parameter.
-    """
-    return type_(**{field.name: values[field.name] for field in fields(type_) if field.name in values} | others)
 
 
 RobotPath = Annotated[str, argument("ROBOT", "A folder with robot.toml, or the name of a robot of the package.")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +9,12 @@ import typer
 
 from femsense.app.command_line.adapter import command
 from femsense.app.command_line.answer import Answer, progress_bar, say
-from femsense.app.command_line.parameters import Recordings, RobotPath, filled, option, places
+from femsense.app.command_line.parameters import Recordings, RobotPath, option, places
 from femsense.app.command_line.several import Several
 from femsense.app.live_options import LiveOptions
+from femsense.sensing.options import SensingOptions
 
 USE_CORRECTION = "Use the empirical correction of femsense improve --correct, which applies to markers."
-
-
-class SensingMethod(StrEnum):
-    """How forces are found."""
-
-    rays = "rays"
-    paper = "paper"
 
 
 @command(Several.EACH)
@@ -60,6 +53,7 @@ def estimate(
     robot: RobotPath,
     recordings: Recordings,
     output: Annotated[Path, option("-o --output", "RUN", "The folder to write.")],
+    *,
     calibration: Annotated[
         Path | None,
         option(
@@ -69,16 +63,7 @@ def estimate(
         ),
     ] = None,
     at: Annotated[list[str] | None, option("--at", "X,Y,Z …", "Contact point, in metres on the body at rest.")] = None,
-    method: Annotated[
-        SensingMethod,
-        option("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
-    ] = SensingMethod.rays,
-    friction: Annotated[float, option("--friction", "MU", "Coefficient of the friction cone of contact forces.")] = 1.0,
-    push: Annotated[
-        bool, option("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
-    ] = False,
-    smooth_s: Annotated[float, option("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0,
-    correct: Annotated[bool, option("--correct", help=USE_CORRECTION)] = False,
+    options: SensingOptions,
     again: Annotated[bool, option("--again", help="Repeat the computation even if RUN contains its result.")] = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
@@ -87,14 +72,12 @@ def estimate(
     from femsense.calib.files import read_calibration
     from femsense.io.recording_folder import load_recording
     from femsense.report.text import run_document, run_text
-    from femsense.sensing.types import SensingOptions
 
     (recording,) = recordings
-    if push and not at:
+    if options.push and not at:
         raise typer.BadParameter("--push applies to the points of --at, and none is given; contacts that are found push anyway")
-    options = filled(SensingOptions, locals(), method=method.value)
-    if smooth_s > 0:
-        say(f"forces are averaged over {smooth_s:g} s and lag by as much")
+    if options.smooth_s > 0:
+        say(f"forces are averaged over {options.smooth_s:g} s and lag by as much")
     with progress_bar("estimate") as progress:
         run = estimate_into(
             output,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from femsense.app.inspection.reports import Problems, Report, attempt
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
@@ -164,7 +164,7 @@ def _check_clouds(r: Recording, report: Report, problems: Problems) -> None:
     frames = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
     if not frames:
         return
-    chosen = {frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, CLOUDS_READ).astype(int))}
+    chosen = {frames[i] for i in spread_evenly(len(frames), CLOUDS_READ)}
     counts: list[int] = []
     for k, v in frames:
         file = r.cloud_files[k][v]

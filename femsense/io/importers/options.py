@@ -107,9 +107,7 @@ class Options:
     format: Annotated[str | None, Flag("--format", "NAME", "Format, if it is not identified; see femsense docs importing.")] = (
         None
     )
-    topics: Annotated[
-        Sequence[str], Flag("--topic", "NAME", "Topics of a bag, or markers of a motion capture, to import.", read=tuple)
-    ] = ()
+    topics: Annotated[Sequence[str], Flag("--topic", "NAME", "Topics of a bag, or markers of a motion capture, to import.")] = ()
     """Topics, streams, tracks or names."""
     columns: Annotated[
         Mapping[str, str],

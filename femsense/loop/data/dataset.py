@@ -10,7 +10,7 @@ import numpy as np
 from femsense.calib.calibrate import calibrated_start, usable_frames
 from femsense.calib.first_poses import first_poses
 from femsense.calib.inputs import first_inputs, input_bounds
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, spread_evenly
 from femsense.core.errors import DataError, InputError
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.surface_rows import (
@@ -26,6 +26,7 @@ from femsense.loop.data.surface_rows import (
     with_surface,
 )
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
+from femsense.loop.options import Measured
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
@@ -40,8 +41,6 @@ MESH = next(effect for effect in EFFECTS if effect.remeshes)
 """The effect that refines the mesh."""
 QUADRATIC: Entry = {"element": "tet10"}
 """The element order of the search if linear elements are declared (see `search/element_order.py`)."""
-MEASURED = ("auto", "markers", "clouds", "both")
-"""Which measurements of a recording are fitted; auto: its markers, or its clouds if it has no markers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,22 +97,24 @@ class Data:
         return robot_on_mesh(self.robot, self.declared.body.mesh) if self.settled else self.robot
 
 
-def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "auto") -> Data:
+def prepare(
+    robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: Measured = Measured.auto
+) -> Data:
     """Check the recordings, split them, and calibrate each for starting values.
 
     Arguments:
         robot: the declared robot.
         recordings: to fit.
         validation: to hold out.
-        measured: which measurements are fitted, one of MEASURED.
+        measured: which measurements are fitted, see `Measured`.
 
     Raises:
         InputError: bad arguments; DataError: the data do not allow a fit.
     """
     if not recordings:
         raise InputError("no recording", where="recordings", expected="at least one recording")
-    if measured not in MEASURED:
-        raise InputError("unknown kind of measurements", where="measured", found=measured, expected=", ".join(MEASURED))
+    if measured not in list(Measured):
+        raise InputError("unknown kind of measurements", where="measured", found=measured, expected=", ".join(Measured))
     recordings = [check_against(robot, r) for r in recordings]
     validation = [check_against(robot, r) for r in validation]
     control = recordings[0].actuation
@@ -156,29 +157,23 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     return Data(robot, control, train, held, held_of, words, placement_std, scale, declared)
 
 
-def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]:
+def _frames_of(recording: Recording, measured: Measured) -> tuple[IntArray, IntArray]:
     """Return the frames with used markers, and those with used clouds. Raises DataError if there are none."""
     usable = usable_frames(recording)
     none = usable[:0]
-    marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]
-    cloudy = none if measured == "markers" else np.intersect1d(usable, cloud_frames(recording))
-    if len(marked) and measured == "auto":
+    marked = none if measured == Measured.clouds else usable[np.isin(usable, recording.marker_frame)]
+    cloudy = none if measured == Measured.markers else np.intersect1d(usable, cloud_frames(recording))
+    if len(marked) and measured == Measured.auto:
         cloudy = none
     if not len(marked) and not len(cloudy):
         raise DataError(_nothing(recording, measured))
     rows = int(np.isin(recording.marker_frame, marked).sum())
-    return marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))], _evenly(recording, cloudy, 2 * MAX_ROWS // SURFACE_POINTS)
+    thinned = marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))]
+    return thinned, cloudy[spread_evenly(len(cloudy), 2 * MAX_ROWS // SURFACE_POINTS)]
 
 
-def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:
-    """Return at most `most` of the frames, evenly spread."""
-    return (
-        frames[np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))] if len(frames) else frames
-    )
-
-
-def _nothing(recording: Recording, measured: str) -> str:
-    wanted = measured if measured in ("markers", "clouds") else "markers or clouds"
+def _nothing(recording: Recording, measured: Measured) -> str:
+    wanted = measured if measured in (Measured.markers, Measured.clouds) else "markers or clouds"
     has = {"markers": bool(len(recording.marker_frame)), "clouds": has_clouds(recording)}
     if not any(has[kind] for kind in has if kind in wanted):
         return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in contact-free frames (or frames with declared loads)"
@@ -187,7 +182,7 @@ def _nothing(recording: Recording, measured: str) -> str:
 
 def marked_frames(recording: Recording) -> IntArray:
     """Return the frames whose markers are fitted, thinned out. Raises DataError if there are none."""
-    return _frames_of(recording, "markers")[0]
+    return _frames_of(recording, Measured.markers)[0]
 
 
 def _trials(

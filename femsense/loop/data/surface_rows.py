@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
@@ -102,7 +102,7 @@ def with_surface(robot: Robot) -> Robot:
 
 def diagonal_of(robot: Robot) -> float:
     """Return the diagonal of the body at rest [m]."""
-    return float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    return diagonal(robot.body.mesh.nodes)
 
 
 # Measured surface

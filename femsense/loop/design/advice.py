@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import FemsenseError
 from femsense.core.parallel import each
 from femsense.loop.data.dataset import NUISANCE, Data
@@ -191,8 +191,9 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
 
 def _representative(trial: Trial) -> Trial:
     frames = trial.scene.frames
-    every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_EACH, len(frames))).round().astype(int))
-    return replace(trial.part(frames[every]), together=False)  # the recording number links it to its markers
+    return replace(
+        trial.part(frames[spread_evenly(len(frames), MOST_EACH)]), together=False
+    )  # the recording number links it to its markers
 
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:

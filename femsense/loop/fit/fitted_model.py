@@ -17,7 +17,7 @@ from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
 from femsense.model.effects.base import range_units
-from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.observation import Hypothesis, SceneJet, Term
 from femsense.model.robot import Robot
 
 ROUGHLY = 4
@@ -50,7 +50,7 @@ class FittedModel:
 def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
     """Return a robot, by default that of the data, with the nuisance effects: the modulus and, if the inputs are absolute, the input offsets. With a
     reference there are none."""
-    terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
+    terms: list[Term] = []
     std: list[float] = []
     for name in () if data.relative else NUISANCE:
         effect, seed = by_session(find_effect(name), [t.scene.recording for t in data.train])
@@ -98,7 +98,7 @@ def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
 
     A time constant of which the data contain only the beginning would otherwise drift to the end of its range when the rest is refitted.
     """
-    fit, terms, keep = fitted.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
+    fit, terms, keep = fitted.fit, list[Term](), list[bool]()
     for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
         own = {p.key for p in effect.parameters(data.robot, data.control)}
         mask = [p.key in own for p in parameters]
@@ -130,6 +130,35 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
     return hypothesis, Prior(fitted.fit.prior.mean[mask], fitted.fit.prior.std[mask], others), mask
 
 
+def without_effect(data: Data, fitted: FittedModel, name: str, noise: Noise, *, worth: float = np.inf) -> FittedModel:
+    """Return a fitted model without one of its effects, refitted; see `keeping`."""
+    return keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise, worth=worth)
+
+
+def with_term(
+    fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...], *, at: int | None = None
+) -> tuple[Hypothesis, Prior]:
+    """Return the hypothesis of a fit with one more term, or with another one in place of its `at`-th, and its prior.
+
+    A term without parameters is applied to the robot.
+    """
+    old, prior = fit.hypothesis, fit.prior
+    if not parameters:
+        return replace(old, robot=effect.apply(old.robot, seed), settled=(*old.settled, (effect, seed))), prior
+    i, span = len(old.terms) if at is None else at % len(old.terms), span_at(fit, at)
+    mean, std = (
+        np.concatenate([values[: span.start], own, values[span.stop :]])
+        for values, own in ((prior.mean, [p.null for p in parameters]), (prior.std, [p.known for p in parameters]))
+    )
+    return replace(old, terms=(*old.terms[:i], (effect, seed, parameters), *old.terms[i + 1 :])), Prior(mean, std)
+
+
+def with_values(fit: JointFit, values: Sequence[float] | FloatArray, *, at: int | None = None) -> FloatArray:
+    """Return the coordinates of a fit with those of one more term, or of another one in place of its `at`-th; see `with_term`."""
+    span = span_at(fit, at)
+    return np.concatenate([fit.coordinates[: span.start], values, fit.coordinates[span.stop :]])
+
+
 def roughly_keeping(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]
 ) -> FittedModel:
@@ -155,6 +184,12 @@ def terms_of(fit: JointFit) -> Iterator[tuple[Effect, Entry, tuple[Parameter, ..
 def span_of(fit: JointFit, name: str) -> slice:
     """Return the slice of an effect's coordinates in a fit; empty if the fit lacks it."""
     return next((span for effect, _, _, span in terms_of(fit) if effect.name == name), slice(0, 0))
+
+
+def span_at(fit: JointFit, at: int | None) -> slice:
+    """Return the slice of the coordinates of the `at`-th term, which may count from the last; None: of one that follows the last."""
+    end = len(fit.coordinates)
+    return slice(end, end) if at is None else [span for *_, span in terms_of(fit)][at]
 
 
 def own_of(fitted: FittedModel) -> FloatArray:

@@ -16,6 +16,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import weight_slopes
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
+from femsense.loop.fit.discretisation_error import as_shown
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs
 from femsense.model.observation import placements
 from femsense.model.robot import Robot
@@ -30,6 +31,11 @@ def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
     ]
     held = [_turned(robot, t, h.poses, h.jet.states) for t, h in zip(data.held, fitted.held)]
     return replace(data, train=train, held=held)
+
+
+def with_errors_as_shown(data: Data, fitted: FittedModel) -> Data:
+    """Return the data with discretisation error and marker placements as a fitted model shows them; see `as_shown`, `with_turning_placements`."""
+    return with_turning_placements(as_shown(data, fitted), fitted)
 
 
 def _turned(robot: Robot, trial: Trial, poses: Sequence[FloatArray], states: Mapping[int, Equilibrium]) -> Trial:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -30,16 +31,25 @@ from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
 FORMAT = "femsense-loop-1"
-FOUND, NONE, UNEXPLAINED = "effects", "none", "unexplained"
-"""Verdicts: the model lacks effects; it fits the data to their noise; a residual remains that no effect fits."""
+
+
+class Verdict(StrEnum):
+    """The conclusion of a search."""
+
+    FOUND = "effects"
+    """The model lacks effects."""
+    NONE = "none"
+    """It fits the data to their noise."""
+    UNEXPLAINED = "unexplained"
+    """A residual remains that no effect fits."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Loop:
     """The content of loop.json: the verdict, the effects with errors before and after, and the limits of the data."""
 
-    verdict: str = ""
-    """FOUND, NONE or UNEXPLAINED."""
+    verdict: Verdict | str = ""
+    """Text: of another version, or empty if it is missing."""
     sentence: str = ""
     """The verdict in words."""
     noise_m: Number = NAN

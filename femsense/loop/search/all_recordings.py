@@ -29,22 +29,22 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.io.files import file_hash, json_text, plain
 from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import NUISANCE, Data, prepare
-from femsense.loop.data.outliers import without_outliers
 from femsense.loop.data.sampled_states import Sampled, drive_table
-from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, own_of, problem_of
+from femsense.loop.fit.discretisation_error import with_mesh_errors_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, without_effect
 from femsense.loop.fit.joint_fit import Prior, fit_jointly
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.normal_equations import Block, NormalEquations, Squares
+from femsense.loop.options import Measured
 from femsense.loop.result.records import AllRecordings
-from femsense.loop.search.calibration import calibrated_pose
+from femsense.loop.search.calibration import calibrated_pose, calibrated_without_outliers
 from femsense.loop.search.effect_fields import candidates_for, effect_fields
 from femsense.loop.search.screening import best_step, penalty, whitened_columns
 from femsense.loop.search.search_state import Progress, Search
 from femsense.loop.thresholds import Thresholds
-from femsense.model.effects import FORMS, Effect, Entry, Parameter, load_own_effect
-from femsense.model.observation import Hypothesis
+from femsense.model.effects import FORMS, Effect, load_own_effect
+from femsense.model.observation import Hypothesis, Term
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_points
 
@@ -116,20 +116,18 @@ def normal_equations(question: Question, recording: Recording, forms: Sequence[E
 def _normal_equations(question: Question, recording: Recording, forms: Sequence[Effect]) -> NormalEquations:
     at = question.hypothesis.robot_at(question.coordinates)
     data = replace(
-        prepare(question.hypothesis.robot, [recording], [], "markers"),
+        prepare(question.hypothesis.robot, [recording], [], Measured.markers),
         placement_std=question.placement_std,
         forms=tuple(forms),
         thresholds=question.thresholds,
         mesh_as_shown=question.mesh_as_shown,
     )
-    placed = calibrated_pose(data, at, question.noise)
-    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
-        data, placed = fewer, calibrated_pose(fewer, at, question.noise)
+    data, placed = calibrated_without_outliers(data, at, question.noise)
     before = calibrated_pose(data, question.declared, question.noise, placed)
     if question.mesh_moves is not None:
         moves = question.mesh_moves
         data = with_mesh_errors_of(data, data.with_trials(lambda t: replace(t, mesh_moves=moves)), placed)
-    data = with_turning_placements(as_shown(data, placed), placed)
+    data = with_errors_as_shown(data, placed)
     placed = calibrated_pose(data, at, question.noise, placed)
     free = Prior(question.coordinates, np.full(len(question.coordinates), np.inf))
     fit = fit_jointly(
@@ -172,7 +170,7 @@ def _squares(data: Data, fitted: FittedModel) -> Squares:
     return Squares(sum(float((r**2).sum()) for r in fitted_rows), counts[0], sum(float((r**2).sum()) for r in held), counts[1])
 
 
-def _key(one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> str:
+def _key(one: Term) -> str:
     """Return the key of a candidate, the same in all recordings."""
     effect, seed, parameters = one
     whole = json_text(
@@ -296,7 +294,7 @@ def _with_evidence(data: Data, fitted: FittedModel, search: Search, noise: Noise
     verdicts = dict[str, str]()
     for name in reversed([effect.name for effect, _, _ in fitted.fit.hypothesis.terms if effect.name not in NUISANCE]):
         with contextlib.suppress(FemsenseError):  # no equilibrium without it: it stays
-            without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
+            without = without_effect(data, fitted, name, noise)
             cost = next((c.cost for c in (*search.last, *search.first) if c.effect.name == name), 0.0)
             gain = without.fit.chi2 - fitted.fit.chi2
             if gain - cost <= data.thresholds.evidence:

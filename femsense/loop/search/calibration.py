@@ -12,10 +12,10 @@ import numpy as np
 from femsense.core.errors import DataError, FemsenseError
 from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
-from femsense.loop.fit.discretisation_error import as_shown, representative_frames, with_mesh_errors
+from femsense.loop.fit.discretisation_error import representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import ROUGHLY, FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
 from femsense.loop.fit.joint_fit import FitOptions, Prior
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown
 from femsense.loop.fit.noise_components import UNTOLD, Noise
 from femsense.loop.search.search_state import Progress
 from femsense.loop.search.swaps import History
@@ -34,9 +34,7 @@ Ready = tuple[Data, FittedModel, History]
 def calibrated(data: Data, progress: Progress) -> Ready:
     """Return the data without outliers, the declared model with its camera calibrated, and the fully calibrated model; preceded by the same on the
     declared mesh if the search uses another one."""
-    placed = calibrated_pose(data, data.robot, START)
-    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
-        data, placed = fewer, calibrated_pose(fewer, data.robot, START)
+    data, placed = calibrated_without_outliers(data, data.robot, START)
     progress("fitting the nuisance parameters")
     base = calibrated_on(data, data.robot, placed)
     if "clouds" in data.measured:
@@ -58,6 +56,19 @@ def calibrated_pose(data: Data, robot: Robot, noise: Noise, start: FittedModel |
     return fit_model(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
 
 
+def calibrated_without_outliers(data: Data, robot: Robot, noise: Noise) -> tuple[Data, FittedModel]:
+    """Return the data without outliers, and a robot with its camera poses and initial inputs calibrated to them."""
+    placed = calibrated_pose(data, robot, noise)
+    while (fewer := without_outliers_of(data, placed)) is not data:
+        data, placed = fewer, calibrated_pose(fewer, robot, noise)
+    return data, placed
+
+
+def without_outliers_of(data: Data, fitted: FittedModel) -> Data:
+    """Return the data without the outliers of a fitted model; the same object if there are none."""
+    return without_outliers(data, [jet.residual for jet in fitted.fit.jets], fitted.held_residuals)
+
+
 def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
     """Return a robot with all nuisance parameters fitted, in a few steps, to all states. A fit to representative states would end elsewhere: with
     fewer states the missing effects bias offsets and modulus more."""
@@ -76,7 +87,7 @@ def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:
         plain = base
-    return with_turning_placements(as_shown(with_mesh_errors(data, plain, names), base), base)
+    return with_errors_as_shown(with_mesh_errors(data, plain, names), base)
 
 
 def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps: int) -> FittedModel:

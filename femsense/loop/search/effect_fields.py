@@ -14,9 +14,9 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import States, Trial, spans_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
-from femsense.model.effects import Effect, Entry, InRecording, Parameter
+from femsense.model.effects import Effect, InRecording, Parameter
 from femsense.model.linear_answers import AtPoints
-from femsense.model.observation import Hypothesis
+from femsense.model.observation import Hypothesis, Term
 from femsense.model.path_solver import PathSolver, look_at
 from femsense.model.robot import Robot
 
@@ -26,7 +26,7 @@ Answers = dict[int, AtPoints]
 
 def candidates_for(
     base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_placements: bool
-) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
+) -> list[Term]:
     """Return the effects and seeds to try in addition to a fitted model."""
     present = set(base.hypothesis.names)
     robot = base.hypothesis.robot_at(base.coordinates)
@@ -57,7 +57,7 @@ def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
 class Fields:
     """Displacements of the markers by effects to first order, at a fitted model."""
 
-    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
+    todo: list[Term]
     """The effects and seeds that can be evaluated, with their parameters."""
     raw: list[FloatArray]
     """Columns [m], one array (k, c, Σq) per trial; a discrete alternative has one column, its full change."""
@@ -95,7 +95,7 @@ class Fields:
 def effect_fields(
     base: JointFit,
     trials: list[Trial],
-    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
+    todo: list[Term],
     answers: list[Answers] | None = None,
 ) -> Fields:
     """Return the fields of effects: those with parameters to first order, with one factorisation per frame, or none if the `answers` of each trial are
@@ -122,7 +122,7 @@ def effect_fields(
     return Fields(usable, raw, rest, base.hypothesis)
 
 
-def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
+def _can_act(robot: Robot, one: Term) -> bool:
     parameters = one[2]
     try:
         Hypothesis(robot, (one,)).robot_at(np.array([p.null + p.step for p in parameters]))
@@ -135,7 +135,7 @@ def _whole_change(
     base: JointFit,
     trials: list[Trial],
     fixed: Robot,
-    one: tuple[Effect, Entry, tuple[Parameter, ...]],
+    one: Term,
     near: list[States],
 ) -> list[FloatArray] | None:
     """Return the change of the residual of each trial by a discrete alternative [m], (k, c); None if it has no equilibrium.

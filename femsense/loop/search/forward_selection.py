@@ -15,66 +15,65 @@ from femsense.loop.fit.fitted_model import (
     found_in,
     own_of,
     problem_of,
+    span_at,
+    with_term,
+    with_values,
 )
-from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, eligible
 from femsense.loop.search.location_search import climbed, lies_on_body, located
-from femsense.loop.search.refit import evidence, refit, tried, with_term, within
+from femsense.loop.search.refit import evidence, refit, tried, within
 from femsense.loop.search.screening import Candidate, joined, linear_gain
-from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
+from femsense.loop.search.search_state import Refit, Setting, no_equilibrium
 from femsense.loop.thresholds import Effort, Thresholds
 
 
-def select_next(
-    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, progress: Progress
-) -> tuple[Refit | None, list[RefitRecord]]:
+def select_next(setting: Setting, fitted: FittedModel, table: list[Candidate]) -> tuple[Refit | None, list[RefitRecord]]:
     """Return the effect to add, or None if none passes; and the record of each refitted candidate."""
+    data = setting.data
     listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
         return None, []
-    refits, records = _refitted(data, fitted, listed, noise, progress)
+    refits, records = _refitted(setting, fitted, listed)
     if not any(r.record.passes for r in refits.values()):  # a seed may be the cause
         evident = data.thresholds.evidence
-        refits = {i: polished(data, fitted, r, noise, progress) if r.score > evident else r for i, r in refits.items()}
-    leading = leaders(data, fitted, refits, noise, progress)
+        refits = {i: polished(setting, fitted, r) if r.score > evident else r for i, r in refits.items()}
+    leading = leaders(setting, fitted, refits)
     if not leading:
         return None, _updated(records, refits)
     first = max(leading, key=lambda i: leading[i].on_all_data)
-    winner = _enriched(data, fitted, leading[first], table, noise, progress).saying(NAMED)
+    winner = _enriched(setting, fitted, leading[first], table).saying(NAMED)
     return winner, _updated(records, refits | leading | {first: winner})
 
 
-def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, progress: Progress) -> dict[int, Refit]:
+def leaders(setting: Setting, fitted: FittedModel, refits: Mapping[int, Refit]) -> dict[int, Refit]:
     """Return the eligible refits within `evidence` of the best one, on fitted and held-out data together, each with its seed improved."""
-    able = eligible(data, refits.values(), noise)
+    able = eligible(setting.data, refits.values(), setting.noise)
     best = max((r.on_all_data for r in able), default=np.inf)
-    near = {i: r for i, r in refits.items() if r in able and r.on_all_data > best - data.thresholds.evidence}
-    return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, progress) for i, r in near.items()}
+    near = {i: r for i, r in refits.items() if r in able and r.on_all_data > best - setting.data.thresholds.evidence}
+    return {i: r if r.record.seed_std is not None else polished(setting, fitted, r) for i, r in near.items()}
 
 
-def _refitted(
-    data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, progress: Progress
-) -> tuple[dict[int, Refit], list[RefitRecord]]:
+def _refitted(setting: Setting, fitted: FittedModel, listed: Sequence[Candidate]) -> tuple[dict[int, Refit], list[RefitRecord]]:
     """Return the refits of a shortlist by the number of their record, and the record of each refitted candidate."""
     refits: dict[int, Refit] = {}
     records: list[RefitRecord] = []
-    evident = data.thresholds.evidence
+    evident = setting.data.thresholds.evidence
     for candidate in listed:
         name = candidate.effect.name
-        progress(f"refitting with {name}")
+        setting.progress(f"refitting with {name}")
         record = RefitRecord(name, candidate.seed)
         others = [
             r.score for r in refits.values() if r.record.passes and r.candidate.effect.name != name
         ]  # forms of one effect share their errors, so that one must not stop another early
         wanted = max([evident, *(score - 2.0 * evident for score in others)])
         try:
-            made = refit(data, fitted, candidate, noise, wanted=wanted)
+            made = refit(setting.data, fitted, candidate, setting.noise, wanted=wanted)
         except FemsenseError as error:
             records.append(replace(record, verdict=no_equilibrium(error)))
             continue
-        refits[len(records)] = acceptance_test(data, fitted, candidate, made, record, noise)
+        refits[len(records)] = acceptance_test(setting.data, fitted, candidate, made, record, setting.noise)
         records.append(record)
     return refits, records
 
@@ -84,41 +83,41 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
-def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, progress: Progress) -> Refit:
+def polished(setting: Setting, fitted: FittedModel, refitted: Refit) -> Refit:
     """Return a refit with an improved seed, tested again, and with the scatter of its coordinates over seeds that fit equally well. A refit that passes
     keeps a seed whose improvement does not."""
-    made, scatter = _polish(data, fitted, refitted, noise, progress)
+    made, scatter = _polish(setting, fitted, refitted)
     record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
         return replace(refitted, record=record)
-    better = acceptance_test(data, fitted, refitted.candidate, made, record, noise)
+    better = acceptance_test(setting.data, fitted, refitted.candidate, made, record, setting.noise)
     return better if better.record.passes or not refitted.record.passes else replace(refitted, record=record)
 
 
-def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, progress: Progress) -> Refit:
+def _enriched(setting: Setting, fitted: FittedModel, winner: Refit, table: list[Candidate]) -> Refit:
     """Return the best refit in a form with more parameters if that has `evidence` over the simpler one."""
-    winner = _with_more_markers(data, fitted, winner, table, noise, progress)
+    data, noise = setting.data, setting.noise
+    winner = _with_more_markers(setting, fitted, winner, table)
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
-        progress(_trying(form))
+        setting.progress(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             continue
         rich = acceptance_test(data, fitted, form, made, winner.record, noise)
         if rich.record.passes:
-            rich = polished(data, fitted, rich, noise, progress)
+            rich = polished(setting, fitted, rich)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
         if rich.record.passes and more > data.thresholds.evidence:
             winner = replace(rich, record=replace(rich.record, seed=form.seed))
     return winner
 
 
-def _with_more_markers(
-    data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, progress: Progress
-) -> Refit:
+def _with_more_markers(setting: Setting, fitted: FittedModel, winner: Refit, table: list[Candidate]) -> Refit:
     """Return marker offsets extended by those of further markers, one at a time while each has `evidence`: the penalty of all at once is too large.
     Other effects are returned unchanged."""
+    data, noise = setting.data, setting.noise
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
@@ -126,7 +125,7 @@ def _with_more_markers(
         if max(gains) <= data.thresholds.evidence:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
-        progress(_trying(form))
+        setting.progress(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             break
@@ -149,12 +148,13 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
     keys = {p.key for p in form.parameters}
     if settled != fitted.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
         return tried(data, fitted, form, noise, winner.score + data.thresholds.evidence)
-    split = len(winner.fitted.fit.coordinates) - len(terms[-1][2])
-    found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.fitted.fit.coordinates[split:])}
+    found = {
+        (p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.fitted.fit.coordinates[span_at(winner.fitted.fit, -1)])
+    }
     own = [found.get((p.key, p.part), found.get((p.key, None), p.null)) for p in form.parameters]
     hypothesis, prior = with_term(fitted.fit, form.effect, form.seed, form.parameters)
     try:
-        coordinates = np.concatenate([winner.fitted.fit.coordinates[:split], own])
+        coordinates = with_values(winner.fitted.fit, own, at=-1)
         price = form.cost - winner.candidate.cost + data.thresholds.evidence
         predicted = linear_gain(winner.fitted.fit, problem_of(data, winner.fitted.fit, noise), form.raw, form.placements)
         if predicted < data.thresholds.hinted * price:
@@ -194,30 +194,28 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
 # --- improvement of seeds --------------------------------------------------------------------------------------------------
 
 
-def _polish(
-    data: Data, fitted: FittedModel, winner: Refit, noise: Noise, progress: Progress
-) -> tuple[FittedModel, Sequence[float]]:
+def _polish(setting: Setting, fitted: FittedModel, winner: Refit) -> tuple[FittedModel, Sequence[float]]:
     """Return the model with its seed (place, radius, time) improved, first among neighbouring seeds, then as fitted parameters; and the scatter over seeds."""
+    data, noise = setting.data, setting.noise
     best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
-        progress(f"trying neighbouring seeds of {effect.name}")
+        setting.progress(f"trying neighbouring seeds of {effect.name}")
         ends = climbed(data, fitted, winner.candidate, noise)
         best, scatter = located(data, fitted, winner.candidate, winner.fitted, ends, noise)
-    return (_with_seed_fitted(data, best, noise, progress) if winner.candidate.parameters else best), scatter
+    return (_with_seed_fitted(setting, best) if winner.candidate.parameters else best), scatter
 
 
-def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, progress: Progress) -> FittedModel:
+def _with_seed_fitted(setting: Setting, best: FittedModel) -> FittedModel:
     """Return a model with the seed of its last effect fitted too, if that reduces χ² and stays inside the bounds."""
-    *others, (effect, seed, parameters) = best.fit.hypothesis.terms
+    data, noise = setting.data, setting.noise
+    *_, (effect, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best
-    progress(f"fitting the seed of {effect.name}")
-    hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
-    null = np.array([p.null for p in more])
-    prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))
+    setting.progress(f"fitting the seed of {effect.name}")
+    hypothesis, prior = with_term(best.fit, effect, seed, (*parameters, *more), at=-1)
     try:
-        made = fit_model(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
+        made = fit_model(data, hypothesis, prior, noise, with_values(best.fit, [p.null for p in more]), own=own_of(best))
     except FemsenseError:
         return best
     values = made.fit.coordinates[-len(more) :]

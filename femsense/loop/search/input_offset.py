@@ -7,7 +7,7 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import beyond_mesh
-from femsense.loop.fit.fitted_model import FittedModel, keeping, span_of
+from femsense.loop.fit.fitted_model import FittedModel, span_of, without_effect
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.refit import evidence
 from femsense.model.effects import OF_INPUTS
@@ -39,7 +39,7 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:
-        without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != OFFSETS], noise)
+        without = without_effect(data, fitted, OFFSETS, noise)
     except FemsenseError:
         return None
     if evidence_for_offsets(data, fitted, without, n_effective) <= data.thresholds.evidence:

@@ -12,15 +12,27 @@ from femsense.core.errors import FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without, own_of, problem_of
+from femsense.loop.fit.fitted_model import (
+    FittedModel,
+    fit_model,
+    jets_without,
+    own_of,
+    problem_of,
+    span_at,
+    with_term,
+    with_values,
+)
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
 from femsense.loop.search.refit import beyond, evidence, tried
 from femsense.loop.search.screening import COLLINEAR, Candidate, confounding, jets_with, screen
 from femsense.loop.thresholds import Thresholds
-from femsense.model.effects import Entry, Parameter
+from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.robot import Robot
+
+GAINS_ONLY = 100.0
+"""Number of observations where only gains are compared, which do not depend on it."""
 
 
 def located(
@@ -29,7 +41,7 @@ def located(
     """Return the best of the fits of a candidate, from its own seed (`made`) and from the end of each local search, with its seed improved; and the scatter of
     its parameters: the larger of that of `closer` and that over the places that fit equally well."""
     evident = data.thresholds.evidence
-    others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
+    others = _at_seeds(data, fitted, candidate.effect, candidate.parameters, [end.seed for end in ends], noise) if ends else []
     tries = [tried(data, fitted, other, noise) for other in others]
     begun = [made, *(one for one in tries if one is not None and one.fit.fit.status != STOPPED_EARLY)]
     moved = list[tuple[FittedModel, list[float]]]()
@@ -50,7 +62,7 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     def at(seeds: Sequence[Entry]) -> list[Candidate]:
         fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
         asked.extend(fresh)
-        known.extend(_screen_seeds(data, fitted, start, fresh, noise, answers) if fresh else [])
+        known.extend(_at_seeds(data, fitted, start.effect, start.parameters, fresh, noise, answers=answers) if fresh else [])
         return [c for c in known if c.seed in seeds]
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
@@ -88,7 +100,7 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
     well. The seeds are compared in the fitted state: fields of the state before the effect rank the neighbours of a large effect wrongly."""
     while True:
         *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
-        around = _seeds_instead(data, fitted, noise, effect.nearby(data.robot, seed))
+        around = _at_seeds(data, fitted, effect, parameters, effect.nearby(data.robot, seed), noise, instead_of=-1)
         here = next((c for c in around if c.seed == seed), None)
         if here is None:  # the effect does not move these markers
             return fitted, [0.0] * len(parameters)
@@ -100,33 +112,40 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
         fitted = made
 
 
-def _seeds_instead(data: Data, fitted: FittedModel, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
-    """Return the last effect of a fitted model at other seeds as candidates in its place, linearised in the fitted state."""
-    *_, (effect, _, parameters) = fitted.fit.hypothesis.terms
-    fields = effect_fields(fitted.fit, data.train, [(effect, s, parameters) for s in seeds])
-    return screen(without_last(fitted.fit), problem_of(data, fitted.fit, noise), fields, 100.0)
-
-
-def without_last(fit: JointFit) -> JointFit:
-    """Return a fit without its last effect, to first order."""
-    return without_term(fit, len(fit.hypothesis.terms) - 1)
+def _at_seeds(
+    data: Data,
+    fitted: FittedModel,
+    effect: Effect,
+    parameters: tuple[Parameter, ...],
+    seeds: Sequence[Entry],
+    noise: Noise,
+    *,
+    instead_of: int | None = None,
+    answers: list[Answers] | None = None,
+) -> list[Candidate]:
+    """Return an effect at some seeds as candidates, linearised at a fitted model; `instead_of`: the term that they replace. Their gains can be compared,
+    not their scores: the number of observations has no influence."""
+    fit = fitted.fit
+    fields = effect_fields(fit, data.train, [(effect, seed, parameters) for seed in seeds], answers)
+    base = fit if instead_of is None else without_term(fit, instead_of)
+    return screen(base, problem_of(data, fit, noise), fields, GAINS_ONLY)
 
 
 def without_term(fit: JointFit, i: int) -> JointFit:
-    """Return a fit without one of its terms, to first order."""
-    terms = fit.hypothesis.terms
-    at, q = sum(len(p) for _, _, p in terms[:i]), len(terms[i][2])
-    columns = fit.own + np.arange(at, at + q)
-    J, own = np.asarray(fit.fit.jacobian), fit.coordinates[at : at + q] - np.array([p.null for p in terms[i][2]])
+    """Return a fit without one of its terms, to first order; `i` may count from the last."""
+    terms, span = list(fit.hypothesis.terms), span_at(fit, i)
+    columns = fit.own + np.arange(span.start, span.stop)
+    J, own = np.asarray(fit.fit.jacobian), fit.coordinates[span] - np.array([p.null for p in terms[i][2]])
     residual = fit.fit.residual - J[:, columns] @ own
+    del terms[i]
     less = replace(fit.fit, theta=np.delete(fit.fit.theta, columns), residual=residual, jacobian=np.delete(J, columns, axis=1))
-    return replace(fit, hypothesis=replace(fit.hypothesis, terms=(*terms[:i], *terms[i + 1 :])), fit=less)
+    return replace(fit, hypothesis=replace(fit.hypothesis, terms=tuple(terms)), fit=less)
 
 
 def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) -> bool:
     """Return whether another seed of an accepted effect may fit better, to first order in the fitted state, with the parameters of its place excluded.
     True for effects without neighbouring seeds, for which nothing can be predicted."""
-    fit, terms = fitted.fit, fitted.fit.hypothesis.terms
+    terms = fitted.fit.hypothesis.terms
     i = [effect.name for effect, _, _ in terms].index(name)
     effect, seed, moving = terms[i]
     around = effect.nearby(data.robot, seed)
@@ -134,32 +153,22 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
         return True
     own = {(p.key, p.part) for p in effect.parameters(data.robot, data.control)}
     parameters = tuple(p for p in moving if (p.key, p.part) in own)
-    fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
-    seen = screen(without_term(fit, i), problem_of(data, fit, noise), fields, 100.0)
+    seen = _at_seeds(data, fitted, effect, parameters, [*effect.seeds(data.robot), *around], noise, instead_of=i)
     here = next((c for c in seen if c.seed == seed), None)
     return here is None or max(c.gain for c in seen) > here.gain + data.thresholds.swap
 
 
 def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:
     """Return a fitted model with the seed of its last effect replaced by that of a candidate, refitted; None if that fails."""
-    fit, q = fitted.fit, len(candidate.parameters)
-    *terms, _ = fit.hypothesis.terms
-    hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
-    start = np.array([p.null for p in candidate.parameters]) + candidate.step
-    keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
+    fit = fitted.fit
+    hypothesis, prior = with_term(fit, candidate.effect, candidate.seed, candidate.parameters, at=-1)
+    start = with_values(fit, np.array([p.null for p in candidate.parameters]) + candidate.step, at=-1)
+    keep = np.arange(len(fit.coordinates)) < span_at(fit, -1).start
     near = jets_with(replace(fitted, fit=replace(fit, jets=jets_without(fitted, keep))), candidate)
     try:
-        coordinates = np.concatenate([fit.coordinates[:-q], start])
-        return fit_model(data, hypothesis, fit.prior, noise, coordinates, own=own_of(fitted), near=near)
+        return fit_model(data, hypothesis, prior, noise, start, own=own_of(fitted), near=near)
     except FemsenseError:
         return None
-
-
-def _screen_seeds(
-    data: Data, fitted: FittedModel, start: Candidate, seeds: Sequence[Entry], noise: Noise, answers: list[Answers] | None = None
-) -> list[Candidate]:
-    fields = effect_fields(fitted.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
-    return screen(fitted.fit, problem_of(data, fitted.fit, noise), fields, 100.0)
 
 
 def lies_on_body(

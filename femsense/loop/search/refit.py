@@ -10,12 +10,11 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, with_term
 from femsense.loop.fit.joint_fit import FitOptions, JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
 from femsense.model.drive import has_history
-from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
 
@@ -110,17 +109,6 @@ def _declared(data: Data, fitted: FittedModel, hypothesis: Hypothesis, noise: No
     nothing = Prior(np.zeros(0), np.zeros(0))
     placed = fit_model(data, alone, nothing, noise, np.zeros(0), own=own_of(fitted))
     return np.concatenate([own_of(placed), fitted.fit.prior.mean])
-
-
-def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
-    """Return the hypothesis of a fit with one more effect, and its prior."""
-    old = fit.hypothesis
-    if not parameters:
-        settled = (*old.settled, (effect, seed))
-        return replace(old, robot=effect.apply(old.robot, seed), settled=settled), fit.prior
-    null = np.array([p.null for p in parameters])
-    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, [p.known for p in parameters]]))
-    return replace(old, terms=(*old.terms, (effect, seed, parameters))), prior
 
 
 def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:

@@ -14,29 +14,25 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
-from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, span_at, with_term, with_values
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.refit import evidence, within
-from femsense.loop.search.search_state import Progress, no_equilibrium
-from femsense.model.effects import FORMS, Effect, Entry, Parameter
+from femsense.loop.search.search_state import Setting, no_equilibrium
+from femsense.model.effects import FORMS
+from femsense.model.observation import Term
 
-Term = tuple[Effect, Entry, tuple[Parameter, ...]]
 
-
-def with_all_parts(
-    data: Data, fitted: FittedModel, noise: Noise, n_effective: float, progress: Progress
-) -> tuple[FittedModel, list[RefitRecord]]:
+def with_all_parts(setting: Setting, fitted: FittedModel) -> tuple[FittedModel, list[RefitRecord]]:
     """Return the model with the richer forms that have evidence, and the record of each form that was fitted."""
-    records: list[RefitRecord] = []
+    data, records = setting.data, list[RefitRecord]()
     for i, term in enumerate(fitted.fit.hypothesis.terms):
         for richer in _richer_terms(data, term):
-            progress(f"trying {term[0].name} with {len(richer[2])} parameters")
-            price = (len(richer[2]) - len(term[2])) * float(np.log(n_effective)) + data.thresholds.evidence
+            setting.progress(f"trying {term[0].name} with {len(richer[2])} parameters")
+            price = (len(richer[2]) - len(term[2])) * float(np.log(setting.n_effective)) + data.thresholds.evidence
             record = RefitRecord(term[0].name, term[1])
             try:
-                made = _fitted_with(data, fitted, i, richer, noise, price)
+                made = _fitted_with(data, fitted, i, richer, setting.noise, price)
             except FemsenseError as error:
                 records.append(replace(record, verdict=no_equilibrium(error)))
                 continue
@@ -77,23 +73,9 @@ def _richer_terms(data: Data, term: Term) -> Iterator[Term]:
 def _fitted_with(data: Data, fitted: FittedModel, i: int, richer: Term, noise: Noise, price: float) -> FittedModel:
     """Return the model with another form of its i-th term, started from its current values; a part without a value starts from
     their mean. Raises DataError."""
-    fit, terms = fitted.fit, fitted.fit.hypothesis.terms
-    first = sum(len(parameters) for _, _, parameters in terms[:i])
-    last = first + len(terms[i][2])
-    found = {p.part: float(v) for p, v in zip(terms[i][2], fit.coordinates[first:last])}
+    fit = fitted.fit
+    found = {p.part: float(v) for p, v in zip(fit.hypothesis.terms[i][2], fit.coordinates[span_at(fit, i)])}
     usual = found.get(None, float(np.mean(list(found.values()))))
-    own = [found.get(p.part, usual) for p in richer[2]]
-    prior = fit.prior
-    return fit_model(
-        data,
-        replace(fit.hypothesis, terms=(*terms[:i], richer, *terms[i + 1 :])),
-        Prior(
-            np.concatenate([prior.mean[:first], [p.null for p in richer[2]], prior.mean[last:]]),
-            np.concatenate([prior.std[:first], [p.known for p in richer[2]], prior.std[last:]]),
-        ),
-        noise,
-        np.concatenate([fit.coordinates[:first], own, fit.coordinates[last:]]),
-        own=own_of(fitted),
-        max_iterations=10,
-        worth=within(fit, price),
-    )
+    start = with_values(fit, [found.get(p.part, usual) for p in richer[2]], at=i)
+    hypothesis, prior = with_term(fit, *richer, at=i)
+    return fit_model(data, hypothesis, prior, noise, start, own=own_of(fitted), max_iterations=10, worth=within(fit, price))

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import as_shown, same_mesh_error, with_mesh_errors
+from femsense.loop.fit.discretisation_error import same_mesh_error, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown, with_turning_placements
 from femsense.loop.fit.model_error import excess_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import repeatability
@@ -20,7 +20,7 @@ from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import hinted, select_next
 from femsense.loop.search.richer_forms import with_all_parts
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
-from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
+from femsense.loop.search.search_state import Progress, Refit, Search, SearchProgress, at_step
 from femsense.loop.search.swaps import instead_of_offsets, simplest, swapped
 from femsense.model.recording import state_key
 
@@ -40,22 +40,23 @@ def search_effects(state: SearchProgress, checkpoint: Checkpoint, progress: Prog
         weights = noise_of(state.data, state.fitted, None, state.noise)[0]
         state.begin_again(with_turning_placements(state.data, state.base), weights)
         _seek(state, checkpoint, progress)
-    data, history, noise = state.data, state.history, state.noise
-    assert noise is not None
-    refits, before = state.refits, state.before
+    return state.data, _completed(state, progress)
+
+
+def _completed(state: SearchProgress, progress: Progress) -> Search:
+    """Return the search with its last tests: does a simpler effect suffice next to a model error, and does one fit better than the input offsets?"""
+    setting, data, history, refits, before = state.setting(progress), state.data, state.history, state.refits, state.before
     if state.holds_error:
-        history, refits = simplest(data, history, refits, state.names, noise, state.n_effective, progress)
-    fitted = history[-1][1]
-    most = _most_effects(data)
-    swap = instead_of_offsets(data, fitted, state.names, noise, state.n_effective, progress) if most else None
+        history, refits = simplest(setting, history, refits, state.names)
+    swap = instead_of_offsets(setting, history[-1][1], state.names) if _most_effects(data) else None
     if swap is not None:
         refits = [*refits, *at_step(swap.records, len(history))]
-        if swap.fitted is not None:
-            fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
+        history = history if swap.fitted is None else [*history, (swap.name, swap.fitted)]
     if len(history) > 1 and "clouds" in data.measured:
-        before = calibrated_pose(data, data.robot_as_declared, noise, before)  # before and after on the same rows
+        before = calibrated_pose(data, data.robot_as_declared, setting.noise, before)  # before and after on the same rows
     tables = state.first, state.table, refits
-    return data, Search(before, history, state.base, fitted, noise, state.n_effective, *tables, swap, state.outweighed)
+    final, noise = history[-1][1], setting.noise
+    return Search(before, history, state.base, final, noise, state.n_effective, *tables, swap, state.outweighed)
 
 
 def _seek(state: SearchProgress, checkpoint: Checkpoint, progress: Progress) -> None:
@@ -86,63 +87,64 @@ def _most_effects(data: Data) -> int:
 
 
 def _take_step(state: SearchProgress, progress: Progress) -> None:
-    """Screen the effects that the model may lack and add the best one; if none passes, end the search."""
-    names, found = state.names, state.found
-    data, fitted, noise, fields = state.data, state.fitted, state.noise, state.fields
-    if found and "clouds" in data.measured:
-        assert noise is not None
+    """Propose effects by their linear scores, fit the best ones, and add the one with the most evidence on fitted and held-out data; if none passes, end."""
+    _screen(state)
+    state.over = state.over or state.found >= _most_effects(state.data)
+    if state.over:
+        return
+    best, tried = select_next(state.setting(progress), state.fitted, state.table)
+    state.note(tried)
+    if best is None:
+        _tell_parts_apart(state, progress)
+    else:
+        _add(state, best, progress)
+
+
+def _screen(state: SearchProgress) -> None:
+    """Refit the current model with the noise of its own residual, and score the effects that it lacks. If it has no equilibrium, its last effect is taken
+    back, and the search ends. The fields of the previous model are reused as long as they predict no gain."""
+    data, fitted, fields = state.data, state.fitted, state.fields
+    if state.found and "clouds" in data.measured:
+        assert state.noise is not None
         fields = None
-        data, fitted = matched(data, fitted, noise)
+        data, fitted = matched(data, fitted, state.noise)
     try:
-        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names, holds_error=state.holds_error)
+        fields = _fields(data, fitted, fields, state.names)
+        estimated, n_effective = noise_of(data, fitted, fields, state.noise)
+        noise = state.noise if state.noise is not None and state.holds_error else estimated
+        fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets)
+        fields, table = scored(data, fitted, fields, noise, state.names, n_effective)
     except FemsenseError as error:
-        if not found:
+        if not state.found:
             raise
         state.take_back(error)
         return
-    history, refits = [*state.history[:-1], (state.history[-1][0], fitted)], state.refits
-    state.data, state.fitted, state.noise, state.n_effective = data, fitted, noise, n_effective
-    state.fields, state.table, state.history = fields, table, history
-    if not found:
+    state.data, state.noise, state.n_effective, state.fields, state.table = data, noise, n_effective, fields, table
+    state.replace_last(fitted)
+    if not state.found:
         state.base, state.first = fitted, table
-    if found >= _most_effects(data):
-        state.over = True
-        return
-    next_one, tried = select_next(data, fitted, table, noise, progress)
-    refits = [*refits, *at_step(tried, len(history))]
-    state.refits = refits
-    if next_one is None:
-        _tell_parts_apart(state, progress)
-        return
-    state.earlier = data
-    winner = next_one.fitted
-    recompute = moved_by(fitted, winner) > discretisation_rms(data, fitted) and not same_mesh_error(fitted, winner)
-    history = [*history, (next_one.candidate.effect.name, winner)]
-    history, refits = swapped(data, history, refits, noise, n_effective, progress)
-    last = history[-1][1]
-    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if recompute else data, last)
-    state.data, state.history, state.refits, state.fitted = data, history, refits, last
+
+
+def _add(state: SearchProgress, best: Refit, progress: Progress) -> None:
+    """Add an effect to the model; drop or exchange earlier ones that it makes unnecessary; recompute the discretisation error if that has changed."""
+    data, before, after = state.data, state.fitted, best.fitted
+    recompute = moved_by(before, after) > discretisation_rms(data, before) and not same_mesh_error(before, after)
+    history = [*state.history, (best.candidate.effect.name, after)]
+    state.history, state.refits = swapped(state.setting(progress), history, state.refits)
+    last = state.history[-1][1]
+    state.earlier, state.fitted = data, last
+    if recompute:
+        state.data = with_errors_as_shown(with_mesh_errors(data, last, state.names), last)
+    else:
+        state.data = with_turning_placements(data, last)
 
 
 def _tell_parts_apart(state: SearchProgress, progress: Progress) -> None:
     """Give accepted effects one value per cable where these have evidence, and continue; otherwise end the search."""
-    assert state.noise is not None
-    fitted, records = with_all_parts(state.data, state.fitted, state.noise, state.n_effective, progress)
-    state.refits = [*state.refits, *at_step(records, len(state.history))]
+    fitted, records = with_all_parts(state.setting(progress), state.fitted)
+    state.note(records)
     state.over = fitted is state.fitted
-    state.fitted, state.history = fitted, [*state.history[:-1], (state.history[-1][0], fitted)]
-
-
-def _screened(
-    data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str], *, holds_error: bool
-) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
-    """Return a model refitted with the noise of its own residual, that noise, the effective number of observations, and the fields and scores of the
-    candidates. The fields of the previous model are reused as long as they predict no gain."""
-    fields = _fields(data, fitted, before, names)
-    estimated, n_effective = noise_of(data, fitted, fields, noise)
-    noise = noise if noise is not None and holds_error else estimated
-    fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets)
-    return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
+    state.replace_last(fitted)
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:

@@ -17,6 +17,21 @@ OUTWEIGHED = "accepted with weights under which a large residual remained; repea
 """The verdict on effects accepted, or passed, before the weights changed."""
 
 
+Progress = Callable[[str], None]
+"""Called with a text that names the current step."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Setting:
+    """The data and weights by which models are compared in one step of the search."""
+
+    data: Data
+    noise: Noise
+    n_effective: float
+    """Effective number of observations, for BIC."""
+    progress: Progress
+
+
 @dataclass(eq=False, slots=True)
 class SearchProgress:
     """The state of a search."""
@@ -56,6 +71,19 @@ class SearchProgress:
     def found(self) -> int:
         """Number of effects found."""
         return len(self.history) - self.given
+
+    def setting(self, progress: Progress) -> Setting:
+        """Return the data and weights of the current step; they are known from the first screening on."""
+        assert self.noise is not None
+        return Setting(self.data, self.noise, self.n_effective, progress)
+
+    def replace_last(self, fitted: FittedModel) -> None:
+        """Replace the current model by one with the same effects."""
+        self.fitted, self.history = fitted, [*self.history[:-1], (self.history[-1][0], fitted)]
+
+    def note(self, records: Iterable[RefitRecord]) -> None:
+        """Keep the results of candidates that were refitted on top of the current model."""
+        self.refits = [*self.refits, *at_step(records, len(self.history))]
 
     def begin_again(self, data: Data, noise: Noise) -> None:
         """Restart the search from the first model, with weights that include the residual of the last one."""
@@ -99,10 +127,6 @@ class Search:
     """As of `SearchProgress`."""
     everywhere: AllRecordings | None = None
     """Results of the last model in all recordings, if only some were searched."""
-
-
-Progress = Callable[[str], None]
-"""Called with a text that names the current step."""
 
 
 def no_equilibrium(error: FemsenseError) -> str:

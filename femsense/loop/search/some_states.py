@@ -13,14 +13,13 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.data.outliers import without_outliers
 from femsense.loop.data.representative_states import spread_states
-from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
+from femsense.loop.fit.discretisation_error import with_mesh_errors_of
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.marker_placement import with_errors_as_shown, with_turning_placements
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
-from femsense.loop.search.calibration import START, calibrated_pose, fitted_again
+from femsense.loop.search.calibration import START, calibrated_pose, fitted_again, without_outliers_of
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, no_equilibrium
@@ -57,10 +56,10 @@ def in_all_states(every: Data, state: SearchProgress, search: Search, progress: 
     noise, given = search.noise, state.given
     fitted = [fitted_again(every, model, noise) for _, model in search.history[:given]]
     data = every
-    while (fewer := _without_outliers(data, fitted[-1])) is not data:
+    while (fewer := without_outliers_of(data, fitted[-1])) is not data:
         data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
     before = calibrated_pose(data, data.robot_as_declared, START)
-    data = with_turning_placements(as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1]), fitted[-1])
+    data = with_errors_as_shown(with_mesh_errors_of(data, state.data, fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
     refits = list(search.refits)
@@ -75,10 +74,6 @@ def in_all_states(every: Data, state: SearchProgress, search: Search, progress: 
         data = with_turning_placements(data, last)
     models = replace(state, data=data, earlier=data, before=before, history=history, fitted=last, base=base, refits=refits)
     return replace(models, noise=noise, n_effective=n_effective, fields=None, first=first, table=first, over=False)
-
-
-def _without_outliers(data: Data, fitted: FittedModel) -> Data:
-    return without_outliers(data, [jet.residual for jet in fitted.fit.jets], fitted.held_residuals)
 
 
 def _added(

@@ -14,7 +14,7 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.cross_validation import LEAST_SWEEPS, sweeps_predicted
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, without_effect
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, eligible, prior_cost
@@ -24,27 +24,25 @@ from femsense.loop.search.input_offset import OFFSETS, evidence_for_offsets, off
 from femsense.loop.search.location_search import closer, may_lie_elsewhere
 from femsense.loop.search.refit import beyond, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
-from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit, at_step
+from femsense.loop.search.search_state import OffsetAlternative, Refit, Setting, at_step
 from femsense.model.recording import state_key
 
 History = list[tuple[str, FittedModel]]
 
 
-def swapped(
-    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, progress: Progress
-) -> tuple[History, list[RefitRecord]]:
+def swapped(setting: Setting, history: History, refits: list[RefitRecord]) -> tuple[History, list[RefitRecord]]:
     """Return the history without earlier effects that the whole model no longer needs, and with alternatives that beat the others; and the refits,
     including those of the alternatives."""
     for name in [name for name, _ in history[1:-1]]:
         fitted = history[-1][1]
-        less = _if_needless(data, fitted, name, noise, n_effective, progress)
+        less = _if_needless(setting, fitted, name)
         if less is not None:
             history = [*history[:-1], (history[-1][0], less)]
             continue
-        alternatives = _alternatives(data, fitted, refits, name)
-        if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
+        alternatives = _alternatives(setting.data, fitted, refits, name)
+        if not alternatives or (alternatives == [name] and not may_lie_elsewhere(setting.data, fitted, name, setting.noise)):
             continue
-        history, refits = _exchanged(data, history, refits, name, alternatives, noise, n_effective, progress)
+        history, refits = _exchanged(setting, history, refits, name, alternatives)
     return history, refits
 
 
@@ -55,13 +53,7 @@ def alternatives_to(own: RefitRecord, refits: Sequence[RefitRecord], table: Sequ
 
 
 def simplest(
-    data: Data,
-    history: History,
-    refits: list[RefitRecord],
-    names: Sequence[str],
-    noise: Noise,
-    n_effective: float,
-    progress: Progress,
+    setting: Setting, history: History, refits: list[RefitRecord], names: Sequence[str]
 ) -> tuple[History, list[RefitRecord]]:
     """Return a history and its refits in which a simpler and more plausible effect replaces each one that it may stand for.
 
@@ -70,7 +62,7 @@ def simplest(
     """
     for name in [name for name, _ in history[1:]]:
         others = [n for n in names if n not in history[-1][1].fit.hypothesis.names]
-        history, refits = _exchanged(data, history, refits, name, others, noise, n_effective, progress, by_held_out=True)
+        history, refits = _exchanged(setting, history, refits, name, others, by_held_out=True)
     return history, refits
 
 
@@ -86,25 +78,22 @@ def predicts_worse(data: Data, fitted: FittedModel, other: FittedModel) -> bool:
 
 
 def _exchanged(
-    data: Data,
+    setting: Setting,
     history: History,
     refits: list[RefitRecord],
     name: str,
     alternatives: list[str],
-    noise: Noise,
-    n_effective: float,
-    progress: Progress,
     *,
     by_held_out: bool = False,
 ) -> tuple[History, list[RefitRecord]]:
     """Return a history in which the best alternative replaces an effect if it is better, by evidence or on held-out data; and the refits."""
     fitted = history[-1][1]
-    progress(f"refitting {' or '.join(alternatives)} instead of {name}")
+    setting.progress(f"refitting {' or '.join(alternatives)} instead of {name}")
     try:
-        without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-        best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, progress, by_held_out)
+        without = without_effect(setting.data, fitted, name, setting.noise)
+        best, records = _better(setting, fitted, without, name, alternatives, by_held_out)
         if best is not None:
-            history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
+            history = [*_without(setting, history, without, name), (best.candidate.effect.name, best.fitted)]
     except FemsenseError:
         return history, refits
     if best is not None:
@@ -113,20 +102,17 @@ def _exchanged(
     return history, [*refits, *at_step(records, len(history) - 1)]
 
 
-def _if_needless(
-    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, progress: Progress
-) -> FittedModel | None:
+def _if_needless(setting: Setting, fitted: FittedModel, name: str) -> FittedModel | None:
     """Return a model without an effect that later ones have made unnecessary (evidence for keeping it ≤ q log n), with the place of the last effect
     improved; else None."""
-    terms = fitted.fit.hypothesis.terms
+    data, noise, terms = setting.data, setting.noise, fitted.fit.hypothesis.terms
     count = sum(len(p) for effect, _, p in terms if effect.name == name)
     if not count:
         return None
-    progress(f"testing whether {name} is still needed")
-    price = count * float(np.log(n_effective))
-    others = [n for n in fitted.fit.hypothesis.names if n != name]
+    setting.progress(f"testing whether {name} is still needed")
+    price = count * float(np.log(setting.n_effective))
     try:
-        without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, price))
+        without = without_effect(data, fitted, name, noise, worth=beyond(fitted.fit, price))
     except FemsenseError:
         return None
     if evidence(without.fit, fitted.fit) > price:
@@ -156,25 +142,18 @@ def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord]
 
 
 def _better(
-    data: Data,
-    fitted: FittedModel,
-    without: FittedModel,
-    name: str,
-    alternatives: list[str],
-    noise: Noise,
-    n_effective: float,
-    progress: Progress,
-    by_held_out: bool,
+    setting: Setting, fitted: FittedModel, without: FittedModel, name: str, alternatives: list[str], by_held_out: bool
 ) -> tuple[Refit | None, list[RefitRecord]]:
     """Return the best alternative if it is better than the accepted effect, and the records of all."""
-    table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *alternatives]), n_effective)
+    data, noise = setting.data, setting.noise
+    table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *alternatives]), setting.n_effective)
     own = _same(table, fitted, name)
     if own is None:
         return None, []
     price = own.cost + prior_cost(data.declared, own.effect, fitted.fit)
     worth = evidence(without.fit, fitted.fit) - price
     listed = [c for c in table if c.effect.name in alternatives and (c.cost < price or not by_held_out)]
-    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, progress)
+    asked = _asked(setting, without, shortlist(listed, data.thresholds, data.effort, first=True), name)
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in asked if r.record.passes)]
     able = eligible(data, asked, noise)
     if by_held_out:
@@ -190,19 +169,17 @@ def _held_decrease(data: Data, before: FittedModel, after: FittedModel, noise: N
     return held_chi2(data, before, noise) - held_chi2(data, after, noise)
 
 
-def _asked(
-    data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, progress: Progress
-) -> list[Refit]:
+def _asked(setting: Setting, without: FittedModel, listed: Sequence[Candidate], name: str) -> list[Refit]:
     """Return the acceptance tests of candidates on top of a model, with the seeds of the leading ones improved."""
     asked = list[Refit]()
     for candidate in listed:
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
         try:
-            made = refit(data, without, candidate, noise)
+            made = refit(setting.data, without, candidate, setting.noise)
         except FemsenseError:
             continue
-        asked.append(acceptance_test(data, without, candidate, made, record, noise))
-    leading = leaders(data, without, dict(enumerate(asked)), noise, progress)
+        asked.append(acceptance_test(setting.data, without, candidate, made, record, setting.noise))
+    leading = leaders(setting, without, dict(enumerate(asked)))
     return [leading.get(i, r) for i, r in enumerate(asked)]
 
 
@@ -213,27 +190,26 @@ def _same(table: Sequence[Candidate], fitted: FittedModel, name: str) -> Candida
     return max(forms, key=lambda c: len(c.parameters), default=None)
 
 
-def _without(data: Data, history: History, without: FittedModel, name: str, noise: Noise) -> History:
+def _without(setting: Setting, history: History, without: FittedModel, name: str) -> History:
     """Return the history as if one effect had never been accepted."""
     left = [n for n, _ in history[1:] if n != name]
     steps: History = [history[0]]
     for i, other in enumerate(left):
         known = [*NUISANCE, *left[: i + 1]]
-        steps.append((other, without if i == len(left) - 1 else keeping(data, without, known, noise)))
+        steps.append((other, without if i == len(left) - 1 else keeping(setting.data, without, known, setting.noise)))
     return steps
 
 
-def instead_of_offsets(
-    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, progress: Progress
-) -> OffsetAlternative | None:
+def instead_of_offsets(setting: Setting, fitted: FittedModel, names: Sequence[str]) -> OffsetAlternative | None:
     """Return the effect that best replaces the input offsets of a model; None if the data do not need these."""
+    data, noise, n_effective = setting.data, setting.noise, setting.n_effective
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None or np.isinf(data.thresholds.swap):
         return None
-    progress("testing alternatives to the input offsets")
+    setting.progress("testing alternatives to the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
-    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, progress)
+    asked = _asked(setting, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS)
     best = max(eligible(data, asked, noise), key=lambda r: r.score, default=None)
     if best is None:
         return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])

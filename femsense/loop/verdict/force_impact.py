@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, spread_evenly
 from femsense.core.errors import FemsenseError
 from femsense.core.parallel import each
 from femsense.fem.compliance import Tangent, compliance, tangent_at
@@ -101,7 +101,7 @@ def force_consequence(before: list[View], after: list[View], noise: Noise) -> Fo
     loaded = loaded or [(a, b, k) for a, b in pairs for k in _loaded_frames(a)]
     try:
         if loaded:
-            chosen = np.unique(np.linspace(0, len(loaded) - 1, POINTS).round().astype(int))
+            chosen = spread_evenly(len(loaded), POINTS)
             rows = each(lambda at: _at_loads(at[0], at[1], at[2], noise), [loaded[i] for i in chosen])
             return ForceImpact(loads=tuple(row for row in rows if row is not None))
         return ForceImpact(compliance=_compliances(*pairs[0]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
@@ -37,6 +37,35 @@ from femsense.model.robot import Robot
 
 COMPARED = 3
 """Number of frames of each held-out recording in which the returned robot is compared with the fitted model."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Returned:
+    """The returned part of a search."""
+
+    names: list[str]
+    """Of the returned effects, nuisance effects first."""
+    back: FittedModel
+    """The model of these."""
+    std: dict[str, FloatArray]
+    """Standard deviations in the last model of the search, by effect."""
+    insignificant: list[str]
+    """Effects that were found, and whose values do not differ significantly from their null."""
+    drifted: bool
+    """Whether the modulus is significant and not returned: a reduction of the residual by an implausible modulus explains nothing."""
+
+
+def returned_part(data: Data, search: Search) -> Returned:
+    """Return the effects of a search that are significant and that held-out data accept, with their model."""
+    final = search.final
+    seed_std = {r.name: np.array(r.seed_std) for r in search.refits if r.is_named and r.seed_std is not None}
+    std = parameter_std(data, final, search.noise, seed_std)
+    promoted = [n for n in promoted_nuisances(data, search) if is_significant(final, n, std[n], data.thresholds)]
+    added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
+    significant = significant_effects(data, final, added, std)
+    names, back, insignificant = returned_effects(data, search, promoted, significant, seed_std)
+    doubtful = [n for n in added if n not in significant or n in insignificant]
+    return Returned(names, back, std, doubtful, MODULUS in promoted and MODULUS not in names)
 
 
 def promoted_nuisances(data: Data, search: Search) -> list[str]:
@@ -194,7 +223,7 @@ def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) ->
         if trial.scene.crossings is not None:
             continue
         frames = trial.scene.frames
-        some = frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).round().astype(int))]
+        some = frames[spread_evenly(len(frames), COMPARED)]
         scene, starts = trial.scene.pick(some), dict(held.jet.states)
         jet = evaluate_robot(robot, scene, held.poses, initial, starts)
         gaps.append(jet.residual - held.jet.residual[np.isin(trial.scene.frame, some)])

@@ -11,7 +11,7 @@ from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.fit.discretisation_error import mesh_error_rms, mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
-from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import Verdict
 from femsense.loop.result.records import AllRecordings, ConfoundedPair, ModelError, NamedEffect, Value, alternatives
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import Thresholds
@@ -39,16 +39,16 @@ def verdict_in_words(
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     known = float(np.hypot(budget.noise_m, budget.placement_m))
     mesh = budget.discretisation_m or 0.0
-    if verdict == NONE and before.held_rms <= AT_NOISE * np.hypot(known, mesh):
+    if verdict == Verdict.NONE and before.held_rms <= AT_NOISE * np.hypot(known, mesh):
         finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
         own = finer if mesh and before.held_rms > AT_NOISE * known else ""
         return f"The model fits the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
     of_it = f"of which {1e3 * budget.held_out_m:.2f} mm is model error and {_noise_in_words(budget)} noise"
-    if verdict == NONE:
+    if verdict == Verdict.NONE:
         costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
         return f"No effect that was tried improves the fit: {error}, {of_it}{costs}." + _mesh_in_words(budget)
     where = "" if after.held_residuals and after.held_residuals[0].shape[1] == 3 else " along the normals of the surface"
-    if verdict == UNEXPLAINED and not effects:
+    if verdict == Verdict.UNEXPLAINED and not effects:
         explains = "no effect that passes the tests fits" if found else "no known effect fits"
         return f"A residual remains that {explains}: {error}{where}, {of_it}." + _mesh_in_words(budget)
     of_it += "".join(
@@ -64,7 +64,7 @@ def verdict_in_words(
         f"{_or('by the model error may stand for', instead.get(e.name, ()))})"
         for e in effects
     )
-    tail = "" if verdict == FOUND else " A residual remains that no effect fits."
+    tail = "" if verdict == Verdict.FOUND else " A residual remains that no effect fits."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
 

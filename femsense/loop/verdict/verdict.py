@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,27 +12,23 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.discretisation_error import without_mesh_error
 from femsense.loop.fit.fitted_model import FittedModel, mean_square
 from femsense.loop.fit.model_error import Excess, excess_of, model_error
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.fit.repeatability import repeatability
-from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
-from femsense.loop.result.records import Left, Structure
+from femsense.loop.fit.repeatability import Repeatability, repeatability
+from femsense.loop.result.loop_result import LoopResult, Verdict
+from femsense.loop.result.records import Left, NamedEffect, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.report_data import gather
 from femsense.loop.verdict.residual_diagnostics import describe_left, frame_errors, structure_tests
 from femsense.loop.verdict.returned_model import (
-    MODULUS,
+    Returned,
     entries_of,
-    is_significant,
     prediction_gap,
-    promoted_nuisances,
-    returned_effects,
-    significant_effects,
+    returned_part,
 )
 from femsense.loop.verdict.sentences import by_mesh, by_noise, everywhere_in_words, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
@@ -46,6 +42,7 @@ from femsense.loop.verdict.summary import (
     values_of,
 )
 from femsense.model.effects import Entry, apply_effects
+from femsense.model.marker_correction import Correction
 from femsense.model.robot import Robot
 
 SAME = 0.01, 1e-5
@@ -55,44 +52,26 @@ SAME = 0.01, 1e-5
 def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: bool = False) -> LoopResult:
     """Return the result of a search, with the data of the report, and with an empirical correction if `correct`."""
     before, final, noise = search.before, search.final, search.noise
-    std = parameter_std(data, final, noise, _seed_std(search))
     measured = repeatability(data, final, noise)
-    promoted = [n for n in promoted_nuisances(data, search) if is_significant(final, n, std[n], data.thresholds)]
-    added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
-    significant = significant_effects(data, final, added, std)
-    names, back, insignificant = returned_effects(data, search, promoted, significant, _seed_std(search))
-    drifted = (
-        MODULUS in promoted and MODULUS not in names
-    )  # a reduction of the residual by an implausible modulus explains nothing
-    promoted = [n for n in names if n in NUISANCE]
+    returned = returned_part(data, search)
+    names, back, std = returned.names, returned.back, returned.std
     entries = entries_of(back, names) if names else []
-    effects = chain_of_effects(data, search, promoted, names, back, std)
-    lacks = lacks_much(data, back, final, noise)
-    shown = back if lacks else final  # the residual includes what unaccepted nuisance effects would remove
-    surprise = _surprise(data, back, noise)
-    plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
-    tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
-    excess = excess_of(data, before, final, back, noise, measured)
+    effects = chain_of_effects(data, search, [n for n in names if n in NUISANCE], names, back, std)
+    remaining = _remaining(data, search, back, measured, rng)
     found = _not_returned(search, names)
-    open_to_doubt = (tests.significant or surprise) and (drifted or excess.explained < data.thresholds.explained)
-    unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
-    verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
+    verdict = _verdict(data, returned, remaining, found, effects)
     pairs = confounded(search, names, data.thresholds)
     correction, learned = judged_correction(data, back) if correct else (None, None)
-    robot = _returned_robot(data, entries)
-    robot = robot if robot.correction is learned else replace(robot, correction=learned)
-    robot = replace(robot, name=improved_name(robot.name)) if entries or learned is not None else robot
-    only_held = bool(surprise) and not tests.significant and not lacks
-    left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
-    budget = model_error(data, excess, noise, measured)
+    robot = _returned_robot(data, entries, learned)
+    budget = model_error(data, remaining.excess, noise, measured)
     return LoopResult(
         verdict=verdict,
         sentence=verdict_in_words(verdict, effects, found, before, back, budget, pairs)
         + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back, names, measured.total)
-        + evidence_for(data, found, [n for n in added if n not in significant or n in insignificant])
-        + surprise
+        + evidence_for(data, found, returned.insignificant)
+        + remaining.surprise
         + _by_prediction(data, robot, back, noise)
         + everywhere_in_words(search.everywhere, data.thresholds),
         noise_m=measured.total,
@@ -105,7 +84,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         next_experiment="",
         not_testable=tuple(untestable(search.first, names, data.thresholds)),
         detectable=detectable(search.last, {effect.name for effect in effects}),
-        left=left,
+        left=_left(data, back, remaining, noise),
         robot=robot,
         declared=data.declared,
         data=data_card(data, final, std, noise, measured.source, search.n_effective),
@@ -114,8 +93,48 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         correction=correction,
         everywhere=search.everywhere,
         residuals=residual_table(data, before, back),
-        evidence=gather(data, search, back, shown, tests, rng),
+        evidence=gather(data, search, back, remaining.shown, remaining.tests, rng),
     )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Remaining:
+    """The tests of the remaining residual."""
+
+    shown: FittedModel
+    """The model whose residual is tested: the last one of the search; or, if the returned one `lacks` much, that, so that the residual includes what
+    rejected nuisance effects would remove."""
+    lacks: bool
+    """Whether the last model of the search has a much smaller residual than the returned one."""
+    surprise: str
+    """A sentence if held-out data have a much larger residual than fitted data; else empty."""
+    tests: Structure
+    excess: Excess
+
+    @property
+    def only_held_out(self) -> bool:
+        """Whether only held-out data show it."""
+        return bool(self.surprise) and not self.tests.significant and not self.lacks
+
+
+def _remaining(data: Data, search: Search, back: FittedModel, measured: Repeatability, rng: np.random.Generator) -> Remaining:
+    noise, lacks = search.noise, lacks_much(data, back, search.final, search.noise)
+    shown = back if lacks else search.final
+    plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
+    tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
+    excess = excess_of(data, search.before, search.final, back, noise, measured)
+    return Remaining(shown, lacks, _surprise(data, back, noise), tests, excess)
+
+
+def _verdict(data: Data, returned: Returned, remaining: Remaining, found: Sequence[str], effects: Sequence[NamedEffect]) -> str:
+    """Return the verdict: a residual is unexplained if it is large, or has structure and the returned effects explain little of it."""
+    excess = remaining.excess
+    explained = not returned.drifted and excess.explained >= data.thresholds.explained
+    if remaining.lacks or excess.is_large or (found and not effects):
+        return Verdict.UNEXPLAINED
+    if (remaining.tests.significant or remaining.surprise) and not explained:
+        return Verdict.UNEXPLAINED
+    return Verdict.FOUND if effects else Verdict.NONE
 
 
 def improved_name(name: str) -> str:
@@ -127,15 +146,16 @@ def improved_name(name: str) -> str:
     return f"{begin}-improved-{int(count[1:] or 1) + 1}"
 
 
-def _returned_robot(data: Data, entries: Sequence[Entry]) -> Robot:
-    """Return the declared robot with effects, in its document too."""
-    if not entries:
-        return data.declared
-    robot = apply_effects(data.declared, entries)
-    if data.declared.document is None:
-        return robot
-    written = [*data.declared.document.get("effects", []), *entries]
-    return replace(robot, document={**data.declared.document, "effects": written})
+def _returned_robot(data: Data, entries: Sequence[Entry], learned: Correction | None) -> Robot:
+    """Return the declared robot with effects, in its document too, and with an empirical correction."""
+    robot, document = data.declared, data.declared.document
+    if entries:
+        robot = apply_effects(robot, entries)
+    if entries and document is not None:
+        robot = replace(robot, document={**document, "effects": [*document.get("effects", []), *entries]})
+    if entries or learned is not None:
+        robot = replace(robot, name=improved_name(robot.name))
+    return robot if robot.correction is learned else replace(robot, correction=learned)
 
 
 def _by_prediction(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> str:
@@ -148,10 +168,6 @@ def _by_prediction(data: Data, robot: Robot, back: FittedModel, noise: Noise) ->
     if gap <= max(share * back.held_rms, least):
         return ""
     return f" The returned robot predicts markers {1e3 * gap:.2f} mm away from those of the fitted model."
-
-
-def _seed_std(search: Search) -> dict[str, FloatArray]:
-    return {r.name: np.array(r.seed_std) for r in search.refits if r.is_named and r.seed_std is not None}
 
 
 def lacks_much(data: Data, back: FittedModel, final: FittedModel, noise: Noise) -> bool:
@@ -175,11 +191,14 @@ def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     )
 
 
-def _left(data: Data, fitted: FittedModel, noise: Noise, tests: Structure, excess: Excess, *, held: bool) -> Left:
+def _left(data: Data, back: FittedModel, remaining: Remaining, noise: Noise) -> Left:
     """Return the description of the remaining residual, of the fitted data or, if only these show it, of the held-out data."""
-    trials, residuals = (data.held, fitted.held_residuals) if held else (data.train, [jet.residual for jet in fitted.fit.jets])
-    beyond = _beyond_mesh(trials, residuals, noise)
-    return describe_left(data.robot, trials, beyond, held_out=held, structure=tests, explained_share=excess.explained)
+    held = remaining.only_held_out
+    trials, residuals = data.train, [jet.residual for jet in remaining.shown.fit.jets]
+    if held:
+        trials, residuals = data.held, back.held_residuals
+    share, beyond = remaining.excess.explained, _beyond_mesh(trials, residuals, noise)
+    return describe_left(data.robot, trials, beyond, held_out=held, structure=remaining.tests, explained_share=share)
 
 
 def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> list[FloatArray]:

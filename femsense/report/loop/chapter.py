@@ -12,7 +12,7 @@ import numpy as np
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import read_loop, saved_loop
 from femsense.loop.result.evidence import Evidence, ForceField, LoadRow, Ranked, Tests, Tip
-from femsense.loop.result.loop_result import UNEXPLAINED, SavedLoop
+from femsense.loop.result.loop_result import SavedLoop, Verdict
 from femsense.loop.result.records import ModelError, Residuals
 from femsense.model.robot import Robot
 from femsense.report import words
@@ -93,7 +93,7 @@ def _pictures(
     result: SavedLoop, evidence: Evidence, residuals: Residuals, robot: Robot | None, rest: DrawnSurface | None
 ) -> dict[str, Any]:
     left = result.left
-    structured = left.structure.significant or (result.verdict == UNEXPLAINED and not left.held_out)
+    structured = left.structure.significant or (result.verdict == Verdict.UNEXPLAINED and not left.held_out)
     cameras = evidence.pictures.camera_axes
     return {
         "mean_residual": mean_residual_panels(result, residuals, cameras, robot, rest),

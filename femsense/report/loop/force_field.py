@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
+from femsense.core.arrays import diagonal
 from femsense.loop.result.evidence import ForceField
 from femsense.report import words
 from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure
@@ -21,7 +22,7 @@ def force_field(field: ForceField, surface: DrawnSurface | None) -> Markup | Non
     largest = float(np.linalg.norm(forces, axis=1).max(initial=0.0))
     if largest <= 0:
         return None
-    size = float(np.linalg.norm(np.ptp(surface.nodes, axis=0)))
+    size = diagonal(surface.nodes)
     scale = FIELD_SHARE * size / largest
     view = best_view(surface.nodes, forces)
     depth = points @ view.towards

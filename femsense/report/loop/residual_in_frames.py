@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal, rms
 from femsense.loop.result.evidence import Pictures, Snapshot
 from femsense.report import words
 from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure, exaggeration, largest_of
@@ -41,7 +41,7 @@ class FrameResiduals:
     @property
     def factor(self) -> float:
         """Exaggeration of the arrows: relative to the largest body, not to the distance between bodies."""
-        largest = max(self._bodies, key=lambda points: float(np.linalg.norm(np.ptp(points, axis=0))))
+        largest = max(self._bodies, key=diagonal)
         return exaggeration(largest, [*self.before, *self.after], share=ARROW_SHARE)
 
     @property
@@ -62,7 +62,7 @@ class FrameResiduals:
                 shape,
                 (Arrows(measured - residual, self.factor * residual, color, rings=True),),
                 color,
-                f"{name}, {title}\n{1e3 * _rms(residual):.2f} mm",
+                f"{name}, {title}\n{1e3 * rms(residual):.2f} mm",
             )
             for title, shape, measured, residual in zip(self.titles, self.shapes, self.measured, residuals)
         ]
@@ -99,12 +99,8 @@ def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Mark
         f"of the frame."
     )
     sizes = ", ".join(
-        f"{title} {words.length(_rms(before))} before and {words.length(_rms(after))} after"
+        f"{title} {words.length(rms(before))} before and {words.length(rms(after))} after"
         for title, before, after in zip((f.title for f in pictures.frames if f.measured_m), frames.before, frames.after)
     )
     alt = f"Residuals in {len(frames.titles)} frames: {sizes}."
     return Markup("<p>{}</p>\n{}").format(text, as_image(frames.figure(pictures.camera_axes), alt=alt, wide=True))
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt((values**2).sum(axis=1).mean()))

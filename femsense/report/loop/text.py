@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from femsense.loop.result.loop_result import NONE, Loop
+from femsense.loop.result.loop_result import Loop, Verdict
 from femsense.loop.result.records import (
     ConfoundedPair,
     CorrectionRecord,
@@ -38,7 +38,7 @@ def loop_text(loop: Loop) -> str:
     for title, said in (
         ("cannot be distinguished", ", ".join(" / ".join(pair.pair) for pair in open_pairs(loop))),
         ("not testable", ", ".join(map(_untestable, loop.not_testable))),
-        ("would have been seen", _seen(loop) if loop.verdict == NONE else ""),
+        ("would have been seen", _seen(loop) if loop.verdict == Verdict.NONE else ""),
         ("next experiment", loop.next_experiment),
     ):
         if said:

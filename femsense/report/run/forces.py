@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.report import words
 from femsense.report.bodies import Arrows, DrawnSurface, Key, Panel, best_view, body_figure, skin
 from femsense.report.drawing import INK, MANY, SERIES, add_legend, as_image, name_axes, new_axes, nice
@@ -138,7 +138,7 @@ def _surface_at(file: Path, frames: Sequence[FrameReport], number: int) -> Drawn
 
 def _draw_forces(surface: DrawnSurface, contacts: Sequence[ContactForce]) -> Any:
     largest = max(c.force_n for c in contacts)
-    scale = ARROW_SHARE * float(np.linalg.norm(np.ptp(surface.nodes, axis=0))) / max(largest, 1e-12)
+    scale = ARROW_SHARE * diagonal(surface.nodes) / max(largest, 1e-12)
     arrows = []
     for c in contacts:
         vector = scale * c.force_n_xyz

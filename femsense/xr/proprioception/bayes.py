@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.xr.proprioception.network import Network, sigmoid
+from femsense.xr.proprioception.network import Network, Units, sigmoid
 
 HIDDEN = 10
 """As in the paper."""
@@ -59,7 +59,9 @@ def train_bayesian(
     z = np.hstack([(x - centre) * scale, np.ones((len(x), 1))])
     weights = _minimise(z, (y - middle) / size, _start(z, y.shape[1], hidden, rng), steps)
     A, d = size * weights.out[:, :-1], middle + size * weights.out[:, -1]
-    return Network("sigmoid", centre, scale, weights.hidden[:, :-1], weights.hidden[:, -1], A, np.zeros((len(d), x.shape[1])), d)
+    return Network(
+        Units.SIGMOID, centre, scale, weights.hidden[:, :-1], weights.hidden[:, -1], A, np.zeros((len(d), x.shape[1])), d
+    )
 
 
 def _minimise(z: FloatArray, t: FloatArray, weights: _Weights, steps: int) -> _Weights:

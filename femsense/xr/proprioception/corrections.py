@@ -14,19 +14,18 @@ the maps that it selected had errors up to 1.47 times as large as the best one, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from femsense.calib.rigid import fit_rigid
-from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, spread_evenly
 from femsense.core.errors import DataError
 from femsense.core.pose import make_pose, transform_points
 from femsense.xr.proprioception.linear import train_ridge
-from femsense.xr.proprioception.network import Network
-from femsense.xr.proprioception.selection import marker_rms
-from femsense.xr.proprioception.spread import HeldOut, errors_of
+from femsense.xr.proprioception.network import Network, Units
+from femsense.xr.proprioception.selection import folds, marker_rms
+from femsense.xr.proprioception.spread import HeldOut, errors_of, marker_distances
 
 BLOCKS = 8
 """Number of blocks of labelled frames that are held out in turn. With four, one of them lacked information that a correction needs: on a day of a real arm,
@@ -73,14 +72,14 @@ class Frames:
     reach: FloatArray
     """How far each channel ranged when the model was learnt, shape (c,)."""
 
-    def select(self, rows: BoolArray) -> Frames:
+    def select(self, rows: BoolArray | IntArray) -> Frames:
         """Return some of the frames."""
         return replace(self, inputs=self.inputs[rows], targets=self.targets[rows])
 
     def errors(self, name: str) -> FloatArray:
         """Return the errors of a correction on blocks in time that it was not fitted to [m], shape (n, 3 m)."""
         errors = np.empty_like(self.targets)
-        for held in _blocks(len(self.targets)):
+        for held in folds(len(self.targets), BLOCKS):
             network = corrected(self.select(~held), name)
             errors[held] = network(self.inputs[held]) - self.targets[held]
         return errors
@@ -88,7 +87,7 @@ class Frames:
     def held_out(self, name: str) -> HeldOut:
         """Return the same errors with the predictive variance of the corrected networks."""
         found = []
-        for k, held in enumerate(_blocks(len(self.targets))):
+        for k, held in enumerate(folds(len(self.targets), BLOCKS)):
             known, other = self.select(~held), self.select(held)
             found.append(errors_of(corrected(known, name), known.inputs, other.inputs, other.targets, group=k))
         return HeldOut.joined(found)
@@ -98,7 +97,7 @@ def explain(frames: Frames) -> tuple[str, dict[str, float]]:
     """Return the correction that explains labelled frames, and the error of each on frames it was not fitted to [m]."""
     errors = {name: frames.errors(name) for name in CORRECTIONS}
     chosen = SIMPLE[0]
-    for name in (*SIMPLE[1:], min(LINEAR, key=lambda name: float(_distances(errors[name]).mean()))):
+    for name in (*SIMPLE[1:], min(LINEAR, key=lambda name: float(marker_distances(errors[name]).mean()))):
         if is_better(errors[name], errors[chosen]):
             chosen = name
     return chosen, {name: marker_rms(found) for name, found in errors.items()}
@@ -109,17 +108,12 @@ def is_better(errors: FloatArray, than: FloatArray, *, seed: int = 0) -> bool:
 
     Parts in time are drawn again and again (Künsch 1989), the same of both; in 95 of 100 drawings they have to be smaller.
     """
-    if _distances(errors).mean() >= BETTER * _distances(than).mean():
+    if marker_distances(errors).mean() >= BETTER * marker_distances(than).mean():
         return False
-    gained = (_distances(than) - _distances(errors)).sum(axis=1)
+    gained = (marker_distances(than) - marker_distances(errors)).sum(axis=1)
     parts = np.array([part.sum() for part in np.array_split(gained, min(RESAMPLED, len(gained)))])
     drawn = np.random.default_rng(seed).integers(len(parts), size=(RESAMPLES, len(parts)))
     return bool(np.quantile(parts[drawn].sum(axis=1), 0.05) > 0.0)
-
-
-def _distances(errors: FloatArray) -> FloatArray:
-    """Return the distance of each marker [m], shape (n, m), of errors, shape (n, 3 m)."""
-    return np.asarray(np.linalg.norm(errors.reshape(len(errors), -1, 3), axis=2))
 
 
 def corrected(frames: Frames, name: str) -> Network:
@@ -148,7 +142,7 @@ def shifts_of(frames: Frames, *, moved: bool = False) -> tuple[Shift, ...]:
     """
     from scipy.optimize import minimize_scalar
 
-    some = frames.select(np.isin(np.arange(len(frames.inputs)), np.linspace(0, len(frames.inputs) - 1, SCAN_ROWS).astype(int)))
+    some = frames.select(spread_evenly(len(frames.inputs), SCAN_ROWS))
     shares = np.linspace(-1.0, 1.0, 2 * SCANNED + 1)
     scans = [(*min((_left(some, Shift(i, s * wide), moved), s * wide) for s in shares), i) for i, wide in enumerate(frames.reach)]
     found = []
@@ -211,17 +205,11 @@ def _left(frames: Frames, shift: Shift, moved: bool) -> float:
     return marker_rms(_errors_without(frames, shift, moved))
 
 
-def _blocks(count: int) -> Iterator[BoolArray]:
-    block = np.arange(count) * BLOCKS // count
-    for number in range(BLOCKS):
-        yield block == number
-
-
 def _with_zeros(network: Network, inputs: FloatArray, targets: FloatArray) -> Network:
     """Return the network whose sensors have other zeros, found by Gauss–Newton steps with a prior."""
     noise = max(marker_rms(network(inputs) - targets) / 10.0, 1e-6)
     spread = np.where(network.scale > 0, 1.0 / np.where(network.scale > 0, network.scale, 1.0), 0.0)
-    if network.kind == "radial":
+    if network.units == Units.RADIAL:
         spread = spread * np.median(np.abs(network.normalised(inputs)))
     offset = np.zeros(len(spread))
     for _ in range(ZERO_STEPS):

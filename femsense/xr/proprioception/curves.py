@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.arrays import BoolArray, FloatArray, spread_evenly
 from femsense.xr.proprioception.linear import train_radial
 from femsense.xr.proprioception.network import Network
-from femsense.xr.proprioception.selection import MOST_ROWS, folds, thinned_rows
+from femsense.xr.proprioception.selection import MOST_ROWS, folds
 
 PENALTY, LENGTH, NOISE = 1e-4, 1.0, 1e-2
 """Of `train_radial`; half or twice the length and a tenth of the noise find as many contradictions."""
@@ -52,7 +52,7 @@ def learn_curves(z: FloatArray, lines: FloatArray) -> tuple[Curve, ...]:
         z: normalised readings in the order of time, shape (n, c).
         lines: how far off the straight line lets each channel be, shape (c,).
     """
-    rows = z[thinned_rows(len(z), MOST_ROWS)]
+    rows = z[spread_evenly(len(z), MOST_ROWS)]
     found = []
     moving = np.flatnonzero(np.ptp(z, axis=0) > 0).tolist()
     for i in moving:

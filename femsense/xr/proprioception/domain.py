@@ -11,6 +11,7 @@ is more accurate (`curves`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -29,31 +30,43 @@ SAME = 1e-12
 """A channel that moves by less, relative to its reading, does not move."""
 
 
+class Why(StrEnum):
+    """Why a row is outside of the training domain."""
+
+    RANGE = "range"
+    STILL = "still"
+    """The channel never moved while it was learnt."""
+    JOINT = "joint"
+    """Each channel is in its range, but not together."""
+    MISSING = "missing"
+    """No finite number."""
+    GAP = "gap"
+    """The row came too long after the one before for a model with a memory, `value` seconds."""
+
+
 @dataclass(frozen=True, slots=True)
 class Outside:
     """A channel outside of the training domain."""
 
     channel: str
-    kind: str
-    """"range", "still" (it never moved while it was learnt), "joint" (each channel is in its range, but not together),
-    "missing" (no finite number), or "gap": the row came too long after the one before for a model with a memory, `value` seconds."""
+    kind: Why
     value: float
     low: float
     high: float
-    """Its training range; for "joint", the interval predicted from the other channels."""
+    """Its training range; for `Why.JOINT`, the interval predicted from the other channels."""
     far: float
     """Distance from the interval in units of its width; infinite without a finite reading."""
 
     @property
     def text(self) -> str:
         """The message to the user, one line."""
-        if self.kind == "missing":
+        if self.kind is Why.MISSING:
             return f"{self.channel}: no number"
-        if self.kind == "gap":
+        if self.kind is Why.GAP:
             return f"{self.value:.2g} s after the row before: the model remembers what came before, and needs a row every {self.high:.2g} s"
-        if self.kind == "still":
+        if self.kind is Why.STILL:
             return f"{self.channel} = {self.value:.4g}, but it never moved while it was learnt: it stood at {self.low:.4g}"
-        seen = "learnt" if self.kind == "range" else "expected from the other channels"
+        seen = "learnt" if self.kind is Why.RANGE else "expected from the other channels"
         return (
             f"{self.channel} = {self.value:.4g} is outside {self.low:.4g} … {self.high:.4g} ({seen}), by {self.far:.2g} "
             f"times that width"
@@ -83,7 +96,7 @@ class Domain:
         Channels that are not `needed`, shape (c,), and have no finite reading are ignored, and the others are judged without them.
         """
         lost = ~np.isfinite(row) & (True if needed is None else needed)
-        missing = [Outside(channels[i], "missing", float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost)]
+        missing = [Outside(channels[i], Why.MISSING, float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost)]
         if missing:
             return tuple(missing)
         found = self._range(row, channels) or self._joint(row, channels)
@@ -130,7 +143,7 @@ class Domain:
         return [
             Outside(
                 channels[i],
-                "range" if np.isfinite(far[i]) else "still",
+                Why.RANGE if np.isfinite(far[i]) else Why.STILL,
                 float(row[i]),
                 float(self.low[i]),
                 float(self.high[i]),
@@ -153,7 +166,7 @@ class Domain:
             if far > (found[i].far if i in found else 0.0):
                 expected, width = row[i] - off / self.scale[i], half / self.scale[i]
                 found[i] = Outside(
-                    channels[i], "joint", float(row[i]), float(expected - width), float(expected + width), float(far)
+                    channels[i], Why.JOINT, float(row[i]), float(expected - width), float(expected + width), float(far)
                 )
         return list(found.values())
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import DataError, InputError
 from femsense.model.marker_units import FARTHEST, doubt_of_size, span
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
@@ -21,19 +21,17 @@ from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
 from femsense.xr.proprioception.selection import (
     MEMORIES,
     MOST_ROWS,
+    Kind,
     Progress,
     compare_plans,
     marker_rms,
     rows_kept,
     simplest_good,
-    thinned_rows,
     train,
 )
 from femsense.xr.proprioception.spread import coverage, growth, held_out, make_spread
 
-KINDS = ("ridge", "radial", "network", "mlp")
-"""In the order of simplicity."""
-NEEDED = {"mlp": "sklearn"}
+NEEDED = {Kind.MLP: "sklearn"}
 """Kinds that need a package of the extra `learn`."""
 FEWEST_ROWS = 60
 TRAINED_ROWS = 3000
@@ -53,7 +51,7 @@ DISTINCT = 20
 class LearnOptions:
     """Problems of the data."""
 
-    kinds: tuple[str, ...] = KINDS
+    kinds: tuple[Kind, ...] = tuple(Kind)
     """Maps that are tried, simple ones first."""
     memories: tuple[tuple[float, ...], ...] = MEMORIES
     """Candidate time constants [s] of filters in addition to the readings; ((),): none."""
@@ -87,12 +85,12 @@ def learn(
     check_frame(data.frame, data.frame if test is None else test.frame)
     held = rows_kept(len(data))
     work, kept = data.select(~held), data.select(held)
-    kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
+    kinds = tuple(Kind(kind) for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
     memories = tuple(taus for taus in options.memories if data.spacing_s <= longest_gap(taus)) or ((),)
     compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
     chosen = simplest_good(compared)
     chain = _chain(data.markers[options.rest_row], options.bones)
-    rows = thinned_rows(len(work), TRAINED_ROWS)
+    rows = spread_evenly(len(work), TRAINED_ROWS)
     networks = {
         item.plan.kind: train(item.plan, work.inputs(item.plan.memory_s)[rows], work.targets[rows], options.seed)
         for item in compared
@@ -108,7 +106,7 @@ def learn(
         }
     network, plan = networks[chosen.plan.kind], chosen.plan
     inputs = kept.inputs(plan.memory_s)
-    some = thinned_rows(len(work), MOST_ROWS)
+    some = spread_evenly(len(work), MOST_ROWS)
     out = held_out(
         lambda x, y: train(plan, x, y, options.seed), work.inputs(plan.memory_s)[some], work.targets[some], work.part[some]
     )
@@ -134,7 +132,7 @@ def learn(
     }
     bones = None
     if options.end_to_end and chain is not None:
-        some = thinned_rows(len(work), BONE_ROWS)
+        some = spread_evenly(len(work), BONE_ROWS)
         wanted = np.array([bone_numbers(chain(markers)) for markers in work.markers[some]])
         bones = train_bayesian(work.inputs(plan.memory_s)[some], wanted, rng=np.random.default_rng(options.seed))
         report["bones_mm"] = _bone_error(bones(inputs), chain, kept)
@@ -217,8 +215,8 @@ def _check(data: Labelled, options: LearnOptions) -> None:
         if span(data.markers) > FARTHEST:
             raise DataError(f"{doubt}\n  try:      x_m, y_m and z_m in metres")
         warnings.warn(doubt, stacklevel=3)
-    if not options.kinds or not set(options.kinds) <= set(KINDS):
-        raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(KINDS))
+    if not options.kinds or not set(options.kinds) <= set(Kind):
+        raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(Kind))
     if len(data) < FEWEST_ROWS:
         raise DataError(
             f"{len(data)} rows have readings and all markers; at least {FEWEST_ROWS} are needed to learn and to hold some out"

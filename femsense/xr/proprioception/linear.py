@@ -11,7 +11,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.xr.proprioception.bayes import inverse_spread
-from femsense.xr.proprioception.network import Network, linear_network
+from femsense.xr.proprioception.network import Network, Units, linear_network
 
 CENTRES = 200
 JITTER = 1e-9
@@ -40,7 +40,7 @@ def train_radial(x: FloatArray, y: FloatArray, *, penalty: float, length: float,
     z = np.asarray(line.normalised(x) * narrow)
     centres = np.asarray(z[:: -(-len(z) // CENTRES)])
     net = Network(
-        "radial",
+        Units.RADIAL,
         line.centre,
         np.asarray(line.scale * narrow),
         centres,
@@ -52,4 +52,4 @@ def train_radial(x: FloatArray, y: FloatArray, *, penalty: float, length: float,
     phi, K = net.hidden(z), net.hidden(centres)
     system = phi.T @ phi + noise * K + JITTER * len(z) * np.eye(len(K))
     A = np.asarray(np.linalg.solve(system, phi.T @ (y - line(x))).T, dtype=np.float64)
-    return Network("radial", net.centre, net.scale, centres, net.b, A, net.C, net.d)
+    return Network(Units.RADIAL, net.centre, net.scale, centres, net.b, A, net.C, net.d)

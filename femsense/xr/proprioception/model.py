@@ -11,7 +11,7 @@ import numpy.typing as npt
 from femsense.core.arrays import BoolArray, FloatArray, as_numbers
 from femsense.core.errors import InputError
 from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
-from femsense.xr.proprioception.domain import Domain, Outside
+from femsense.xr.proprioception.domain import Domain, Outside, Why
 from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.memory import longest_gap, step_memory, with_memory
 from femsense.xr.proprioception.network import Network
@@ -46,7 +46,7 @@ class ProprioceptiveModel:
         error = self.report.get("error_mm")
         stated = f", {error:.2g} mm on held-out blocks" if isinstance(error, float) else ""
         return (
-            f"ProprioceptiveModel({len(self.channels)} channels → {len(self.marker_names)} markers, {self.network.kind}{stated})"
+            f"ProprioceptiveModel({len(self.channels)} channels → {len(self.marker_names)} markers, {self.network.units}{stated})"
         )
 
     def markers(self, rows: npt.ArrayLike, time_s: npt.ArrayLike | None = None) -> FloatArray:
@@ -188,7 +188,7 @@ class LiveModel:
             gap, longest = time_s - self._time_s, longest_gap(model.memory_s)
             past = step_memory(self._memory, self._row, x, gap, taus)
             if gap > longest:
-                outside += (Outside("time_s", "gap", gap, 0.0, longest, gap / longest - 1.0),)
+                outside += (Outside("time_s", Why.GAP, gap, 0.0, longest, gap / longest - 1.0),)
         self._memory, self._row, self._time_s = past, x, time_s
         inputs = np.concatenate([x, past.ravel()])[None]
         markers = model.network(inputs).reshape(-1, 3)

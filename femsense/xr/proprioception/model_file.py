@@ -23,8 +23,8 @@ from femsense.xr.proprioception.curves import Curve
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import AS_MEASURED
 from femsense.xr.proprioception.model import ProprioceptiveModel
-from femsense.xr.proprioception.network import KINDS, Network
-from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, read_onnx, write_onnx
+from femsense.xr.proprioception.network import Network, Units
+from femsense.xr.proprioception.onnx_file import network_nodes, read_onnx, write_onnx
 from femsense.xr.proprioception.spread import Spread
 
 FORMAT = "femsense-proprioception-1"
@@ -40,6 +40,8 @@ CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
     """Write a model as an ONNX file and return its path. Raises InputError if a foreign file exists there."""
+    from onnx.helper import make_node
+
     check_target(path, folder=False, kind=MODEL)
     width = len(model.channels)
     inputs = {"readings": width}
@@ -47,19 +49,19 @@ def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
     source = "readings"
     if model.memory_s:
         inputs["filtered"] = width * len(model.memory_s)
-        nodes.append(Node("Concat", ("readings", "filtered"), "inputs", {"axis": 1}))
+        nodes.append(make_node("Concat", ["readings", "filtered"], ["inputs"], axis=1))
         source = "inputs"
     networks = {"markers": model.network} | ({"bones": model.bones} if model.bones is not None else {})
     numbers: dict[str, npt.NDArray[np.float32]] = {}
     for name, network in networks.items():
-        found, constants = network_nodes(name, network.kind, source)
+        found, constants = network_nodes(name, network.units, source)
         nodes += found
         stored = _stored(network)
         numbers |= {f"{name}.{key}": stored[key] for key in constants}
     outputs = {name: len(network.d) for name, network in networks.items()}
-    target = Path(path)
-    write_onnx(target, Graph(tuple(nodes), inputs, outputs, numbers), {KEY: json_text(_document(model, networks), indent=None)})
-    return target
+    text = {KEY: json_text(_document(model, networks), indent=None)}
+    write_onnx(path, nodes, numbers, inputs=inputs, outputs=outputs, text=text)
+    return Path(path)
 
 
 def load_model(path: str | Path) -> ProprioceptiveModel:
@@ -101,7 +103,7 @@ def _chain(chain: dict[str, Any]) -> Armature:
 def _domain(table: dict[str, Any]) -> Domain:
     """Return a domain; files of older versions hold no curves."""
     curves = (
-        Curve(row["channel"], Network("radial", *(freeze(row[key]) for key in NUMBERS)), row["half"])
+        Curve(row["channel"], Network(Units.RADIAL, *(freeze(row[key]) for key in NUMBERS)), row["half"])
         for row in table.get("curves", ())
     )
     low, high, centre, scale, precision, limit = (freeze(table[key]) for key in DOMAIN)
@@ -124,7 +126,7 @@ def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[
         "frame": model.frame,
         "memory_s": model.memory_s,
         "filters": FILTERS,
-        "networks": {name: network.kind for name, network in networks.items()},
+        "networks": {name: network.units for name, network in networks.items()},
         "domain": _domain_table(model.domain),
         "chain": None
         if chain is None
@@ -151,14 +153,14 @@ def _spread(table: dict[str, Any] | None) -> Spread | None:
 def _stored(network: Network) -> dict[str, npt.NDArray[np.float32]]:
     """Return the constants of a graph. Of radial units: −½ |z − B|² = z·B − ½ |B|² − ½ |z|²."""
     numbers = {key: getattr(network, key) for key in NUMBERS}
-    if network.kind == "radial":
+    if network.units == Units.RADIAL:
         numbers |= {"b": -0.5 * (network.B**2).sum(axis=1), "half": np.full((len(network.centre), 1), -0.5)}
     return {key: np.asarray(array.T if key in TURNED else array, dtype=np.float32) for key, array in numbers.items()}
 
 
 def _network(name: str, kind: str, numbers: dict[str, npt.NDArray[np.float32]]) -> Network:
-    if kind not in KINDS:
-        raise InputError("unknown kind of network", where=name, found=kind, expected=" | ".join(KINDS))
+    if kind not in list(Units):
+        raise InputError("unknown kind of network", where=name, found=kind, expected=" | ".join(Units))
     wide, high = len(numbers[f"{name}.centre"]), len(numbers[f"{name}.d"])
     none = {"B": np.zeros((wide, 0)), "b": np.zeros(0), "A": np.zeros((0, high))}
 
@@ -168,4 +170,4 @@ def _network(name: str, kind: str, numbers: dict[str, npt.NDArray[np.float32]]) 
             raise InputError("a constant is missing", where=f"{name}.{key}")
         return freeze(stored.T if key in TURNED else stored)
 
-    return Network(kind, *(array(key) for key in NUMBERS))
+    return Network(Units(kind), *(array(key) for key in NUMBERS))

@@ -7,20 +7,28 @@ y = A φ(z) + C z + d,   z = scale · (x − centre)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray
 
-KINDS = ("linear", "sigmoid", "relu", "radial")
+
+class Units(StrEnum):
+    """The hidden units of a network."""
+
+    LINEAR = "linear"
+    """None."""
+    SIGMOID = "sigmoid"
+    RELU = "relu"
+    RADIAL = "radial"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Network:
     """A map from inputs, shape (n, d), to outputs, shape (n, o)."""
 
-    kind: str
-    """One of `KINDS`."""
+    units: Units
     centre: FloatArray
     """shape (d,), in the units of the inputs."""
     scale: FloatArray
@@ -47,15 +55,15 @@ class Network:
 
     def hidden(self, z: FloatArray) -> FloatArray:
         """Return the hidden units of normalised inputs, shape (n, h)."""
-        if self.kind == "radial":
+        if self.units == Units.RADIAL:
             return np.asarray(np.exp(-0.5 * squared_distances(z, self.B)))
         a = z @ self.B.T + self.b
-        return np.maximum(a, 0.0) if self.kind == "relu" else sigmoid(a)
+        return np.maximum(a, 0.0) if self.units == Units.RELU else sigmoid(a)
 
     @property
     def uses(self) -> BoolArray:
         """Which inputs the output depends on, shape (d,): constant inputs have no scale, excluded ones no weight."""
-        hidden = np.ones(len(self.scale), dtype=bool) if self.kind == "radial" else (self.B != 0).any(axis=0)
+        hidden = np.ones(len(self.scale), dtype=bool) if self.units == Units.RADIAL else (self.B != 0).any(axis=0)
         return np.asarray((self.scale != 0) & ((self.C != 0).any(axis=0) | (hidden & bool(self.A.any()))))
 
     def followed_by(self, M: FloatArray, shift: FloatArray) -> Network:
@@ -69,7 +77,7 @@ class Network:
 
 def linear_network(centre: FloatArray, scale: FloatArray, C: FloatArray, d: FloatArray) -> Network:
     """Return a network without hidden units."""
-    return Network("linear", centre, scale, np.zeros((0, C.shape[1])), np.zeros(0), np.zeros((len(C), 0)), C, d)
+    return Network(Units.LINEAR, centre, scale, np.zeros((0, C.shape[1])), np.zeros(0), np.zeros((len(C), 0)), C, d)
 
 
 def sigmoid(x: FloatArray) -> FloatArray:

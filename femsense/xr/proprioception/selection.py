@@ -10,15 +10,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from enum import StrEnum
 from itertools import product
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, rms, spread_evenly
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.labelled import Labelled
 from femsense.xr.proprioception.linear import train_radial, train_ridge
-from femsense.xr.proprioception.network import Network
+from femsense.xr.proprioception.network import Network, Units
 
 FOLDS = 6
 TEST_BLOCKS, TEST_EVERY, TEST_FIRST = 20, 7, 3
@@ -34,17 +35,28 @@ MLP_UNITS, MLP_MEMBERS = 10, 5
 """Units of each small network, and how many networks make a committee."""
 MLP_DECAY = 1.0
 """Weight decay, as scikit-learn counts it."""
-CHEAP = {"ridge", "radial"}
 Progress = Callable[[int, int], None]
 """Called with (steps done, all steps)."""
+
+
+class Kind(StrEnum):
+    """Maps, in the order of simplicity."""
+
+    RIDGE = "ridge"
+    RADIAL = "radial"
+    NETWORK = "network"
+    """The paper's."""
+    MLP = "mlp"
+
+
+CHEAP = {Kind.RIDGE, Kind.RADIAL}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
     """One map before it is trained."""
 
-    kind: str
-    """"ridge", "radial", "network" (the paper's) or "mlp"."""
+    kind: Kind
     memory_s: tuple[float, ...]
     used: BoolArray
     """Channels that it takes, shape (c,)."""
@@ -74,21 +86,16 @@ def rows_kept(count: int) -> BoolArray:
     return np.asarray(block % TEST_EVERY == TEST_FIRST)
 
 
-def folds(count: int) -> Iterator[BoolArray]:
-    """Yield which rows are held out, one block in time after the other, shape (count,)."""
-    block = np.arange(count) * FOLDS // max(count, 1)
-    for number in range(FOLDS):
-        yield block == number
-
-
-def thinned_rows(count: int, most: int) -> IntArray:
-    """Return at most `most` rows, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+def folds(count: int, number: int = FOLDS) -> Iterator[BoolArray]:
+    """Yield which rows are held out, one of `number` blocks in time after the other, shape (count,)."""
+    block = np.arange(count) * number // max(count, 1)
+    for held in range(number):
+        yield block == held
 
 
 def compare_plans(
     data: Labelled,
-    kinds: tuple[str, ...],
+    kinds: tuple[Kind, ...],
     memories: tuple[tuple[float, ...], ...],
     *,
     seed: int,
@@ -98,17 +105,17 @@ def compare_plans(
 
     Memory and channels are chosen with ridge and radial maps, which cost little; the networks follow their choice.
     """
-    rows = thinned_rows(len(data), MOST_ROWS)
+    rows = spread_evenly(len(data), MOST_ROWS)
     targets = data.targets[rows]
     inputs = {taus: data.inputs(taus)[rows] for taus in ((), *memories)}
     everything = np.ones(len(data.channels), dtype=bool)
     sets = {tuple(used): used for used in (everything, _needed(inputs[()], targets))}
-    best: dict[str, Compared] = {}
+    best: dict[Kind, Compared] = {}
     jobs = list(product(memories, sets.values()))
     for done, (taus, used) in enumerate(jobs):
         if progress is not None:
             progress(done, len(jobs))
-        for plan in _cheap_plans(taus, used, kinds if CHEAP & set(kinds) else ("ridge",)):
+        for plan in _cheap_plans(taus, used, kinds if CHEAP & set(kinds) else (Kind.RIDGE,)):
             _keep(best, compare_plan(plan, inputs[taus], targets, seed))
     if not set(kinds) <= CHEAP:
         _keep_networks(best, kinds, lambda plan: compare_plan(plan, inputs[plan.memory_s], targets, seed), progress)
@@ -137,11 +144,11 @@ def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Net
     also those it does not use."""
     columns, rng, numbers = plan.columns, np.random.default_rng(seed), plan.numbers
     x = inputs[:, columns]
-    if plan.kind == "ridge":
+    if plan.kind is Kind.RIDGE:
         network = train_ridge(x, targets, penalty=numbers["penalty"])
-    elif plan.kind == "radial":
+    elif plan.kind is Kind.RADIAL:
         network = train_radial(x, targets, penalty=numbers["penalty"], length=numbers["length"], noise=numbers["noise"])
-    elif plan.kind == "network":
+    elif plan.kind is Kind.NETWORK:
         network = train_bayesian(x, targets, rng=rng)
     else:
         network = train_mlp(x, targets, seed=seed)
@@ -171,24 +178,24 @@ def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
     second = np.concatenate([m.coefs_[1].T.reshape(y.shape[1], -1) for m in members], axis=1)
     d = np.mean([m.intercepts_[1] for m in members], axis=0)
     share = size / MLP_MEMBERS
-    return Network("relu", line.centre, line.scale, first, b, share * second, line.C, line.d + size * d)
+    return Network(Units.RELU, line.centre, line.scale, first, b, share * second, line.C, line.d + size * d)
 
 
 def marker_rms(errors: FloatArray) -> float:
     """Return the root mean square distance of markers [m] of errors, shape (n, 3 m)."""
-    return float(np.sqrt((errors.reshape(len(errors), -1, 3) ** 2).sum(axis=2).mean()))
+    return rms(errors.reshape(len(errors), -1, 3))
 
 
-def _cheap_plans(taus: tuple[float, ...], used: BoolArray, kinds: tuple[str, ...]) -> Iterator[Plan]:
-    if "ridge" in kinds:
+def _cheap_plans(taus: tuple[float, ...], used: BoolArray, kinds: tuple[Kind, ...]) -> Iterator[Plan]:
+    if Kind.RIDGE in kinds:
         for penalty in PENALTIES:
-            yield Plan("ridge", taus, used, {"penalty": penalty})
-    if "radial" in kinds:
+            yield Plan(Kind.RIDGE, taus, used, {"penalty": penalty})
+    if Kind.RADIAL in kinds:
         for length, noise in product(LENGTHS, NOISES):
-            yield Plan("radial", taus, used, {"penalty": PENALTIES[1], "length": length, "noise": noise})
+            yield Plan(Kind.RADIAL, taus, used, {"penalty": PENALTIES[1], "length": length, "noise": noise})
 
 
-def _keep(best: dict[str, Compared], found: Compared) -> None:
+def _keep(best: dict[Kind, Compared], found: Compared) -> None:
     """Keep the better one of a kind; a memory or another set of channels must bring `GAIN`."""
     before = best.get(found.plan.kind)
     if before is None:
@@ -200,16 +207,15 @@ def _keep(best: dict[str, Compared], found: Compared) -> None:
 
 
 def _keep_networks(
-    best: dict[str, Compared], kinds: tuple[str, ...], compare: Callable[[Plan], Compared], progress: Progress | None
+    best: dict[Kind, Compared], kinds: tuple[Kind, ...], compare: Callable[[Plan], Compared], progress: Progress | None
 ) -> None:
     leader = min(best.values(), key=lambda item: item.rms).plan
-    settings = {(leader.memory_s, tuple(leader.used)): leader, ((), tuple(leader.used)): Plan("", (), leader.used)}
-    jobs = list(product((kind for kind in kinds if kind in ("network", "mlp")), settings.values()))
-    for done, (kind, like) in enumerate(jobs):
+    memories = dict.fromkeys((leader.memory_s, ()))
+    jobs = list(product((kind for kind in kinds if kind not in CHEAP), memories))
+    for done, (kind, taus) in enumerate(jobs):
         if progress is not None:
             progress(done, len(jobs))
-        plan = Plan(kind, like.memory_s, like.used)
-        _keep(best, compare(plan))
+        _keep(best, compare(Plan(kind, taus, leader.used)))
 
 
 def _needed(x: FloatArray, targets: FloatArray) -> BoolArray:
@@ -221,7 +227,7 @@ def _needed(x: FloatArray, targets: FloatArray) -> BoolArray:
     """
 
     def error(used: BoolArray) -> float:
-        return compare_plan(Plan("ridge", (), used, {"penalty": PENALTIES[1]}), x, targets, 0).rms
+        return compare_plan(Plan(Kind.RIDGE, (), used, {"penalty": PENALTIES[1]}), x, targets, 0).rms
 
     starts = (np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1], dtype=bool))
     return min((_one_by_one(used, error) for used in starts), key=error)
@@ -248,4 +254,4 @@ def _widened(network: Network, columns: BoolArray) -> Network:
     centre[columns], scale[columns] = network.centre, network.scale
     B, C = np.zeros((len(network.B), wide)), np.zeros((len(network.d), wide))
     B[:, columns], C[:, columns] = network.B, network.C
-    return Network(network.kind, centre, scale, B, network.b, network.A, C, network.d)
+    return Network(network.units, centre, scale, B, network.b, network.A, C, network.d)

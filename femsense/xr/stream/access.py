@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hmac
 import ipaddress
+import os
 import secrets
 import socket
 import ssl
@@ -16,6 +17,9 @@ from femsense.core.errors import InputError
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 COOKIE = "femsense"
+PASSWORD = "FEMSENSE_PASSWORD"
+"""Environment variable that may hold the password."""
+PASSWORD_WAYS = f"--password-file FILE, or the variable {PASSWORD}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +43,7 @@ class Access:
                 where="--host",
                 found=self.host,
                 expected="a password, or 127.0.0.1",
-                hint="--password-file FILE, or the variable FEMSENSE_PASSWORD",
+                hint=PASSWORD_WAYS,
             )
         if self.key is not None and self.certificate is None:
             raise InputError("a key without its certificate", where="--key", hint="--certificate FILE")
@@ -104,10 +108,10 @@ def same_origin(origin: str | None, host: str | None) -> bool:
     return origin is None or origin.partition("://")[2] == (host or "")
 
 
-def read_password(file: Path | None, environment: str | None) -> str | None:
-    """Return the first line of a file, else the variable's value, else None. Raises InputError."""
+def read_password(file: Path | None) -> str | None:
+    """Return the first line of a file, else the value of the variable PASSWORD, else None. Raises InputError."""
     if file is None:
-        return environment or None
+        return os.environ.get(PASSWORD) or None
     try:
         password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
     except (OSError, UnicodeDecodeError) as error:

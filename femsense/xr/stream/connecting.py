@@ -5,8 +5,9 @@ from __future__ import annotations
 import socket
 import ssl
 
+from femsense.xr.stream.access import PASSWORD_WAYS
+
 NO_ANSWER = "no answer"
-PASSWORD_WAYS = "--password-file FILE, or the variable FEMSENSE_PASSWORD"
 NO_TLS = "nothing is encrypted there: the address without the s (http://, mqtt://)"
 NO_STREAM = "the server there is not a femsense stream, or is encrypted (https://)"
 NO_BROKER = "the server there is not a broker, or is encrypted (mqtts://)"

@@ -19,7 +19,7 @@ from femsense.calib.calibration import Calibration
 from femsense.control.follow import Follower
 from femsense.control.motion import CONVERGING, REACHED, STOPPED, Motion
 from femsense.control.search import ReachOptions
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.fem.mesh import embed_points
 from femsense.model.robot import Robot
 from femsense.xr.skinning import Skin, prepare_poses
@@ -114,7 +114,7 @@ class DragServer:
             options=ReachOptions(tolerance_m=self.options.tolerance_m),
         )
         self._skin, self._fit = embed_points(robot.body.mesh, skin.rest), prepare_poses(skin)
-        self._size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+        self._size = diagonal(robot.body.mesh.nodes)
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, diagonal, freeze
 from femsense.core.errors import FemsenseError
 from femsense.xr.glb_reader import AnimatedSkin, read_glb
 from femsense.xr.landmarks import landmarks_of_run
@@ -252,7 +252,7 @@ def with_residuals(points: FloatArray, nodes: npt.ArrayLike, tets: npt.ArrayLike
     from femsense.pointcloud.rays import Surface
 
     mesh = TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets))
-    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    size = diagonal(mesh.nodes)
     reach = CLOUD_REACH * size
     inside = ((points > mesh.nodes.min(axis=0) - reach) & (points < mesh.nodes.max(axis=0) + reach)).all(axis=1)
     some = points[inside]

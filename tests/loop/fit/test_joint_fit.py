@@ -13,9 +13,9 @@ from fitted_arm import NOISE, fitted_arm
 from femsense.core.errors import DataError
 from femsense.core.least_squares import GaussNewtonOptions, gauss_newton
 from femsense.loop.data.trial import Trial
+from femsense.loop.fit.fitted_model import with_term
 from femsense.loop.fit.joint_fit import Jets, JointProblem, nearby_start
 from femsense.loop.fit.noise_components import whiten
-from femsense.loop.search.refit import with_term
 from femsense.model.effects import find_effect
 from femsense.model.observation import SceneJet
 

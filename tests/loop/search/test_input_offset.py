@@ -9,7 +9,7 @@ from arm import arm, record
 from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.search_state import OffsetAlternative
+from femsense.loop.search.search_state import OffsetAlternative, Setting
 from femsense.loop.search.swaps import instead_of_offsets
 from femsense.model.robot import Robot
 
@@ -26,7 +26,7 @@ def asked(
     data = prepare(robot, [record(inputs, truth=truth, noise=3e-4, **changes)[0]], [])
     hypothesis, prior = with_nuisance(data)
     full = fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
-    return instead_of_offsets(data, full, tried, NOISE, 200.0, lambda text: None)
+    return instead_of_offsets(Setting(data, NOISE, 200.0, lambda text: None), full, tried)
 
 
 def test_weight_on_one_mount_takes_the_place_of_zeros_that_moved():

@@ -22,6 +22,7 @@ from femsense.loop.search.forward_selection import select_next
 from femsense.loop.search.location_search import climbed, closer, located, may_lie_elsewhere, same_place, without_term
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import Candidate, screen, screen_model
+from femsense.loop.search.search_state import Setting
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import find_effect
@@ -60,7 +61,7 @@ def test_another_form_of_an_effect_is_held_against_other_effects_alone(started: 
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["payload", "cable_gain"]), COUNT)
     one, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
     forms = [replace(one, score=100.0), replace(one, effect=replace(one.effect), score=100.0), replace(gain, score=50.0)]
-    _, records = select_next(data, fitted, forms, NOISE, lambda text: None)
+    _, records = select_next(Setting(data, NOISE, COUNT, lambda text: None), fitted, forms)
     assert [r.name for r in records] == ["payload", "payload", "cable_gain"]
     assert "stopped early" not in records[1].verdict and records[2].verdict.startswith("stopped early")
 
@@ -129,7 +130,7 @@ def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is()
     assert not may_lie_elsewhere(data, right, "payload", NOISE)
     history = [("", base), ("payload", wrong), ("cable_gain", right)]
     named, said = RefitRecord("payload", {}, NAMED, step=1, dbic=1000.0), list[str]()
-    assert swapped(data, history, [named], NOISE, COUNT, said.append) == (history, [named])
+    assert swapped(Setting(data, NOISE, COUNT, said.append), history, [named]) == (history, [named])
     assert not any("in the place" in text for text in said)
 
 
@@ -153,7 +154,7 @@ def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(started: tup
     both = refit(data, beside, far, NOISE)
     found = [("", fitted), ("cable_gain", beside), ("payload", both)]
     dear = np.inf if needless else 1.0  # what each number of an effect costs
-    left = swapped(data, found, [], NOISE, dear, lambda text: None)[0][-1][1]
+    left = swapped(Setting(data, NOISE, dear, lambda text: None), found, [])[0][-1][1]
     if not needless:
         assert left is both
         return

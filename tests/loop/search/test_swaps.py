@@ -20,11 +20,11 @@ from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, held_share
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
-from femsense.loop.search.location_search import closer, without_last
+from femsense.loop.search.location_search import closer, without_term
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
 from femsense.loop.search.search import scored, search_effects
-from femsense.loop.search.search_state import Refit, SearchProgress
+from femsense.loop.search.search_state import Refit, SearchProgress, Setting
 from femsense.loop.search.swaps import predicts_worse, swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import find_effect
@@ -49,6 +49,10 @@ def started() -> tuple[Data, FittedModel]:
     return data, fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
 
 
+def set_in(data: Data) -> Setting:
+    return Setting(data, NOISE, COUNT, lambda text: None)
+
+
 def added(data: Data, fitted: FittedModel, name: str, step: int) -> tuple[FittedModel, RefitRecord]:
     """Return a fitted model with one more effect, rightly or not, and its record."""
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, [name]), COUNT)
@@ -63,9 +67,7 @@ def test_a_rival_that_is_right_takes_the_place_of_what_was_named_first():
     first, wrong = added(data, base, "gravity", 1)
     second, right = added(data, first, "cable_gain", 2)
     rival = replace(wrong, name="payload", verdict=PASSES)
-    history, refits = swapped(
-        data, [("", base), ("gravity", first), ("cable_gain", second)], [wrong, rival, right], NOISE, COUNT, lambda text: None
-    )
+    history, refits = swapped(set_in(data), [("", base), ("gravity", first), ("cable_gain", second)], [wrong, rival, right])
     assert [name for name, _ in history] == ["", "cable_gain", "payload"]
     assert history[-1][1].fit.chi2 < second.fit.chi2
     assert set(history[1][1].fit.hypothesis.names) == {"stiffness", "cable_offset", "cable_gain"}
@@ -79,7 +81,7 @@ def test_what_is_right_keeps_its_place():
     second, other = added(data, first, "cable_gain", 2)
     rival = replace(right, name="gravity", verdict=PASSES)
     before = [("", base), ("payload", first), ("cable_gain", second)]
-    history, refits = swapped(data, before, [right, rival, other], NOISE, COUNT, lambda text: None)
+    history, refits = swapped(set_in(data), before, [right, rival, other])
     assert {name for name, _ in history} == {"", "payload", "cable_gain"}  # perhaps at a better place
     assert history[-1][1].fit.chi2 <= second.fit.chi2
     assert not any(r.is_named for r in refits if r.name == "gravity")
@@ -140,7 +142,7 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
     far = max(table[:6], key=lambda c: np.linalg.norm(np.subtract(c.seed["point_m"], HIDDEN[0]["point_m"])))
     made = refit(data, base, far, NOISE)
     rough = acceptance_test(data, base, far, made, RECORD, NOISE)
-    better = polished(data, base, rough, NOISE, lambda text: None)
+    better = polished(set_in(data), base, rough)
     gained = evidence(base.fit, better.fitted.fit) - evidence(base.fit, made.fit)
     assert better.score == pytest.approx(evidence(base.fit, better.fitted.fit) - far.cost) and gained > 10.0
     assert abs(gained - (made.fit.chi2 - better.fitted.fit.chi2)) > 1.0  # noise is larger than thought
@@ -152,7 +154,7 @@ def test_effects_without_near_rivals_are_not_asked_again():
     second, other = added(data, first, "cable_gain", 2)
     rival = replace(own, name="payload", verdict=PASSES, dbic=0.1 * own.evidence - 20.0)
     before = [("", base), ("gravity", first), ("cable_gain", second)]
-    history, refits = swapped(data, before, [own, rival, other], NOISE, COUNT, lambda text: None)
+    history, refits = swapped(set_in(data), before, [own, rival, other])
     assert history is before and len(refits) == 3
 
 
@@ -228,12 +230,12 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
     far = max(table[:6], key=lambda c: np.linalg.norm(np.subtract(c.seed["point_m"], HIDDEN[0]["point_m"])))
     rough = acceptance_test(data, base, far, refit(data, base, far, NOISE), RECORD, NOISE)
-    end = polished(data, base, rough, NOISE, lambda text: None)
+    end = polished(set_in(data), base, rough)
     there = acceptance_test(data, base, far, end.fitted, RECORD, NOISE)
     held = [r.record.held_dchi2 / r.record.dchi2 / held_share(data) for r in (rough, there)]
     for wanted, found in ((0.5 * (held[0] + held[1]), True), (2.0 * max(held), False)):
         own = replace(data, thresholds=replace(DEFAULTS, held_gain=wanted, significant=0.0))
-        winner, records = select_next(own, base, [far], NOISE, lambda text: None)
+        winner, records = select_next(set_in(own), base, [far])
         assert (winner is not None) == found and records[0].is_named == found
 
 
@@ -270,13 +272,13 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
         c for c in table if len(c.parameters) == 3 and np.linalg.norm(np.subtract(c.seed["point_m"], hidden["point_m"])) > 0.012
     )
     fitted = refit(data, base, candidate, NOISE)
-    alone = without_last(fitted.fit)
+    alone = without_term(fitted.fit, -1)
     back = alone.fit.residual + np.asarray(fitted.fit.fit.jacobian)[:, -3:] @ fitted.fit.coordinates[-3:]
     np.testing.assert_allclose(back, fitted.fit.fit.residual, atol=1e-9)
     moved, scatter = closer(data, fitted, NOISE)
     assert np.linalg.norm(np.subtract(moved.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
     assert moved.fit.chi2 < 0.5 * fitted.fit.chi2 and np.all(np.array(scatter) < 0.2)
-    whole = polished(data, base, Refit(candidate, fitted, 0.0, RECORD), NOISE, lambda text: None).fitted
+    whole = polished(set_in(data), base, Refit(candidate, fitted, 0.0, RECORD)).fitted
     found, std = whole.fit.coordinates[-6:], parameter_std(data, whole, NOISE, {})["payload"]
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
     off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])

@@ -10,10 +10,9 @@ from arm import arm, record, sweeps
 from fitted_arm import NOISE, fitted_arm
 
 from femsense.loop.data.dataset import Data, prepare
-from femsense.loop.fit.fitted_model import fit_model, with_nuisance
+from femsense.loop.fit.fitted_model import fit_model, with_nuisance, with_term
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.refit import with_term
 from femsense.loop.search.search_state import Search
 from femsense.loop.thresholds import DEFAULTS
 from femsense.loop.verdict import returned_model, summary

@@ -19,7 +19,7 @@ from femsense.xr.proprioception.corrections import LINEAR, Frames, explain, is_b
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.files import read_labelled
 from femsense.xr.proprioception.labelled import Labelled, joined, labelled
-from femsense.xr.proprioception.learn import KINDS, LearnOptions, error_interval, learn
+from femsense.xr.proprioception.learn import LearnOptions, error_interval, learn
 from femsense.xr.proprioception.linear import train_radial, train_ridge
 from femsense.xr.proprioception.selection import folds, marker_rms, rows_kept
 
@@ -95,7 +95,7 @@ def test_held_out_blocks_are_blocks_in_time_and_cover_everything_once() -> None:
 
 @pytest.fixture(scope="module")
 def model():
-    return learn(session(1), options=LearnOptions(kinds=KINDS[:2], end_to_end=True, bones=ArmatureOptions(bones=3)))
+    return learn(session(1), options=LearnOptions(kinds=("ridge", "radial"), end_to_end=True, bones=ArmatureOptions(bones=3)))
 
 
 def test_the_stated_error_holds_on_a_fresh_recording(model) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from femsense.core.errors import InputError
@@ -14,7 +15,7 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.memory import with_memory
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers, bones_from_numbers
 from femsense.xr.proprioception.model_file import load_model, save_model
-from femsense.xr.proprioception.network import KINDS, Network
+from femsense.xr.proprioception.network import Network, Units
 
 CHANNELS = ("red", "green", "blue")
 REST = np.outer(np.linspace(0, 0.1, 4), [0, 0, 1.0])
@@ -36,7 +37,7 @@ def some_model(kind: str, *, memory: tuple[float, ...] = (), end_to_end: bool = 
     return ProprioceptiveModel(CHANNELS, tuple("abcd"), network, memory, domain, chain, bones, {"error_mm": 1.5})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", Units)
 @pytest.mark.parametrize("memory", [(), (0.1, 1.0)])
 def test_a_model_comes_back_from_its_file(kind: str, memory: tuple[float, ...], tmp_path: Path) -> None:
     model = some_model(kind, memory=memory, end_to_end=True)
@@ -55,9 +56,9 @@ def test_a_model_comes_back_from_its_file(kind: str, memory: tuple[float, ...], 
     assert (back.frame, load_model(save_model(replace(model, frame="robot"), tmp_path / "r.onnx")).frame) == ("markers", "robot")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", Units)
 def test_another_runtime_computes_the_same(kind: str, tmp_path: Path) -> None:
-    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    runtime = pytest.importorskip("onnxruntime")
     model = some_model(kind, memory=(0.5,), end_to_end=True)
     path = save_model(model, tmp_path / "model.onnx")
     onnx.checker.check_model(onnx.load(path), full_check=True)
@@ -69,7 +70,7 @@ def test_another_runtime_computes_the_same(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(bones, model.bones(inputs), atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", Units)
 @pytest.mark.parametrize("end_to_end", [False, True])
 def test_a_channel_that_no_map_takes_may_have_no_number(kind: str, end_to_end: bool, tmp_path: Path) -> None:
     model = some_model(kind, memory=(0.5,), end_to_end=end_to_end)

@@ -1,0 +1,45 @@
+"""Options of an estimate, in Python and on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+from femsense.core.options import Flag
+
+
+class SensingMethod(StrEnum):
+    """How forces are found."""
+
+    rays = "rays"
+    """Every point is a measurement, one objective (docs/method/estimator.md)."""
+    paper = "paper"
+    """The published method: feature points along their normals and one linear step."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensingOptions:
+    """What the data cannot say."""
+
+    method: Annotated[
+        SensingMethod,
+        Flag("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
+    ] = SensingMethod.rays
+    friction: Annotated[float | None, Flag("--friction", "MU", "Coefficient of the friction cone of contact forces.")] = 1.0
+    """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
+    push: Annotated[
+        bool, Flag("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
+    ] = False
+    smooth_s: Annotated[float, Flag("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0
+    """Time constant over which the forces of one track are averaged [s]. 0: each frame speaks for itself."""
+    modulus_std: float = 0.03
+    """What is not known of the modulus before the free frames are seen, relative."""
+    marker_std_m: float | None = None
+    """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
+    marker_model_std: float = 0.015
+    """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
+    correct: Annotated[
+        bool, Flag("--correct", help="Use the empirical correction of femsense improve --correct, which applies to markers.")
+    ] = False
+    """Its standard deviation is used too."""
