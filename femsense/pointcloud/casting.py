@@ -33,11 +33,11 @@ class Rays:
     order: IntArray
     """Rays by cell, shape (k,)."""
     starts: IntArray
-    """Where each cell begins in `order`, shape (rows + 1, …): cells of a row lie one after the other; shape (rows · columns + 1,)."""
+    """Where each cell begins in `order`, and its length at the end: row by row, shape (rows · columns + 1,)."""
     corner: FloatArray
     """Of the first cell, shape (2,)."""
     cell: float
-    """Side of a cell."""
+    """Side of a cell [1]."""
     columns: int
     """Cells in a row."""
 
@@ -128,7 +128,7 @@ def tensor_of(values: FloatArray):  # type: ignore[no-untyped-def]
 def _span(low, high, corner, cell, count):  # type: ignore[no-untyped-def]
     """Return the first and the last cell along an axis that an interval meets; the last is smaller where there is none."""
     first, last = np.floor((low - corner) / cell), np.floor((high - corner) / cell)
-    return int(max(first, 0.0)), int(min(last, count - 1.0))
+    return int(min(max(first, 0.0), count)), int(max(min(last, count - 1.0), -1.0))
 
 
 @njit(cache=True)
