@@ -13,19 +13,37 @@ import numpy as np
 from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, freeze, read_only
+from femsense.fem.closest_point import closest_on_surface
 from femsense.inference.error_field import ErrorField
 from femsense.inference.mixture import Others
 from femsense.inference.rows import Rows
-from femsense.pointcloud.casting import Rays, closest_points, rays_through
+from femsense.pointcloud.casting import Rays, rays_through
+from femsense.pointcloud.rays import Surface
 
 GRAZING = 0.25
 """Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
 FAR = 6.0
 """Pixels in front of the surface by more than this many σ are compared with its closest point."""
 ANCHORED = 30.0
-"""Pixels farther from the surface than this many σ stay tied to its closest point: whatever they are, they are not of the robot here."""
+"""Pixels that cannot be nearer to the surface than this many σ stay tied to the point that was closest: they are not of the robot there."""
+FEW = 400
+"""Up to so many points are compared with all triangles; more are worth boxes about these."""
 ON_SURFACE = 1e-5
 """Nearer than this the direction to the closest point is the face's normal [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Anchors:
+    """Closest points of a body in one state, to which pixels far from it stay tied."""
+
+    positions: FloatArray
+    """Nodes of the state [m], shape (n, 3)."""
+    triangle: IntArray
+    """On which the point closest to each pixel lies, shape (m,)."""
+    weights: FloatArray
+    """Its barycentric coordinates there, shape (m, 3)."""
+    gap: FloatArray
+    """How far it is [m], shape (m,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,8 +64,7 @@ class Pixels:
     """1/T: how many independent measurements a pixel counts for."""
     coloured: bool
     """Whether colour separates the robot from the rest."""
-    anchors: tuple[IntArray, FloatArray] | None = None
-    """Of points far from the body: the triangle that was closest, −1 for others, shape (m,), and the barycentric weights there, (m, 3); None: of no point."""
+    anchors: Anchors | None = None
     rays: tuple[tuple[IntArray, Rays], ...] = field(init=False)
     """Of each camera: which of the points are its own, and their rays."""
     ways: FloatArray = field(init=False)
@@ -63,8 +80,7 @@ class Pixels:
     def anchored(self, skin: Skin, positions: FloatArray) -> Pixels:
         """Return the pixels with those far from the body in a state, nodes (n, 3) [m], tied to its closest points: these change too little to be looked for
         again in each state."""
-        triangle, weights, gap = closest_points(positions, skin.triangles, self.points)
-        return replace(self, anchors=(np.where(gap > ANCHORED * self.ray_std, triangle, -1), weights))
+        return replace(self, anchors=Anchors(positions, *closest_points(positions, skin.triangles, self.points)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,12 +131,26 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
     )
 
 
+def closest_points(positions: FloatArray, triangles: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the triangle of a surface that is closest to each point (k, 3), shape (k,), the barycentric weights there, shape (k, 3), and how far that is
+    [m], shape (k,)."""
+    k = len(points)
+    triangle, weights, gap = np.empty(k, dtype=np.int64), np.empty((k, 3)), np.empty(k)
+    if k <= FEW:
+        closest_on_surface(read_only(positions), read_only(triangles), read_only(points), triangle, weights, gap)
+    else:
+        _, gap, triangle, weights = Surface(positions, triangles).closest_points(points)
+    return triangle, weights, gap
+
+
 def _closest_points(pixels: Pixels, far: IntArray, x: FloatArray, triangles: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return triangle, barycentric weights and distance [m] of the points of a surface closest to some pixels (k,); of anchored ones where they are tied."""
-    if pixels.anchors is None:
+    anchors = pixels.anchors
+    if anchors is None:
         return closest_points(x, triangles, pixels.points[far])
-    found, at = pixels.anchors[0][far], pixels.anchors[1][far]
-    gap, near = np.empty(len(far)), np.flatnonzero(found < 0)
+    moved = float(np.linalg.norm(x - anchors.positions, axis=1).max())
+    found, at, gap = anchors.triangle[far], anchors.weights[far], np.empty(len(far))
+    near = np.flatnonzero(anchors.gap[far] - moved <= ANCHORED * pixels.ray_std[far])
     found[near], at[near], _ = closest_points(x, triangles, pixels.points[far[near]])
     _distances(x, triangles, read_only(pixels.points), far, found, at, gap)
     return found, at, gap

@@ -12,12 +12,9 @@ import numpy as np
 from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
-from femsense.fem.closest_point import closest_on_surface
 
 PER_CELL = 2.0
 """Rays in a cell of the image plane, on average."""
-FEW = 400
-"""Up to so many points are compared with all triangles; more are worth boxes about these."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,37 +88,6 @@ def rays_through(points: FloatArray, origin: FloatArray) -> Rays:
     key = at[:, 1] * columns + at[:, 0]
     starts = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=rows * columns))])
     return Rays(np.array(origin), basis, uv, np.argsort(key, kind="stable"), starts, corner, cell, columns)
-
-
-def closest_points(positions: FloatArray, triangles: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the triangle of a surface that is closest to each point (k, 3), shape (k,), the barycentric weights there, shape (k, 3), and how far that is
-    [m], shape (k,)."""
-    k = len(points)
-    if k <= FEW:
-        triangle, weights, gap = np.empty(k, dtype=np.int64), np.empty((k, 3)), np.empty(k)
-        closest_on_surface(read_only(positions), read_only(triangles), read_only(points), triangle, weights, gap)
-        return triangle, weights, gap
-    answer = scene_of(positions, triangles).compute_closest_points(tensor_of(points))
-    triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
-    weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
-    place = np.einsum("ri,ric->rc", weights, positions[triangles[triangle]])
-    return triangle, weights, np.linalg.norm(points - place, axis=1)
-
-
-def scene_of(positions: FloatArray, triangles: IntArray):  # type: ignore[no-untyped-def]
-    """Return Open3D's scene of a surface, with boxes about its triangles that take a millisecond to build."""
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(tensor_of(positions), o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)))
-    return scene
-
-
-def tensor_of(values: FloatArray):  # type: ignore[no-untyped-def]
-    """Return an array as Open3D takes it."""
-    import open3d as o3d
-
-    return o3d.core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.pointcloud.casting import closest_points, rays_through, scene_of, tensor_of
+from femsense.pointcloud.casting import rays_through
 
 GRAZING = 0.25
 """Rays that meet the surface at a smaller |cos| say little and err at silhouettes:
@@ -57,7 +57,12 @@ class Surface:
 
     @cached_property
     def _scene(self):  # type: ignore[no-untyped-def]
-        return scene_of(self.positions, self.triangles)
+        """Open3D's scene of it, with boxes about its triangles that take a millisecond to build."""
+        import open3d as o3d
+
+        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(_tensor(self.positions), o3d.core.Tensor(np.ascontiguousarray(self.triangles, dtype=np.uint32)))
+        return scene
 
     def cast(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
         """Return how measured points lie to what their rays meet.
@@ -69,7 +74,7 @@ class Surface:
         """
         rays = points - origins
         ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        answer = self._scene.cast_rays(tensor_of(np.hstack([origins, ray])))
+        answer = self._scene.cast_rays(_tensor(np.hstack([origins, ray])))
         hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
         triangle, uv = answer["primitive_ids"].numpy()[hit], answer["primitive_uvs"].numpy()[hit].astype(np.float64)
         hits = self._hits(hit, triangle.astype(np.int64), uv, points, ray)
@@ -79,7 +84,7 @@ class Surface:
         """Return how measured points lie to the closest faces that look at their camera; arguments as for `cast`."""
         rays = points - origins
         ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        answer = self._scene.compute_closest_points(tensor_of(points))
+        answer = self._scene.compute_closest_points(_tensor(points))
         triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
         hits = self._hits(np.arange(len(points)), triangle, uv, points, ray)
         gap = np.linalg.norm(points - hits.place(self.positions), axis=1)
@@ -104,23 +109,30 @@ class Surface:
 
     def gap(self, points: FloatArray) -> FloatArray:
         """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
-        return np.asarray(self._scene.compute_distance(tensor_of(points)).numpy(), dtype=np.float64)
+        return np.asarray(self._scene.compute_distance(_tensor(points)).numpy(), dtype=np.float64)
 
     def signed_gap(self, points: FloatArray, *, within: float) -> FloatArray:
         """Return how far points (k, 3) lie outside the surface [m], shape (k,): < 0 inside; beyond `within` both count as outside."""
         gap = self.gap(points)
         near = np.flatnonzero(gap < within)
-        inside = near[self._scene.compute_occupancy(tensor_of(points[near])).numpy() > 0.5]
+        inside = near[self._scene.compute_occupancy(_tensor(points[near])).numpy() > 0.5]
         gap[inside] *= -1.0
         return gap
 
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
         """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m],
         their triangles (k,) and barycentric weights (k, 3)."""
-        triangle, weights, gap = closest_points(self.positions, self.triangles, points)
-        place = np.einsum("ri,ric->rc", weights, self.positions[self.triangles[triangle]])
-        inside = self._scene.compute_occupancy(tensor_of(points)).numpy() > 0.5
+        place, gap, triangle, weights = self.closest_points(points)
+        inside = self._scene.compute_occupancy(_tensor(points)).numpy() > 0.5
         return place, np.where(inside, -gap, gap), triangle, weights
+
+    def closest_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+        """Return the closest points (k, 3) [m], distances (k,) [m], their triangles (k,) and barycentric weights (k, 3)."""
+        answer = self._scene.compute_closest_points(_tensor(points))
+        triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
+        weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
+        place = np.einsum("ri,ric->rc", weights, self.positions[self.triangles[triangle]])
+        return place, np.linalg.norm(points - place, axis=1), triangle, weights
 
     def _hits(self, index: IntArray, triangle: IntArray, uv: FloatArray, points: FloatArray, ray: FloatArray) -> SurfaceHits:
         nodes = self.triangles[triangle]
@@ -142,3 +154,9 @@ def together(first: SurfaceHits, second: SurfaceHits) -> SurfaceHits:
             for name in ("index", "nodes", "weights", "normal", "distance", "cosine")
         )
     )
+
+
+def _tensor(values: FloatArray):  # type: ignore[no-untyped-def]
+    import open3d as o3d
+
+    return o3d.core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
