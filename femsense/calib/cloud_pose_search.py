@@ -18,11 +18,12 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from femsense.calib.rigid import rotation_between
 from femsense.calib.scan import REACH
 from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import invert_pose, make_pose, transform_points
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.filters import voxel_grid
 from femsense.pointcloud.objects import find_plane
@@ -267,13 +268,10 @@ def _apart(T: FloatArray, other: FloatArray, samples: FloatArray) -> float:
 
 
 def _rigid(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the pose that takes b (n, 3) best onto a (n, 3) (Kabsch 1976)."""
+    """Return the pose that takes b (n, 3) best onto a (n, 3), also where they do not determine it."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
-    R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_a - R @ mean_b
-    return T
+    R = rotation_between(a - mean_a, b - mean_b)
+    return make_pose(R, mean_a - R @ mean_b)
 
 
 class _Fine:

@@ -13,7 +13,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from femsense.calib.rigid import fit_rigid_robust
+from femsense.calib.rigid import fit_rigid_robust, rotation_between
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
@@ -239,12 +239,9 @@ def _sides(corner: FloatArray) -> FloatArray:
 
 
 def _laid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3,
-    3) (Kabsch 1976)."""
+    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3, 3)."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd(np.einsum("hki,kj->hij", a - mean_a[:, None], b - mean_b))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    R = U @ Vt
+    R = rotation_between(a - mean_a[:, None], b - mean_b)
     return R, mean_a - np.einsum("hij,j->hi", R, mean_b)
 
 

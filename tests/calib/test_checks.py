@@ -70,7 +70,7 @@ def test_another_unit_is_named(robot: Robot, factor: float, unit: str) -> None:
 
 def test_left_handed_axes_are_named(robot: Robot) -> None:
     for axis in np.eye(3):
-        with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
+        with pytest.raises(DataError, match="axes of the markers seem left-handed"):
             calibrate(robot, recorded(robot, seen(robot) * (1 - 2 * axis)))
 
 
@@ -161,7 +161,7 @@ def test_swaps_need_a_reason() -> None:
     ("name", "text"),
     [
         ("v_inch", "39.27 times too large: are they in inches"),
-        ("v_swapall", "swapped: mid and tip"),
+        ("v_swapall", "swapped: tip and mid"),
         ("v_zeros_all", "left: these"),
     ],
 )
@@ -202,7 +202,7 @@ def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_swapped_labels(s
     recording, _ = record(inputs, noise=2e-4, seed=seed)
     xyz = recording.marker_xyz * np.where(np.arange(3) == seed, -1.0, 1.0)
     table = (recording.marker_names, recording.marker_frame, recording.marker_index, xyz)
-    with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
+    with pytest.raises(DataError, match="axes of the markers seem left-handed"):
         calibrate(arm(), with_marker_table(recording, *table))
 
 

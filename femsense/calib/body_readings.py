@@ -1,0 +1,79 @@
+"""Readings of the body: another direction of gravity, another modulus. Their predicted misfit is that of a few frames."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.input_readings import marker_places
+from femsense.calib.marker_fit import MarkerFit
+from femsense.calib.readings import REFUSED, Reading, share_with
+from femsense.core.arrays import freeze
+from femsense.model.recording_checks import in_frames
+
+FEW = 3
+"""Frames by which they are predicted."""
+MODULI = (0.4, 0.63, 1.6, 2.5)
+"""Other moduli, as shares of the declared one, next to the one that the motions of the markers indicate. Without them, an arm declared 1.67
+times too stiff was refused because of another direction of gravity."""
+LEAST = 1.1
+"""Ratio of motions below which they indicate no other modulus."""
+UNLIKELY = 3.0
+"""A modulus off by more is refused: silicones of one name differ by a factor of two."""
+
+
+def body_otherwise(fit: MarkerFit) -> Iterator[Reading]:
+    """Yield other directions of gravity and other moduli."""
+    frames, scene = fit.scene.frames, fit.scene
+    few = frames[np.unique(np.linspace(0, len(frames) - 1, FEW).round().astype(int))]
+    rows, now = np.isin(scene.frame, few), marker_places(fit.robot, scene.recording, few, fit.initial)
+    for one in itertools.chain(_gravities(fit), _moduli(fit)) if now is not None else ():
+        other = marker_places(one.robot, one.recording, few, fit.initial)
+        if other is not None and now is not None:
+            modelled = fit.modelled.copy()
+            modelled[rows] += (other - now)[np.searchsorted(few, scene.frame[rows]), scene.marker[rows]]
+            yield replace(one, predicted=share_with(fit, modelled=modelled, rows=rows))
+
+
+def _gravities(fit: MarkerFit) -> Iterator[Reading]:
+    robot, recording, frames = fit.robot, fit.scene.recording, fit.scene.frames
+    own, size = robot.body.gravity, float(np.linalg.norm(robot.body.gravity))
+    if recording.gravity is not None:
+        error = f"the gravity{in_frames(recording)} seems to have the wrong sign (an accelerometer at rest shows it upwards)"
+        yield Reading(error, robot, replace(recording, gravity=freeze(-recording.gravity)), frames)
+        return
+    for j, sign in itertools.product(range(3) if size else (), (1.0, -1.0)):
+        other = sign * size * np.eye(3)[j]
+        if float(other @ own) < 0.9 * size**2:
+            axis = f"{'-' if sign < 0 else '+'}{'xyz'[j]}"
+            error = f"gravity seems to point along {axis} of the robot, not as gravity.vector_m_s2 says"
+            yield Reading(error, replace(robot, body=robot.body.with_gravity(other)), recording, frames)
+
+
+def _moduli(fit: MarkerFit) -> Iterator[Reading]:
+    farther = _motion(fit)
+    for scale in (*MODULI, *([1.0 / farther] if farther > 0.0 and max(farther, 1.0 / farther) > LEAST else [])):
+        yield Reading(
+            f"the body seems to have about {scale:.2g} times its declared modulus (under these inputs, the markers move {farther:.3g} times as "
+            "far as the model)",
+            replace(fit.robot, body=fit.robot.body.with_stiffness_scale(scale)),
+            fit.scene.recording,
+            fit.scene.frames,
+            advice="Is young_modulus_pa right? femsense improve finds it.",
+            parameters=1,
+            refused=REFUSED if max(scale, 1.0 / scale) > UNLIKELY else np.inf,
+        )
+
+
+def _motion(fit: MarkerFit) -> float:
+    """Return how far the markers move about their means, as a multiple of the model's motion along it [1]; 0 where the model does not move."""
+    own, seen = fit.modelled.copy(), fit.measured.copy()
+    _, label = np.unique(np.column_stack([fit.scene.view, fit.scene.marker]), axis=0, return_inverse=True)
+    for places in (own, seen):
+        places -= np.stack([np.bincount(label.ravel(), column) / np.bincount(label.ravel()) for column in places.T], axis=1)[
+            label.ravel()
+        ]
+    return float((own * seen).sum() / max((own**2).sum(), 1e-300)) if own.any() else 0.0
