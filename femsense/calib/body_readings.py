@@ -31,7 +31,7 @@ def body_otherwise(fit: MarkerFit) -> Iterator[Reading]:
     few = frames[np.unique(np.linspace(0, len(frames) - 1, FEW).round().astype(int))]
     rows, now = np.isin(scene.frame, few), marker_places(fit.robot, scene.recording, few, fit.initial)
     for one in itertools.chain(_gravities(fit), _moduli(fit)) if now is not None else ():
-        other = marker_places(one.robot, one.recording, few, fit.initial)
+        other = marker_places(one.robot or fit.robot, one.recording or scene.recording, few, fit.initial)
         if other is not None and now is not None:
             modelled = fit.modelled.copy()
             modelled[rows] += (other - now)[np.searchsorted(few, scene.frame[rows]), scene.marker[rows]]
@@ -39,18 +39,18 @@ def body_otherwise(fit: MarkerFit) -> Iterator[Reading]:
 
 
 def _gravities(fit: MarkerFit) -> Iterator[Reading]:
-    robot, recording, frames = fit.robot, fit.scene.recording, fit.scene.frames
-    own, size = robot.body.gravity, float(np.linalg.norm(robot.body.gravity))
+    body, recording = fit.robot.body, fit.scene.recording
+    size = float(np.linalg.norm(body.gravity))
     if recording.gravity is not None:
         error = f"the gravity{in_frames(recording)} seems to have the wrong sign (an accelerometer at rest shows it upwards)"
-        yield Reading(error, robot, replace(recording, gravity=freeze(-recording.gravity)), frames)
+        yield Reading(error, recording=replace(recording, gravity=freeze(-recording.gravity)))
         return
     for j, sign in itertools.product(range(3) if size else (), (1.0, -1.0)):
         other = sign * size * np.eye(3)[j]
-        if float(other @ own) < 0.9 * size**2:
+        if float(other @ body.gravity) < 0.9 * size**2:
             axis = f"{'-' if sign < 0 else '+'}{'xyz'[j]}"
             error = f"gravity seems to point along {axis} of the robot, not as gravity.vector_m_s2 says"
-            yield Reading(error, replace(robot, body=robot.body.with_gravity(other)), recording, frames)
+            yield Reading(error, robot=replace(fit.robot, body=body.with_gravity(other)))
 
 
 def _moduli(fit: MarkerFit) -> Iterator[Reading]:
@@ -59,9 +59,7 @@ def _moduli(fit: MarkerFit) -> Iterator[Reading]:
         yield Reading(
             f"the body seems to have about {scale:.2g} times its declared modulus (under these inputs, the markers move {farther:.3g} times as "
             "far as the model)",
-            replace(fit.robot, body=fit.robot.body.with_stiffness_scale(scale)),
-            fit.scene.recording,
-            fit.scene.frames,
+            robot=replace(fit.robot, body=fit.robot.body.with_stiffness_scale(scale)),
             advice="Is young_modulus_pa right? femsense improve finds it.",
             parameters=1,
             refused=REFUSED if max(scale, 1.0 / scale) > UNLIKELY else np.inf,

@@ -22,7 +22,7 @@ WIDE = 0.2
 
 def declared_pose(fit: MarkerFit) -> Iterator[Reading]:
     """Yield the files with a declared pose left open: of one camera, or of all, which finds a displaced base of the robot."""
-    recording, scene = fit.scene.recording, fit.scene
+    recording = fit.scene.recording
     views = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and _shows_pose(fit, v)]
     for free in [*((v,) for v in views), *([tuple(views)] if len(views) > 1 else [])]:
         columns = [c for v in free for c in range(6 * v, 6 * v + 6)]
@@ -30,11 +30,9 @@ def declared_pose(fit: MarkerFit) -> Iterator[Reading]:
             lambda other, free=free: pose_error(  # type: ignore[misc]
                 recording, free, fit.poses, other.poses, [fit.modelled[fit.rows_of(v)].mean(axis=0) for v in free]
             ),
-            fit.robot,
-            opened(recording, free),
-            scene.frames,
             min(_rigid_share(fit, free), first_order(fit, fit.jet.by_pose[:, :, columns]).share),
-            REMEDY,
+            opened(recording, free),
+            advice=REMEDY,
             parameters=len(columns),
             refused=EXPLAINED,
         )
@@ -59,11 +57,9 @@ def pose_at_rest(fit: MarkerFit) -> Iterator[Reading]:
     if scene.recording.rest is not None:
         yield Reading(
             f"rest.csv puts the robot elsewhere than the markers of the frames, which lie {1e3 * left:.3g} mm off",
-            fit.robot,
-            replace(scene.recording, rest=None),
-            scene.frames,
             rigid_misfit(scene.view, fit.modelled, fit.measured) / max(left, 1e-300),
-            "Are both in the frame of the same camera, which did not move in between?",
+            replace(scene.recording, rest=None),
+            advice="Are both in the frame of the same camera, which did not move in between?",
             reported=EXPLAINED,
             refused=EXPLAINED if left > max(map(fit.spread_of, range(len(fit.poses)))) else np.inf,
         )
@@ -82,11 +78,9 @@ def moved_camera(fit: MarkerFit) -> Iterator[Reading]:
         before, after = (int(recording.frame_numbers[k]) for k in (frames[frames < split].max(), split))
         yield Reading(
             f"camera {name or '(only one)'} or the robot's base seems to have moved between frames {before} and {after}",
-            fit.robot,
-            _split(recording, v, split),
-            scene.frames,
             left / max(plain, 1e-300),
-            "Calibrate the frames of one pose: make two recordings of it.",
+            _split(recording, v, split),
+            advice="Calibrate the frames of one pose: make two recordings of it.",
             parameters=6,
             reported=EXPLAINED,
             refused=EXPLAINED,

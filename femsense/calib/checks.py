@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from femsense.calib.marker_fit import MarkerFit, root_mean_square
-from femsense.calib.marker_readings import UNNAMED
+from femsense.calib.marker_readings import UNNAMED, with_robot_markers
 from femsense.calib.readings import EXPLAINED
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -84,7 +83,7 @@ def relabelled(fit: MarkerFit, *, strict: bool = True) -> Recording | None:
     if not (far | renamed).any():
         return None
     _say(robot, scene, renamed, far)
-    return _rewritten(robot, scene, marker, ~far)
+    return _rewritten(fit, marker, ~far)
 
 
 def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
@@ -121,17 +120,10 @@ def _outliers(off: FloatArray, spread: float) -> BoolArray:
     return far
 
 
-def _rewritten(robot: Robot, scene: Scene, marker: IntArray, kept: BoolArray) -> Recording:
+def _rewritten(fit: MarkerFit, marker: IntArray, kept: BoolArray) -> Recording:
     """Return the recording whose rows in the scene's frames have other names, or are gone."""
-    r = scene.recording
-    others = ~np.isin(r.marker_frame, scene.frames)
-    number = {name: i for i, name in enumerate(robot.marker_names)}
-    index = np.array([number[r.marker_names[i]] for i in r.marker_index], dtype=np.int64)
-    return with_marker_table(
-        replace(r, marker_names=robot.marker_names),
-        robot.marker_names,
-        np.concatenate([r.marker_frame[others], scene.frame[kept]]),
-        np.concatenate([index[others], marker[kept]]),
-        np.vstack([r.marker_xyz[others], scene.points[kept]]),
-        view=np.concatenate([r.marker_view[others], scene.view[kept]]),
-    )
+    r = with_robot_markers(fit.robot, fit.scene.recording)
+    own = np.isin(r.marker_frame, fit.scene.frames)  # the rows of the scene, in its order
+    index, left = r.marker_index.copy(), np.ones(len(own), dtype=np.bool_)
+    index[own], left[own] = marker, kept
+    return with_marker_table(r, r.marker_names, r.marker_frame[left], index[left], r.marker_xyz[left], view=r.marker_view[left])

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from femsense.calib.rigid import rotation_between
+from femsense.calib.rigid import poses_apart, rotation_between
 from femsense.calib.scan import REACH
 from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
@@ -255,16 +255,11 @@ def _closest_points(scene: FloatArray, samples: Samples, starts: Sequence[FloatA
     result: list[FloatArray] = []
     for _, T in sorted(done, key=lambda d: d[0]):
         T_robot_camera = invert_pose(T)
-        if all(_apart(T_robot_camera, other, samples.places) > 0.05 * size for other in result):
+        if all(poses_apart(T_robot_camera, other, samples.places) > 0.05 * size for other in result):
             result.append(T_robot_camera)
         if len(result) == FINAL:
             break
     return result
-
-
-def _apart(T: FloatArray, other: FloatArray, samples: FloatArray) -> float:
-    D = T @ invert_pose(other)
-    return float(np.linalg.norm(transform_points(D, samples) - samples, axis=1).mean())
 
 
 def _rigid(a: FloatArray, b: FloatArray) -> FloatArray:

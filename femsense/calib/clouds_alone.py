@@ -11,6 +11,7 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.cloud_pose_search import View, find_cloud_pose
 from femsense.calib.first_poses import in_line
 from femsense.calib.from_clouds import START_STD, fit_clouds
+from femsense.calib.inputs import calibrated_inputs
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
@@ -106,10 +107,7 @@ def free_states(robot: Robot, recording: Recording, calibration: Calibration, vi
             "the pose of a camera without markers needs a cloud of a free frame: mark frames in which nothing touches "
             f"the robot {how_to_free(recording)}"
         )
-    initial = None
-    if recording.actuation_zero == "unknown":
-        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
-        initial = np.array([table[name] for name in robot.body.cable_names])
+    initial = calibrated_inputs(robot, recording, calibration) if recording.actuation_zero == "unknown" else None
     driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
     states = {k: solve_frame(driven, k) for k in _different(recording, frames)}
     still = {k: state for k, state in states.items() if state.converged}

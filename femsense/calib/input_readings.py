@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from femsense.calib.marker_fit import MarkerFit
 from femsense.calib.readings import Reading, first_order, share_with
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.equilibrium import SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.marker_correction import recorded_inputs
 from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.path_solver import look_at
 from femsense.model.recording import Recording
@@ -54,81 +55,85 @@ def marker_places(robot: Robot, recording: Recording, frames: IntArray, initial:
     return np.array(places)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Columns:
+    """Inputs of cables and chambers, read otherwise."""
+
+    error: str
+    table: FloatArray
+    """[N] or [m], and [Pa], shape (F, a + c)."""
+    advice: str = ""
+    frames: IntArray | None = None
+    """Frames that have such inputs, shape (f,); None: all."""
+
+
 def inputs_otherwise(fit: MarkerFit) -> Iterator[Reading]:
     """Yield other readings of the columns of inputs, predicted by the linear response of the markers."""
-    scene, response = fit.scene, _response(fit)
+    scene, response, table = fit.scene, _response(fit), recorded_inputs(fit.scene.recording)
+    names = (*fit.robot.body.cable_names, *fit.robot.body.chamber_names)
     if response is None:
         return
-    for one in itertools.chain(_units(fit), _signs(fit), _orders(fit), _delays(fit)):
-        drivers = _drivers(one.recording, fit.initial, one.frames)
-        rows = np.isin(scene.frame, one.frames)
+    every = itertools.chain(
+        _units(scene.recording, table),
+        _signs(names, table),
+        _orders(names, len(fit.robot.body.cables), table),
+        _delays(scene.frames, table),
+    )
+    for one in every:
+        frames, recording = scene.frames if one.frames is None else one.frames, _with_inputs(scene.recording, one.table)
+        drivers, rows = _drivers(recording, fit.initial, frames), np.isin(scene.frame, frames)
         changed = fit.modelled + response.by(drivers - response.drivers, fit)
-        anew = response.places[scene.marker] + response.by(
-            drivers - response.base, fit
-        )  # where a state is slack as it is read now
-        yield replace(one, predicted=min(share_with(fit, modelled=places, rows=rows) for places in (changed, anew)))
+        slack_before = response.places[scene.marker] + response.by(drivers - response.base, fit)
+        predicted = min(share_with(fit, modelled=places, rows=rows) for places in (changed, slack_before))
+        yield Reading(f"{one.error}{in_frames(recording)}", predicted, recording, frames=frames, advice=one.advice)
 
 
-def _units(fit: MarkerFit) -> Iterator[Reading]:
-    a = len(fit.robot.body.cables)
-    for kind, columns in ((fit.scene.recording.actuation, slice(0, a)), ("pressure", slice(a, None))):
-        for factor, unit in UNITS[kind].items() if _table(fit)[:, columns].any() else ():
-            table = _table(fit).copy()
-            table[:, columns] *= factor
-            yield _with_table(
-                fit,
-                table,
-                f"the {'pressures' if kind == 'pressure' else 'inputs'} seem to be in {unit}",
-                f"The files hold {SI[kind]}.",
+def _units(recording: Recording, table: FloatArray) -> Iterator[_Columns]:
+    own = np.arange(table.shape[1]) < recording.inputs.shape[1]
+    for kind, columns in ((recording.actuation, own), ("pressure", ~own)):
+        for factor, unit in UNITS[kind].items() if table[:, columns].any() else ():
+            yield _Columns(
+                f"the inputs seem to be in {unit}", np.where(columns, factor, 1.0) * table, f"The files hold {SI[kind]}."
             )
 
 
-def _signs(fit: MarkerFit) -> Iterator[Reading]:
-    names = _names(fit)
-    ones = [[j] for j in range(len(names))] if len(names) > 1 else []
-    for columns in [list(range(len(names))), *ones]:
-        turned = _table(fit).copy()
-        turned[:, columns] *= -1.0
-        if columns and turned[:, columns].any():
-            which = f"{', '.join(names[j] for j in columns)}{in_frames(fit.scene.recording)}"
-            yield _with_table(fit, turned, f"the inputs of {which} seem to have the wrong sign (> 0 pulls)")
+def _signs(names: Sequence[str], table: FloatArray) -> Iterator[_Columns]:
+    ones: list[BoolArray] = list(np.eye(len(names), dtype=bool)) if len(names) > 1 else []
+    for columns in (np.ones(len(names), dtype=bool), *ones):
+        if table[:, columns].any():
+            which = ", ".join(name for name, turned in zip(names, columns) if turned)
+            yield _Columns(f"the inputs of {which} seem to have the wrong sign (> 0 pulls)", np.where(columns, -table, table))
 
 
-def _orders(fit: MarkerFit) -> Iterator[Reading]:
-    names, a = _names(fit), len(fit.robot.body.cables)
-    for first, count in ((0, a), (a, len(names) - a)):
+def _orders(names: Sequence[str], cables: int, table: FloatArray) -> Iterator[_Columns]:
+    for first, count in ((0, cables), (cables, len(names) - cables)):
         for order in _permutations(count):
             columns = np.arange(len(names))
             columns[first : first + count] = first + np.array(order)
             moved = [f"{names[i]} moves the robot as {names[j]} should" for i, j in enumerate(np.argsort(columns)) if i != j]
-            yield _with_table(
-                fit,
-                _table(fit)[:, columns],
-                f"the columns of inputs{in_frames(fit.scene.recording)} seem exchanged: {', '.join(moved)}",
-                "Exchange them, or the cables in robot.toml.",
-            )
+            error = f"the columns of inputs seem exchanged: {', '.join(moved)}"
+            yield _Columns(error, table[:, columns], "Exchange them, or the cables in robot.toml.")
 
 
 def _permutations(count: int) -> Iterator[tuple[int, ...]]:
-    """Yield the permutations of n columns except the identity."""
+    """Yield the permutations of n columns except the identity; of many columns, those that exchange two."""
     own = tuple(range(count))
-    if count <= PERMUTED:
-        yield from (order for order in itertools.permutations(own) if order != own)
-        return
-    for i, j in itertools.combinations(own, 2):
+    for order in itertools.permutations(own) if count <= PERMUTED else ():
+        if order != own:
+            yield order
+    for i, j in itertools.combinations(own, 2) if count > PERMUTED else ():
         yield tuple(j if k == i else i if k == j else k for k in own)
 
 
-def _delays(fit: MarkerFit) -> Iterator[Reading]:
-    frames, table = fit.scene.frames, _table(fit)
+def _delays(frames: IntArray, table: FloatArray) -> Iterator[_Columns]:
     for lag in (lag for lag in range(-LATEST, LATEST + 1) if lag):
         there = frames[(frames + lag >= 0) & (frames + lag < len(table))]
-        if len(there) < max(2, len(frames) // 2) or not np.ptp(table, axis=0).any():
-            continue
-        taken = np.clip(np.arange(len(table)) + lag, 0, len(table) - 1)
-        how = "early" if lag > 0 else "late"
-        error = f"the markers are {abs(lag)} frames {how}, as they follow the inputs of other frames"
-        yield replace(_with_table(fit, table[taken], error, "Are markers and inputs on one clock?"), frames=there)
+        if len(there) >= max(2, len(frames) // 2) and np.ptp(table, axis=0).any():
+            taken = np.clip(np.arange(len(table)) + lag, 0, len(table) - 1)
+            error = (
+                f"the markers are {abs(lag)} frames {'early' if lag > 0 else 'late'}, as they follow the inputs of other frames"
+            )
+            yield _Columns(error, table[taken], "Are markers and inputs on one clock?", there)
 
 
 def zero_of_inputs(fit: MarkerFit) -> Iterator[Reading]:
@@ -141,11 +146,9 @@ def zero_of_inputs(fit: MarkerFit) -> Iterator[Reading]:
     values = ", ".join(f"{name} {scale * z:+.2g} {unit}" for name, z in zip(fit.robot.body.cable_names, found.value))
     yield Reading(
         f"the inputs{in_frames(recording)} seem to count from another zero ({values})",
-        fit.robot,
-        replace(recording, inputs=freeze(recording.inputs + found.value)),
-        fit.scene.frames,
         found.share,
-        'actuation_zero = "unknown" finds it.',
+        replace(recording, inputs=freeze(recording.inputs + found.value)),
+        advice='actuation_zero = "unknown" finds it.',
         parameters=len(found.value),
         refused=np.inf,
     )
@@ -165,10 +168,9 @@ def input_of_one_cable(fit: MarkerFit) -> Iterator[Reading]:
     by_gain = by_offset * recording.inputs[fit.scene.frame][:, None, :]
     unit, scale = _unit_of(recording)
     for j in moving.tolist():
-        gains = (
-            by_gain.sum(axis=2),
-            *([by_gain[:, :, j]] if len(moving) > 1 else []),
-        )  # where one cable moves alone, a modulus does the same
+        gains = [by_gain.sum(axis=2)]
+        if len(moving) > 1:  # where one cable moves alone, its gain and the gain of all are one
+            gains.append(by_gain[:, :, j])
         found = first_order(fit, np.stack([by_offset[:, :, j], *gains], axis=2))
         offset, offset_std, gain, gain_std = found.value[0], found.std[0], 1.0, 0.0
         if len(moving) > 1:
@@ -176,16 +178,14 @@ def input_of_one_cable(fit: MarkerFit) -> Iterator[Reading]:
         if abs(offset) < KNOWN * offset_std and abs(gain - 1.0) <= KNOWN * gain_std:
             continue
         times = f"times {gain:.3g} ± {gain_std:.1g}, " if gain_std else ""
+        size = f"{times}plus {scale * offset:.2g} ± {scale * offset_std:.1g} {unit}"
         inputs = recording.inputs.copy()
         inputs[:, j] = gain * inputs[:, j] + offset
         yield Reading(
-            f"the input of {fit.robot.body.cable_names[j]} alone seems off "
-            f"({times}plus {scale * offset:.2g} ± {scale * offset_std:.1g} {unit})",
-            fit.robot,
-            replace(recording, inputs=freeze(inputs)),
-            frames,
+            f"the input of {fit.robot.body.cable_names[j]} alone seems off ({size})",
             found.share,
-            "Is its sensor calibrated, the cable slack or caught?",
+            replace(recording, inputs=freeze(inputs)),
+            advice="Is its sensor calibrated, the cable slack or caught?",
             parameters=2,
             refused=np.inf,
         )
@@ -210,19 +210,6 @@ def _by_input(fit: MarkerFit) -> FloatArray:
 def _unit_of(recording: Recording) -> tuple[str, float]:
     """Return the unit in which inputs are reported, and how many of it an SI unit has."""
     return ("N", 1.0) if recording.actuation == "tension" else ("mm", 1e3)
-
-
-def _names(fit: MarkerFit) -> tuple[str, ...]:
-    return (*fit.robot.body.cable_names, *fit.robot.body.chamber_names)
-
-
-def _table(fit: MarkerFit) -> FloatArray:
-    """Return the recorded inputs of cables and chambers, shape (F, a + c)."""
-    return np.hstack([fit.scene.recording.inputs, fit.scene.recording.pressures])
-
-
-def _with_table(fit: MarkerFit, table: FloatArray, error: str, advice: str = "") -> Reading:
-    return Reading(error, fit.robot, _with_inputs(fit.scene.recording, table), fit.scene.frames, advice=advice)
 
 
 def _with_inputs(recording: Recording, table: FloatArray) -> Recording:
@@ -258,7 +245,7 @@ def _drivers(recording: Recording, initial: FloatArray | None, frames: IntArray)
 
 def _response(fit: MarkerFit) -> _Response | None:
     """Return how the markers answer; None where no input changes, or a state is missing."""
-    recording, initial, table, frames = fit.scene.recording, fit.initial, _table(fit), fit.scene.frames
+    recording, initial, table, frames = fit.scene.recording, fit.initial, recorded_inputs(fit.scene.recording), fit.scene.frames
     a = recording.inputs.shape[1]
     if initial is not None:  # all cables pull, in whichever way they are read
         initial = np.maximum(initial, np.abs(table[:, :a] - table[frames, :a].mean(axis=0)).max(axis=0))

@@ -15,8 +15,9 @@ import numpy as np
 from femsense.calib.inputs import first_inputs
 from femsense.calib.joint import fit_joint
 from femsense.calib.marker_readings import LEFT_HANDED, MIRROR
-from femsense.calib.pose_search import PosedNames, apart, refine_names, search_poses, squared
+from femsense.calib.pose_search import PosedNames, refine_names, search_poses, squared
 from femsense.calib.readings import AS_GOOD, EXPLAINED, SUSPICIOUS
+from femsense.calib.rigid import poses_apart
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.pose import transform_points
@@ -249,13 +250,13 @@ def _require_one(
     """
     spread = _spread(robot)
     for i, one in enumerate(seen):
-        chosen = PosedNames(best.poses[one.view], readings[i][0].marker, best.error_m)
+        chosen = best.poses[one.view]
         likely = [r for r in readings[i][1:] if r.error_m < EXPLAINED * max(readings[i][0].error_m, 1e-6)]
-        others = [r for r in likely if apart(r, chosen, robot.marker_points) > ELSEWHERE * spread]
+        others = [r for r in likely if poses_apart(r.T_robot_camera, chosen, robot.marker_points) > ELSEWHERE * spread]
         for other in others[:3]:
             first = [other if j == i else r[0] for j, r in enumerate(readings)]
             other_fit = _fitted(robot, recording, seen, _combined(recording, seen, first))
-            away = apart(PosedNames(other_fit.poses[one.view], (), 0.0), chosen, robot.marker_points)
+            away = poses_apart(other_fit.poses[one.view], chosen, robot.marker_points)
             both = (other_fit.marker >= 0) & (best.marker >= 0)
             if (
                 (other_fit.marker != best.marker)[both].any()

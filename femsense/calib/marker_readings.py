@@ -14,8 +14,8 @@ from femsense.calib.readings import AS_GOOD, EXPLAINED, REPORTED, SUSPICIOUS, Re
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.model.as_it_is import evaluate_robot
-from femsense.model.marker_units import unit_hint
 from femsense.model.recording import Recording
+from femsense.model.robot import Robot
 
 LEFT_HANDED = "Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
 UNNAMED = "Where names are not known, leave the column marker empty: the model names the markers"
@@ -69,11 +69,9 @@ def left_handed(fit: MarkerFit) -> Iterator[Reading]:
             continue  # most markers fit: some are outliers
         yield Reading(
             f"the axes of the markers{text_of(fit, views)} seem left-handed",
-            fit.robot,
-            scaled(opened(fit.scene.recording, views), views, MIRROR),
-            fit.scene.frames,
             share_with(fit, measured=np.where(mine[:, None], fit.measured * MIRROR, fit.measured)),
-            LEFT_HANDED,
+            scaled(opened(fit.scene.recording, views), views, MIRROR),
+            advice=LEFT_HANDED,
             reported=EXPLAINED,
             refused=EXPLAINED,
         )
@@ -81,81 +79,50 @@ def left_handed(fit: MarkerFit) -> Iterator[Reading]:
 
 def exchanged_labels(fit: MarkerFit) -> Iterator[Reading]:
     """Yield markers under other names, the same in all frames."""
-    robot, scene, recording = fit.robot, fit.scene, fit.scene.recording
-    true = {v: names for (v, *more) in cameras_of(fit) if not more for names in [_true_names(fit, v)]}
-    own = np.arange(len(robot.marker_names))
+    scene, labels, own = fit.scene, fit.robot.marker_names, np.arange(len(fit.robot.marker_names))
+    places = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in scene.frames.tolist()])
+    true = {views[0]: _true_names(fit, views[0], places) for views in cameras_of(fit) if len(views) == 1}
     for names in {tuple(names.tolist()): names for names in true.values() if (names != own).any()}.values():
         views = [v for v, others in true.items() if (others == names).all()]
         renamed = np.where(np.isin(scene.view, views), names[scene.marker], scene.marker)
-        rows = f", in the rows of camera {' and '.join(recording.camera_names[v] for v in views)}" if text_of(fit, views) else ""
+        every = opened(with_robot_markers(fit.robot, scene.recording), views)
+        index = np.where(np.isin(every.marker_view, views), names[every.marker_index], every.marker_index)
+        rows = text_of(fit, views).replace(" of", ", in the rows of", 1)
+        changed = ", ".join(f"{labels[i]} is {labels[j]}" for i, j in enumerate(names.tolist()) if i != j)
         yield Reading(
-            f"the labels{text_of(fit, views)} seem swapped: {_cycles(robot.marker_names, names)}",
-            robot,
-            _renamed(opened(recording, views), robot.marker_names, views, names),
-            scene.frames,
-            share_with(fit, modelled=_places_of(fit)[np.searchsorted(scene.frames, scene.frame), renamed]),
-            f"Swap them in markers.csv{rows}. {UNNAMED}",
+            f"the labels{text_of(fit, views)} seem swapped: {changed}",
+            share_with(fit, modelled=places[np.searchsorted(scene.frames, scene.frame), renamed]),
+            replace(every, marker_index=freeze(index, np.int64)),
+            advice=f"Swap them in markers.csv{rows}. {UNNAMED}",
             parameters=int((names != own).sum()),
             reported=EXPLAINED,
             refused=EXPLAINED,
         )
 
 
-def _places_of(fit: MarkerFit) -> FloatArray:
-    """Return where the model has all markers in each frame of the scene [m], shape (f, m, 3)."""
-    return np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in fit.scene.frames.tolist()])
+def with_robot_markers(robot: Robot, recording: Recording) -> Recording:
+    """Return the recording, all of whose markers are the robot's, with these in the robot's order."""
+    number = np.array([robot.marker_names.index(name) for name in recording.marker_names], dtype=np.int64)
+    return replace(recording, marker_names=robot.marker_names, marker_index=freeze(number[recording.marker_index], np.int64))
 
 
-def _true_names(fit: MarkerFit, view: int) -> IntArray:
+def _true_names(fit: MarkerFit, view: int, places: FloatArray) -> IntArray:
     """Return the marker that each label of a camera belongs to, shape (m,): of the poses that fit the points without their names about equally
-    well, that under which the fewest labels change."""
-    scene, places, measured = fit.scene, _places_of(fit), fit.measured
-    number = np.searchsorted(scene.frames, scene.frame)
-    rows = [np.flatnonzero(fit.rows_of(view) & (number == i)) for i in range(len(scene.frames))]
+    well, that under which the fewest labels change. `places` are the markers of the model in each frame [m], shape (f, m, 3)."""
+    scene, measured, own = fit.scene, fit.measured, np.arange(places.shape[1])
+    rows = [np.flatnonzero(fit.rows_of(view) & (scene.frame == k)) for k in scene.frames]
     used = sorted(range(len(rows)), key=lambda i: -len(rows[i]))[:SEARCHED]
-    own = np.arange(len(fit.robot.marker_names))
     try:
         found = search_poses([places[i] for i in used], [measured[rows[i]] for i in used], rng=np.random.default_rng(0))
     except DataError:
         return own
     likely = []
     for one in (one for one in found if one.error_m < AS_GOOD * found[0].error_m):
-        votes = np.zeros((len(own), len(own)))
+        votes = 1e-3 * np.eye(len(own))
         for i, names in zip(used, one.marker):
             np.add.at(votes, (scene.marker[rows[i]][names >= 0], names[names >= 0]), 1.0)
-        likely.append(linear_sum_assignment(-votes - 1e-3 * np.eye(len(own)))[1])
+        likely.append(linear_sum_assignment(-votes)[1])
     return min(likely, key=lambda names: int((names != own).sum()))
-
-
-def _renamed(recording: Recording, markers: Sequence[str], views: Sequence[int], names: IntArray) -> Recording:
-    """Return the recording with other names for the robot's markers in the rows of some cameras."""
-    index = {name: i for i, name in enumerate(recording.marker_names)}
-    truth = {index[own]: index.get(markers[j]) for own, j in zip(markers, names.tolist()) if own in index}
-    mine = np.isin(recording.marker_view, views)
-    every = [truth.get(i, i) if own else i for i, own in zip(recording.marker_index.tolist(), mine)]
-    known = np.array([i is not None for i in every], dtype=bool)
-    return replace(
-        recording,
-        marker_frame=freeze(recording.marker_frame[known], np.int64),
-        marker_index=freeze([i for i in every if i is not None], np.int64),
-        marker_view=freeze(recording.marker_view[known], np.int64),
-        marker_xyz=freeze(recording.marker_xyz[known]),
-    )
-
-
-def _cycles(markers: Sequence[str], names: IntArray) -> str:
-    """Return swaps as text: "a and b" for two, "a is b, b is c, c is a" for more."""
-    left, texts = {i: int(j) for i, j in enumerate(names) if i != j}, []
-    while left:
-        chain = [next(iter(left))]
-        while left.get(chain[-1], chain[0]) != chain[0]:
-            chain.append(left[chain[-1]])
-        cycle = [markers[m] for m in chain]
-        pairs = ", ".join(f"{a} is {b}" for a, b in zip(cycle, [*cycle[1:], cycle[0]]))
-        texts.append(" and ".join(cycle) if len(cycle) == 2 else pairs)
-        for m in chain:
-            left.pop(m, None)
-    return "; ".join(texts)
 
 
 def marker_scale(fit: MarkerFit) -> Iterator[Reading]:
@@ -181,16 +148,11 @@ def marker_scale(fit: MarkerFit) -> Iterator[Reading]:
         if abs(scale - 1.0) < KNOWN * std or scale <= 0.0:
             continue
         which = "all cameras" if len(views) > 1 else f"camera {fit.scene.recording.camera_names[views[0]] or '(only one)'}"
-        unit = f"{unit_hint(scale).capitalize()} The files hold metres"
         yield Reading(
             f"the markers of {which} are {scale:.3f} ± {std:.1g} times too large",
-            fit.robot,
-            scaled(fit.scene.recording, views, 1.0 / scale),
-            fit.scene.frames,
             found.share,
-            unit
-            if max(scale, 1.0 / scale) > UNIT
-            else "Is the scale of the motion capture or of the camera's depth right, and the size of the robot's mesh?",
+            scaled(fit.scene.recording, views, 1.0 / scale),
+            advice="Is the scale of the motion capture or of the camera's depth right, and the size of the robot's mesh?",
             parameters=1,
             refused=EXPLAINED if max(scale, 1.0 / scale) > UNIT else np.inf,
         )

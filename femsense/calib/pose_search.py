@@ -16,7 +16,7 @@ import numpy as np
 from femsense.calib.rigid import fit_rigid_robust, rotation_between
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import transform_points
 
 TRIANGLES = 30
 """Number of measured triangles that are tried. With a third of outliers, 30 % of the triangles contain none; that none of 30 is clean
@@ -243,9 +243,3 @@ def _laid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=0)
     R = rotation_between(a - mean_a[:, None], b - mean_b)
     return R, mean_a - np.einsum("hij,j->hi", R, mean_b)
-
-
-def apart(one: PosedNames, other: PosedNames, model: FloatArray) -> float:
-    """Return how far two poses place the markers (m, 3) apart, root mean square [m]."""
-    T = one.T_robot_camera @ invert_pose(other.T_robot_camera)
-    return float(np.sqrt(((transform_points(T, model) - model) ** 2).sum(axis=1).mean()))

@@ -44,12 +44,13 @@ class Reading:
 
     error: str | Callable[[MarkerFit], str]
     """The error in the files if this reading is right, as a clause; or that of the reading's fit."""
-    robot: Robot
-    recording: Recording
-    frames: IntArray
-    """Indices of the frames that it applies to, shape (f,)."""
     predicted: float = np.inf
     """Misfit to first order, as a fraction of the current one; readings above 1/`reported` are not fitted."""
+    recording: Recording | None = None
+    """As it is read now; None: as it stands, and so in the next two."""
+    robot: Robot | None = None
+    frames: IntArray | None = None
+    """Indices of the frames that it applies to, shape (f,)."""
     advice: str = ""
     """What to do, one sentence or more."""
     parameters: int = 0
@@ -108,11 +109,12 @@ def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit) ->
 
 def _compared(fit: MarkerFit, reading: Reading, refit: Refit) -> _Compared | None:
     """Return a reading with its evidence; None where it has no fit."""
+    frames = fit.scene.frames if reading.frames is None else reading.frames
     try:
-        other = refit(reading.robot, reading.recording, reading.frames)
+        other = refit(reading.robot or fit.robot, reading.recording or fit.scene.recording, frames)
     except DataError:
         return None
-    residual, own = other.jet.residual, fit.jet.residual[np.isin(fit.scene.frame, reading.frames)]
+    residual, own = other.jet.residual, fit.jet.residual[np.isin(fit.scene.frame, frames)]
     p = len(fit.result.theta)
     reduced = [(r**2).sum() / max(r.size - q, 1e-9) for r, q in ((residual, p + reading.parameters), (own, p))]
     left, before = (float(np.sqrt((r**2).sum(axis=1).mean())) for r in (residual, own))

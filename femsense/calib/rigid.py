@@ -6,7 +6,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, as_points
 from femsense.core.errors import DataError, InputError
-from femsense.core.pose import make_pose
+from femsense.core.pose import invert_pose, make_pose, transform_points
 
 
 def rotation_between(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -56,6 +56,12 @@ def fit_rigid_robust(points_a: FloatArray, points_b: FloatArray, *, rounds: int 
         weights = 1.0 / (1.0 + (distance / scale) ** 2)
         T = fit_rigid(points_a, points_b, weights=weights)
     return T, weights
+
+
+def poses_apart(T: FloatArray, other: FloatArray, points: FloatArray) -> float:
+    """Return how far two poses of a camera put points that it sees apart, root mean square [m]; points (k, 3) are where the second has them."""
+    moved = transform_points(T @ invert_pose(other), points)
+    return float(np.sqrt(((moved - points) ** 2).sum(axis=1).mean()))
 
 
 def rigid_residual(a: FloatArray, b: FloatArray) -> FloatArray:
