@@ -9,30 +9,32 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.calib.input_readings import marker_places
+from femsense.calib.inputs import different_frames
 from femsense.calib.marker_fit import MarkerFit
 from femsense.calib.readings import REFUSED, Reading, share_with
 from femsense.core.arrays import freeze
 from femsense.model.recording_checks import in_frames
 
 FEW = 3
-"""Frames by which they are predicted."""
+"""Frames by which they are predicted, those under the most different inputs."""
 MODULI = (0.4, 0.63, 1.6, 2.5)
 """Other moduli, as shares of the declared one, next to the one that the motions of the markers indicate. Without them, an arm declared 1.67
 times too stiff was refused because of another direction of gravity."""
-LEAST = 1.1
-"""Ratio of motions below which they indicate no other modulus."""
+LEAST = 1.5
+"""Ratio of motions below which they indicate no other modulus: laws differ by less on a correct recording."""
 UNLIKELY = 3.0
 """A modulus off by more is refused: silicones of one name differ by a factor of two."""
 
 
 def body_otherwise(fit: MarkerFit) -> Iterator[Reading]:
     """Yield other directions of gravity and other moduli."""
-    frames, scene = fit.scene.frames, fit.scene
-    few = frames[np.unique(np.linspace(0, len(frames) - 1, FEW).round().astype(int))]
-    rows, now = np.isin(scene.frame, few), marker_places(fit.robot, scene.recording, few, fit.initial)
-    for one in itertools.chain(_gravities(fit), _moduli(fit)) if now is not None else ():
+    scene = fit.scene
+    few = np.sort(different_frames(scene.recording, scene.frames.tolist(), FEW))
+    rows = np.isin(scene.frame, few)
+    now = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in few.tolist()])
+    for one in itertools.chain(_gravities(fit), _moduli(fit)):
         other = marker_places(one.robot or fit.robot, one.recording or scene.recording, few, fit.initial)
-        if other is not None and now is not None:
+        if other is not None:
             modelled = fit.modelled.copy()
             modelled[rows] += (other - now)[np.searchsorted(few, scene.frame[rows]), scene.marker[rows]]
             yield replace(one, predicted=share_with(fit, modelled=modelled, rows=rows))

@@ -159,7 +159,7 @@ def _fitted(robot: Robot, recording: Recording, chosen: IntArray, history: list[
     """
     fit = _fitted_as_named(robot, recording, chosen, history)
     if is_suspicious(fit):
-        compare_readings(fit, OF_MARKERS, _looked_at)
+        compare_readings(fit, OF_MARKERS, _looked_at, rivals=OF_LARGE_ERRORS if strict else ())
     better = relabelled(fit, strict=strict)
     if better is not None:
         fit = _fitted_as_named(robot, better, chosen, history)

@@ -11,7 +11,7 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.cloud_pose_search import View, find_cloud_pose
 from femsense.calib.first_poses import in_line
 from femsense.calib.from_clouds import START_STD, fit_clouds
-from femsense.calib.inputs import calibrated_inputs
+from femsense.calib.inputs import calibrated_inputs, different_frames
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
@@ -109,23 +109,11 @@ def free_states(robot: Robot, recording: Recording, calibration: Calibration, vi
         )
     initial = calibrated_inputs(robot, recording, calibration) if recording.actuation_zero == "unknown" else None
     driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
-    states = {k: solve_frame(driven, k) for k in _different(recording, frames)}
+    states = {k: solve_frame(driven, k) for k in different_frames(recording, frames, FRAMES)}
     still = {k: state for k, state in states.items() if state.converged}
     if not still:
         raise DataError("no equilibrium in the free frames: are the inputs those of this robot?")
     return still
-
-
-def _different(recording: Recording, frames: list[int]) -> list[int]:
-    """Return FRAMES of the frames at most, the first under the largest inputs, each next one as far from the others as can be."""
-    rows = np.hstack([recording.inputs, recording.pressures])[frames]
-    rows = rows / np.maximum(np.abs(rows).max(axis=0), 1e-12)
-    chosen = [int(np.abs(rows).sum(axis=1).argmax())]
-    while len(chosen) < min(FRAMES, len(frames)):
-        distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
-        distance[chosen] = -1.0
-        chosen.append(int(distance.argmax()))
-    return [frames[i] for i in chosen]
 
 
 def seen_by(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
+from femsense.model.marker_correction import recorded_inputs
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -58,6 +60,18 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
         return None
     lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
     return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
+
+
+def different_frames(recording: Recording, frames: Sequence[int], count: int) -> list[int]:
+    """Return some of the frames, the first under the largest inputs, each next one under inputs as far from the others' as can be."""
+    rows = recorded_inputs(recording)[np.asarray(frames)]
+    rows = rows / np.maximum(np.abs(rows).max(axis=0), 1e-12)
+    chosen = [int(np.abs(rows).sum(axis=1).argmax())]
+    while len(chosen) < min(count, len(frames)):
+        distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
+        distance[chosen] = -1.0
+        chosen.append(int(distance.argmax()))
+    return [int(frames[i]) for i in chosen]
 
 
 def calibrated_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:

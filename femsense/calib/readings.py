@@ -81,18 +81,20 @@ class _Compared:
     """s / s₀, of the reading to the files [1]."""
 
 
-def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit) -> None:
+def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *, rivals: Sequence[Reread] = ()) -> None:
     """Refuse files that fit far better under an alternative reading; warn of those that fit better.
 
     Arguments:
         fit: of the files as they stand.
         rereads: the kinds of readings.
         refit: fits another reading.
+        rivals: further kinds, which compete where one of the first is promising.
 
     Raises:
         DataError: states the error in the files if the reading is right, and the misfits of both.
     """
-    tried = [one for reread in rereads for one in reread(fit) if one.predicted * one.reported < 1.0]
+    tried = _promising(fit, rereads)
+    tried += _promising(fit, rivals) if tried else []
     fitted = [_compared(fit, one, refit) for one in sorted(tried, key=lambda one: one.predicted)[:MOST]]
     better = [one for one in fitted if one is not None and one.ratio * one.reading.reported < 1.0]
     if not better:
@@ -105,6 +107,10 @@ def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit) ->
     if is_suspicious(fit) and all(one.ratio * one.reading.refused < 1.0 for one in (best, *others)):
         raise DataError(text.strip())
     warnings.warn(f"{text} Or the model errs by as much: femsense improve", stacklevel=5)
+
+
+def _promising(fit: MarkerFit, rereads: Sequence[Reread]) -> list[Reading]:
+    return [one for reread in rereads for one in reread(fit) if one.predicted * one.reported < 1.0]
 
 
 def _compared(fit: MarkerFit, reading: Reading, refit: Refit) -> _Compared | None:

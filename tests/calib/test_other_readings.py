@@ -90,6 +90,17 @@ def test_another_zero_is_mentioned_with_its_size() -> None:
         calibrate(arm(), with_inputs(np.add(recording().inputs, [1.0, 0.0, 0.0, 0.0])))
 
 
+def test_readings_that_fit_as_well_are_listed_in_the_same_line() -> None:
+    """A weightless arm with a square section: what turns its cables by a quarter turns its markers, too."""
+    weightless = {"gravity": (0.0, 0.0, 0.0)}
+    seen = record(LEVELS, noise=2e-4, truth=arm((8, 3, 3), law="neo_hookean", **weightless))[0]
+    turned = with_inputs(seen.inputs[:, [2, 3, 1, 0]], seen)
+    with pytest.raises(
+        DataError, match=r"the columns of inputs seem exchanged: .*then fit to 0\.3.* As good: the labels seem swapped: .* \(0\.3"
+    ):
+        calibrate(arm(**weightless), turned)
+
+
 @pytest.mark.parametrize("modulus", [180e3, 500e3, 600e3])
 def test_a_body_that_is_softer_or_stiffer_is_not_refused_for_gravity(modulus: float) -> None:
     recording = record(2.0 * (LEVELS[[0, 1, 3, 4, 5]] > 0), noise=2e-4, seed=3)[0]
