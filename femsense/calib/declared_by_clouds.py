@@ -115,7 +115,7 @@ def _fitted(robot: Robot, recording: Recording, found: Calibration, view: int) -
     views = seen_by(robot, recording, free_states(robot, recording, found, [view]), view)
     near = settle_cloud_pose(views, found.poses[view])
     if near.gain < LEAST:
-        near = max([near, *search_cloud_poses(views)[:1]], key=lambda pose: pose.gain)
+        near = next((pose for pose in search_cloud_poses(views)[:1] if pose.gain >= LEAST), near)
     start = started_at(robot, found, {view: near.T_robot_camera})
     try:
         return fit_clouds(robot, opened, start, guessed=(view,))
