@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from femsense.calib.input_readings import marker_places
-from femsense.calib.inputs import different_frames
+from femsense.calib.inputs import most_different
 from femsense.calib.marker_fit import MarkerFit
 from femsense.calib.readings import REFUSED, Reading, share_with
 from femsense.core.arrays import freeze
 from femsense.model.recording_checks import in_frames
 
 FEW = 3
-"""Frames by which they are predicted, those under the most different inputs."""
+"""Frames by which they are predicted, those with the most different states."""
 MODULI = (0.4, 0.63, 1.6, 2.5)
 """Other moduli, as shares of the declared one, next to the one that the motions of the markers indicate. Without them, an arm declared 1.67
 times too stiff was refused because of another direction of gravity."""
@@ -26,13 +26,24 @@ UNLIKELY = 3.0
 """A modulus off by more is refused: silicones of one name differ by a factor of two."""
 
 
-def body_otherwise(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield other directions of gravity and other moduli."""
+def direction_of_gravity(fit: MarkerFit) -> Iterator[Reading]:
+    """Yield gravity along another axis."""
+    yield from _predicted(fit, _gravities(fit))
+
+
+def modulus(fit: MarkerFit) -> Iterator[Reading]:
+    """Yield other moduli."""
+    yield from _predicted(fit, _moduli(fit))
+
+
+def _predicted(fit: MarkerFit, readings: Iterable[Reading]) -> Iterator[Reading]:
+    """Yield those readings that have an equilibrium in a few frames, with their misfit there."""
     scene = fit.scene
-    few = np.sort(different_frames(scene.recording, scene.frames.tolist(), FEW))
+    places = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in scene.frames.tolist()])
+    chosen = np.sort(most_different((places - places.mean(axis=0)).reshape(len(places), -1), FEW))
+    few, now = scene.frames[chosen], places[chosen]
     rows = np.isin(scene.frame, few)
-    now = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in few.tolist()])
-    for one in itertools.chain(_gravities(fit), _moduli(fit)):
+    for one in readings:
         other = marker_places(one.robot or fit.robot, one.recording or scene.recording, few, fit.initial)
         if other is not None:
             modelled = fit.modelled.copy()

@@ -52,16 +52,17 @@ def _rigid_share(fit: MarkerFit, free: Sequence[int]) -> float:
 
 
 def pose_at_rest(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield the files without rest.csv, which holds the pose elsewhere than the markers of the frames."""
+    """Yield the files without rest.csv, which holds the pose elsewhere than the markers of the frames: more than their spread, since a clamp
+    that gives moves these, too."""
     scene, left = fit.scene, root_mean_square(fit.jet.residual)
-    if scene.recording.rest is not None:
+    if scene.recording.rest is not None and left > max(map(fit.spread_of, range(len(fit.poses)))):
         yield Reading(
             f"rest.csv puts the robot elsewhere than the markers of the frames, which lie {1e3 * left:.3g} mm off",
             rigid_misfit(scene.view, fit.modelled, fit.measured) / max(left, 1e-300),
             replace(scene.recording, rest=None),
             advice="Are both in the frame of the same camera, which did not move in between?",
             reported=EXPLAINED,
-            refused=EXPLAINED if left > max(map(fit.spread_of, range(len(fit.poses)))) else np.inf,
+            refused=EXPLAINED,
         )
 
 

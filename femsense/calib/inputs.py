@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
-from femsense.model.marker_correction import recorded_inputs
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -62,16 +60,14 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
     return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
 
 
-def different_frames(recording: Recording, frames: Sequence[int], count: int) -> list[int]:
-    """Return some of the frames, the first under the largest inputs, each next one under inputs as far from the others' as can be."""
-    rows = recorded_inputs(recording)[np.asarray(frames)]
-    rows = rows / np.maximum(np.abs(rows).max(axis=0), 1e-12)
+def most_different(rows: FloatArray, count: int) -> list[int]:
+    """Return indices of some of the rows (n, k), the largest first, each next one as far from the others as can be."""
     chosen = [int(np.abs(rows).sum(axis=1).argmax())]
-    while len(chosen) < min(count, len(frames)):
+    while len(chosen) < min(count, len(rows)):
         distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
         distance[chosen] = -1.0
         chosen.append(int(distance.argmax()))
-    return [int(frames[i]) for i in chosen]
+    return chosen
 
 
 def calibrated_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:

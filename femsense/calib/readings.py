@@ -34,7 +34,7 @@ EXPLAINED = 4.0
 divides the misfit by two, since the sag is the same in all frames."""
 AS_GOOD = 1.2
 """Readings whose misfits differ by less than this factor are not distinguished: that with the fewest parameters is reported, and the others listed."""
-MOST = 6
+MOST = 4
 """Readings that are fitted, those with the smallest predicted misfit."""
 
 
@@ -71,6 +71,7 @@ Refit = Callable[[Robot, Recording, IntArray], MarkerFit]
 class _Compared:
     """A reading that was fitted."""
 
+    kind: Reread
     reading: Reading
     text: str
     left: float
@@ -95,12 +96,16 @@ def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *,
     """
     tried = _promising(fit, rereads)
     tried += _promising(fit, rivals) if tried else []
-    fitted = [_compared(fit, one, refit) for one in sorted(tried, key=lambda one: one.predicted)[:MOST]]
+    fitted = [_compared(fit, *one, refit) for one in sorted(tried, key=lambda one: one[1].predicted)[:MOST]]
     better = [one for one in fitted if one is not None and one.ratio * one.reading.reported < 1.0]
     if not better:
         return
     alike = AS_GOOD * min(one.ratio for one in better)
-    best, *others = sorted((one for one in better if one.ratio <= alike), key=lambda one: (one.reading.parameters, one.ratio))
+    of_kind: dict[Reread, _Compared] = {}
+    for one in sorted(better, key=lambda one: (one.reading.parameters, one.ratio)):
+        if one.ratio <= alike:
+            of_kind.setdefault(one.kind, one)
+    best, *others = of_kind.values()
     text = f"{best.text}: the markers then fit to {1e3 * best.left:.3g} mm instead of {1e3 * best.before:.3g} mm. {best.reading.advice}"
     if others:
         text += f" As good: {'; '.join(f'{one.text} ({1e3 * one.left:.3g} mm)' for one in others)}."
@@ -109,11 +114,11 @@ def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *,
     warnings.warn(f"{text} Or the model errs by as much: femsense improve", stacklevel=5)
 
 
-def _promising(fit: MarkerFit, rereads: Sequence[Reread]) -> list[Reading]:
-    return [one for reread in rereads for one in reread(fit) if one.predicted * one.reported < 1.0]
+def _promising(fit: MarkerFit, rereads: Sequence[Reread]) -> list[tuple[Reread, Reading]]:
+    return [(kind, one) for kind in rereads for one in kind(fit) if one.predicted * one.reported < 1.0]
 
 
-def _compared(fit: MarkerFit, reading: Reading, refit: Refit) -> _Compared | None:
+def _compared(fit: MarkerFit, kind: Reread, reading: Reading, refit: Refit) -> _Compared | None:
     """Return a reading with its evidence; None where it has no fit."""
     frames = fit.scene.frames if reading.frames is None else reading.frames
     try:
@@ -125,7 +130,7 @@ def _compared(fit: MarkerFit, reading: Reading, refit: Refit) -> _Compared | Non
     reduced = [(r**2).sum() / max(r.size - q, 1e-9) for r, q in ((residual, p + reading.parameters), (own, p))]
     left, before = (float(np.sqrt((r**2).sum(axis=1).mean())) for r in (residual, own))
     text = reading.error if isinstance(reading.error, str) else reading.error(other)
-    return _Compared(reading, text, left, before, float(np.sqrt(reduced[0] / max(reduced[1], 1e-300))))
+    return _Compared(kind, reading, text, left, before, float(np.sqrt(reduced[0] / max(reduced[1], 1e-300))))
 
 
 def is_suspicious(fit: MarkerFit) -> bool:
