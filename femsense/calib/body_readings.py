@@ -10,18 +10,22 @@ import numpy as np
 
 from femsense.calib.input_readings import marker_places
 from femsense.calib.inputs import most_different
-from femsense.calib.marker_fit import MarkerFit
+from femsense.calib.marker_fit import MarkerFit, root_mean_square
 from femsense.calib.readings import REFUSED, Reading, share_with
-from femsense.core.arrays import freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.model.recording_checks import in_frames
 
 FEW = 3
 """Frames by which they are predicted, those with the most different states."""
+SAME = 7
+"""Decimals of metres to which places of one state agree."""
 MODULI = (0.4, 0.63, 1.6, 2.5)
 """Other moduli, as shares of the declared one, next to the one that the motions of the markers indicate. Without them, an arm declared 1.67
 times too stiff was refused because of another direction of gravity."""
 LEAST = 1.5
 """Ratio of motions below which they indicate no other modulus: laws differ by less on a correct recording."""
+STILL = 1e-3
+"""A model whose markers move by less than this share of their spread indicates no modulus."""
 UNLIKELY = 3.0
 """A modulus off by more is refused: silicones of one name differ by a factor of two."""
 
@@ -40,7 +44,9 @@ def _predicted(fit: MarkerFit, readings: Iterable[Reading]) -> Iterator[Reading]
     """Yield those readings that have an equilibrium in a few frames, with their misfit there."""
     scene = fit.scene
     places = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in scene.frames.tolist()])
-    chosen = np.sort(most_different((places - places.mean(axis=0)).reshape(len(places), -1), FEW))
+    moved = (places - places.mean(axis=0)).reshape(len(places), -1)
+    chosen = np.array(most_different(moved, FEW))
+    chosen = np.sort(chosen[np.unique(moved[chosen].round(SAME), axis=0, return_index=True)[1]])
     few, now = scene.frames[chosen], places[chosen]
     rows = np.isin(scene.frame, few)
     for one in readings:
@@ -80,11 +86,13 @@ def _moduli(fit: MarkerFit) -> Iterator[Reading]:
 
 
 def _motion(fit: MarkerFit) -> float:
-    """Return how far the markers move about their means, as a multiple of the model's motion along it [1]; 0 where the model does not move."""
-    own, seen = fit.modelled.copy(), fit.measured.copy()
+    """Return how far the markers move about their means, as a multiple of the model's motion along it [1]; 0 where the model hardly moves."""
     _, label = np.unique(np.column_stack([fit.scene.view, fit.scene.marker]), axis=0, return_inverse=True)
-    for places in (own, seen):
-        places -= np.stack([np.bincount(label.ravel(), column) / np.bincount(label.ravel()) for column in places.T], axis=1)[
-            label.ravel()
-        ]
-    return float((own * seen).sum() / max((own**2).sum(), 1e-300)) if own.any() else 0.0
+    own, seen = (places - _means(places, label.ravel()) for places in (fit.modelled, fit.measured))
+    moved = root_mean_square(own)
+    return float((own * seen).sum() / (own**2).sum()) if moved > STILL * max(map(fit.spread_of, range(len(fit.poses)))) else 0.0
+
+
+def _means(rows: FloatArray, label: IntArray) -> FloatArray:
+    """Return for each row (n, c) the mean of those with its label (n,)."""
+    return np.stack([np.bincount(label, column) / np.bincount(label) for column in rows.T], axis=1)[label]
