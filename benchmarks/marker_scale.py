@@ -21,7 +21,7 @@ from calibration_robots import one_camera, recorded, without_clouds
 from real import arm, tentacle, trunk
 
 from femsense import FemsenseError, Recording, Robot, calibrate, load_recording, load_robot
-from femsense.calib.marker_scale import scaled
+from femsense.calib.marker_readings import scaled
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SCALES = (1.01, 1.03, 0.97)

@@ -13,23 +13,21 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.checks import check_reading, pairs_of, relabelled
+from femsense.calib.checks import relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.declared_by_clouds import check_declared_by_clouds, views_to_check
-from femsense.calib.declared_poses import Fitted, check_declared_poses
 from femsense.calib.first_poses import first_poses
 from femsense.calib.from_clouds import fit_clouds
 from femsense.calib.from_images import has_image_markers, with_image_markers
-from femsense.calib.input_checks import check_inputs
 from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
-from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, moved_by_law, root_mean_square
+from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, moved_by_law
 from femsense.calib.marker_assignment import name_markers
-from femsense.calib.marker_scale import check_marker_scale
-from femsense.calib.other_readings import check_other_readings
+from femsense.calib.marker_fit import MarkerFit, root_mean_square
+from femsense.calib.marker_readings import UNNAMED
+from femsense.calib.other_readings import OF_LARGE_ERRORS, OF_MARKERS, OF_SMALL_ERRORS
 from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
+from femsense.calib.readings import compare_readings, is_suspicious, rigid_misfit
 from femsense.calib.rigid import fit_rigid
-from femsense.calib.single_inputs import check_single_inputs
-from femsense.calib.still_camera import check_camera_still
 from femsense.calib.without_fit import as_declared, from_rest
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
@@ -50,6 +48,8 @@ MAX_FRAMES = 16
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
 START_FRAMES = 5
 """Frames that Algorithm 1 uses for the start."""
+HOPELESS = 0.5
+"""A misfit above this share of the markers' spread is no fit, whatever the reason."""
 
 
 def usable_frames(recording: Recording) -> IntArray:
@@ -119,10 +119,10 @@ def _by_markers(robot: Robot, recording: Recording, chosen: IntArray) -> Calibra
     """Return the calibration by markers, zeros of pressures included where they are unknown."""
     history: list[float] = []
     if not has_unknown_zeros(robot, recording):
-        return _result(robot, *_fitted(robot, recording, chosen, history), history)
+        return _result(_fitted(robot, recording, chosen, history), history)
     zeros = find_pressure_zeros(robot, recording, lambda shifted: _fitted_as_named(shifted, recording, chosen, history))
     shifted = with_initial_pressures(robot, zeros.pressure)
-    found = _result(shifted, *_fitted(shifted, recording, chosen, history), history)
+    found = _result(_fitted(shifted, recording, chosen, history), history)
     weak = weak_zeros(recording, zeros)
     status = f"{found.status}, but these data hardly determine the initial pressure of {weak}" if weak else found.status
     return replace(found, chamber_pressure_pa=zeros.pressure, pressure_std_pa=zeros.std, status=status)
@@ -147,52 +147,52 @@ def calibrated_start(
 ) -> tuple[tuple[FloatArray, ...], FloatArray | None, dict[int, Equilibrium]]:
     """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin;
     frames need markers. `strict` refuses all that `calibrate` refuses (DataError)."""
-    _, _, poses, initial, jet = _fitted(robot, recording, frames, [], strict=strict)
-    return tuple(poses), initial, jet.states
+    fit = _fitted(robot, recording, frames, [], strict=strict)
+    return fit.poses, fit.initial, fit.jet.states
 
 
-def _fitted(
-    robot: Robot, recording: Recording, chosen: IntArray, history: list[float], *, strict: bool = True
-) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    """Return the scene of the frames that are used, and the fit to it; labels put right, outliers left out.
+def _fitted(robot: Robot, recording: Recording, chosen: IntArray, history: list[float], *, strict: bool = True) -> MarkerFit:
+    """Return the fit to the frames that are used; labels put right, outliers left out.
 
     Raises:
-        DataError: markers that cannot be the robot's as they are written (`check_reading`).
+        DataError: markers or inputs that cannot be the robot's as they are written.
     """
-    scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
-    pairs, names = pairs_of(robot, scene, poses, jet.residual), recording.camera_names
-    # first: a mirrored body that is symmetric fits under other labels in single frames
-    check_reading(robot, pairs, cameras=names, strict=False)
-    better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0, strict=strict)
-    if changed:
-        scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
-        pairs = pairs_of(robot, scene, poses, jet.residual)
+    fit = _fitted_as_named(robot, recording, chosen, history)
+    if is_suspicious(fit):
+        compare_readings(fit, OF_MARKERS, _looked_at, rivals=OF_LARGE_ERRORS if strict else ())
+    better = relabelled(fit, strict=strict)
+    if better is not None:
+        fit = _fitted_as_named(robot, better, chosen, history)
     if strict:
-        check_declared_poses(scene.recording, poses, pairs, lambda other: _left_with(robot, other, scene.frames))
-        check_inputs(scene.recording, pairs)
-        said = check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
-        if initial is None:
-            check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of, said=said)
-        check_marker_scale(robot, scene, poses, initial, jet, _residual_of)
-        check_camera_still(robot, scene.recording, pairs)
-    check_reading(robot, pairs, cameras=names, strict=strict)
-    return scene, fit, poses, initial, jet
+        compare_readings(fit, (*OF_SMALL_ERRORS, *(OF_LARGE_ERRORS if is_suspicious(fit) else ())), _looked_at)
+        _require_fit(fit)
+    return fit
 
 
-def _residual_of(robot: Robot, recording: Recording, frames: IntArray) -> FloatArray:
-    """Return what a fit to some frames leaves [m], shape (k, 3); as all other readings they are only looked at."""
-    return _fitted_as_named(robot, recording, frames, [], PathSolver(look_at))[-1].residual
+def _looked_at(robot: Robot, recording: Recording, frames: IntArray) -> MarkerFit:
+    """Return the fit of an alternative reading; a frame that Newton does not reach has no equilibrium."""
+    return _fitted_as_named(robot, recording, frames, [], PathSolver(look_at))
 
 
-def _left_with(robot: Robot, recording: Recording, frames: IntArray) -> Fitted:
-    """Return what a fit to some frames leaves [m], and its poses."""
-    _, _, poses, _, jet = _fitted_as_named(robot, recording, frames, [], PathSolver(look_at))
-    return root_mean_square(jet.residual), poses
+def _require_fit(fit: MarkerFit) -> None:
+    """Refuse markers that leave a large share of their spread for an unknown reason (DataError)."""
+    view, names = fit.scene.view, fit.scene.recording.camera_names
+    for v, name in enumerate(names):
+        mine, spread = view == v, fit.spread_of(v)
+        if len(np.unique(fit.scene.marker[mine])) < 4:
+            continue
+        left = rigid_misfit(view[mine], fit.modelled[mine], fit.measured[mine])
+        if left > HOPELESS * spread > 0.0:
+            which = f" of camera {name}" if len(names) > 1 else ""
+            raise DataError(
+                f"the markers{which} do not fit the robot: the residual is {100 * left / spread:.0f} % of their spread of "
+                f"{1e3 * spread:.3g} mm. Are these the markers of {fit.robot.name!r}, in metres, under their names? {UNNAMED}"
+            )
 
 
 def _fitted_as_named(
     robot: Robot, recording: Recording, chosen: IntArray, history: list[float], solver: PathSolver | None = None
-) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
+) -> MarkerFit:
     seen = _thinned(chosen[np.isin(chosen, recording.marker_frame)])
     scene = make_scene(robot, recording, seen)
     poses = first_poses(robot, scene)
@@ -200,7 +200,7 @@ def _fitted_as_named(
     if recording.actuation_zero == "unknown" and robot.body.cables:
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
         poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
-    return scene, *fit_joint(robot, scene, poses, initial, history, solver=solver)
+    return fit_joint(robot, scene, poses, initial, history, solver=solver)
 
 
 def _thinned(frames: IntArray) -> IntArray:
@@ -248,16 +248,9 @@ def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
     ]
 
 
-def _result(
-    robot: Robot,
-    scene: Scene,
-    fit: FitResult,
-    poses: list[FloatArray],
-    initial: FloatArray | None,
-    jet: SceneJet,
-    history: list[float],
-) -> Calibration:
-    recording, moved = scene.recording, moved_by_law(robot, scene, fit, poses, initial, jet)
+def _result(found: MarkerFit, history: list[float]) -> Calibration:
+    robot, scene, fit, poses, initial, jet = found.robot, found.scene, found.result, found.poses, found.initial, found.jet
+    recording, moved = scene.recording, moved_by_law(found)
     covariance = fit.covariance + np.outer(moved, moved)
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
     joint = np.zeros((6 * len(poses),) * 2)
@@ -279,7 +272,7 @@ def _result(
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
     return Calibration(
         T_robot_camera=poses[0],
-        poses=tuple(poses),
+        poses=poses,
         camera_names=recording.camera_names,
         cable_tension_n=tables.tension,
         cable_displacement_m=tables.displacement,

@@ -18,11 +18,12 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from femsense.calib.rigid import poses_apart, rotation_between
 from femsense.calib.scan import REACH
 from femsense.calib.visible_side import Samples, size_of, spread_samples
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import invert_pose, make_pose, transform_points
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.filters import voxel_grid
 from femsense.pointcloud.objects import find_plane
@@ -38,8 +39,8 @@ CLOSER = 300
 """Poses that closest points refine."""
 FINAL = 16
 """Poses that are refined with finer points."""
-FINE, FINE_STEPS = 1200, 25
-"""Samples and steps of that."""
+COARSE_STEPS, FINE, FINE_STEPS = 10, 1200, 25
+"""Steps of both, and samples of the second."""
 RAYS = 10000
 """Rays of a view that judge at most."""
 MOST_CELLS = 4e6
@@ -143,7 +144,7 @@ def search_cloud_poses(views: Sequence[View]) -> list[CloudPose]:
         return []
     samples = spread_samples(first.surface, 3 * SAMPLES)
     starts = _on_the_grid(scene, samples, size)
-    closer = _closest_points(scene, samples, starts, size)
+    closer = _closest(scene, samples, starts, size)
     fine = [_Fine(view, size) for view in views]
     fitted = [_settled(fine, T, size) for T in closer]
     found: list[CloudPose] = []
@@ -233,47 +234,45 @@ class _DistanceMap:
         return np.asarray(np.where(inside, self.map[at[..., 0], at[..., 1], at[..., 2]], self.cap))
 
 
-def _closest_points(scene: FloatArray, samples: Samples, starts: Sequence[FloatArray], size: float) -> list[FloatArray]:
+def _closest(scene: FloatArray, samples: Samples, starts: Sequence[FloatArray], size: float) -> list[FloatArray]:
     """Return T_robot_camera of the poses to which closest points lead, best first, FINAL at most, each (4, 4)."""
-    tree = cKDTree(scene)
-    done: list[tuple[float, FloatArray]] = []
-    for T in starts:
-        score = np.inf
-        for step in range(12):
-            placed, side = samples.looking(T, 0.1)
-            if not side.any():
-                break
-            distance, index = (np.asarray(found) for found in tree.query(placed[side]))
-            score = float(np.minimum(distance, CAP * size).mean())
-            limit = max(np.quantile(distance, 0.7), 1e-9)
-            good = distance <= limit
-            T = _rigid(scene[index[good]], placed[side][good]) @ T
-            if step == 4 and len(done) >= FINAL and score > 2.0 * sorted(s for s, _ in done)[FINAL - 1]:
-                break
-        done.append((score, T))
+    sides, done = [(samples, cKDTree(scene))], []
+    for start in starts:
+        T = _registered(sides, start, size * np.geomspace(2.0 * CAP, REACH, COARSE_STEPS))
+        placed, looking = samples.looking(T, 0.1)
+        distance = np.asarray(sides[0][1].query(placed[looking])[0])
+        done.append((float(np.minimum(distance, CAP * size).mean()) if len(distance) else np.inf, invert_pose(T)))
     result: list[FloatArray] = []
-    for _, T in sorted(done, key=lambda d: d[0]):
-        T_robot_camera = invert_pose(T)
-        if all(_apart(T_robot_camera, other, samples.places) > 0.05 * size for other in result):
-            result.append(T_robot_camera)
-        if len(result) == FINAL:
-            break
+    for _, T in sorted(done, key=lambda one: one[0]):
+        if len(result) < FINAL and all(poses_apart(T, other, samples.places) > 0.05 * size for other in result):
+            result.append(T)
     return result
 
 
-def _apart(T: FloatArray, other: FloatArray, samples: FloatArray) -> float:
-    D = T @ invert_pose(other)
-    return float(np.linalg.norm(transform_points(D, samples) - samples, axis=1).mean())
+def _registered(sides: Sequence[tuple[Samples, Any]], T: FloatArray, reaches: FloatArray) -> FloatArray:
+    """Return T_camera_robot to which closest points lead, (4, 4): of each side of the body its visible samples and a tree of the measured points.
+
+    Pairs within a reach that shrinks, one step each [m], count.
+    """
+    for reach in reaches.tolist():
+        a, b = [], []
+        for samples, tree in sides:
+            placed, looking = samples.looking(T, 0.1)
+            distance, index = tree.query(placed[looking], distance_upper_bound=reach)
+            near = np.isfinite(distance)
+            a.append(tree.data[index[near]])
+            b.append(placed[looking][near])
+        if sum(len(part) for part in b) < 10:
+            break
+        T = _rigid(np.vstack(a), np.vstack(b)) @ T
+    return T
 
 
 def _rigid(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the pose that takes b (n, 3) best onto a (n, 3) (Kabsch 1976)."""
+    """Return the pose that takes b (n, 3) best onto a (n, 3), also where they do not determine it."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
-    R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_a - R @ mean_b
-    return T
+    R = rotation_between(a - mean_a, b - mean_b)
+    return make_pose(R, mean_a - R @ mean_b)
 
 
 class _Fine:
@@ -309,18 +308,9 @@ class _Fine:
 
 def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) -> CloudPose:
     """Return the pose to which closest points of all views lead, with finer points and a reach that shrinks, and how it fits."""
-    T, trees = invert_pose(T_robot_camera), [view.near(T_robot_camera, size) for view in views]
-    for reach in size * np.geomspace(CAP, REACH, FINE_STEPS):
-        a, b = [], []
-        for view, tree in zip(views, trees):
-            placed, looking = view.samples.looking(T, 0.1)
-            distance, index = tree.query(placed[looking], distance_upper_bound=reach)
-            good = np.isfinite(distance)
-            a.append(tree.data[index[good]])
-            b.append(placed[looking][good])
-        if sum(len(part) for part in b) < 10:
-            break
-        T = _rigid(np.vstack(a), np.vstack(b)) @ T
+    trees = [view.near(T_robot_camera, size) for view in views]
+    sides = [(view.samples, tree) for view, tree in zip(views, trees)]
+    T = _registered(sides, invert_pose(T_robot_camera), size * np.geomspace(CAP, REACH, FINE_STEPS))
     return _judged(views, trees, invert_pose(T), size)
 
 

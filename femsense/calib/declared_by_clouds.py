@@ -11,12 +11,12 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.checks import EXPLAINED, SUSPICIOUS
 from femsense.calib.cloud_pose_search import LEAST, search_cloud_poses, settle_cloud_pose
 from femsense.calib.clouds_alone import free_states, seen_by, started_at
-from femsense.calib.declared_poses import DECLARED_STD, said
+from femsense.calib.declared_poses import DECLARED_STD, REMEDY, pose_error
 from femsense.calib.from_clouds import fit_clouds, free_clouds, measured_noises, pose_pivot
 from femsense.calib.inputs import calibrated_inputs
+from femsense.calib.readings import EXPLAINED, SUSPICIOUS
 from femsense.calib.scan import REACH, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
@@ -78,8 +78,10 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
         if off < ALLOWED or (apart < KNOWN and not plain):
             continue
         middle = robot.body.mesh.nodes.mean(axis=0)
-        text = said(recording, [view], found.poses, fitted.poses, [middle], before, left)
-        text += f". That is {apart:.2g} times what the clouds leave open"
+        text = (
+            f"{pose_error(recording, [view], found.poses, fitted.poses, [middle])}: it leaves {1e3 * before:.3g} mm, one that is fitted to "
+            f"the clouds {1e3 * left:.3g} mm. {REMEDY} That is {apart:.2g} times what the clouds leave open"
+        )
         factor, softer = _with_modulus(robot, recording, found, view, body)
         by_modulus = softer < 0.5 * before
         if plain and not by_modulus:
@@ -113,7 +115,7 @@ def _fitted(robot: Robot, recording: Recording, found: Calibration, view: int) -
     views = seen_by(robot, recording, free_states(robot, recording, found, [view]), view)
     near = settle_cloud_pose(views, found.poses[view])
     if near.gain < LEAST:
-        near = max([near, *search_cloud_poses(views)[:1]], key=lambda pose: pose.gain)
+        near = next((pose for pose in search_cloud_poses(views)[:1] if pose.gain >= LEAST), near)
     start = started_at(robot, found, {view: near.T_robot_camera})
     try:
         return fit_clouds(robot, opened, start, guessed=(view,))

@@ -10,8 +10,8 @@ import numpy as np
 from femsense.calib.calibrate import calibrated_start
 from femsense.calib.calibration import Calibration
 from femsense.calib.pressure_zeros import with_initial_pressures
-from femsense.core.arrays import FloatArray, IntArray
-from femsense.core.pose import invert_pose, transform_points
+from femsense.calib.rigid import poses_apart
+from femsense.core.arrays import IntArray
 from femsense.model.marker_correction import corrected
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
@@ -50,7 +50,7 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
     driven = with_initial_pressures(robot.in_recording(recording.label), calibration.chamber_pressure_pa)
     poses, _, _ = calibrated_start(driven, free, frames, strict=True)
     for v, name in enumerate(recording.camera_names):
-        off = _apart(robot.marker_points, poses[v], calibration.poses[v])
+        off = poses_apart(calibration.poses[v], poses[v], robot.marker_points)
         size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
         if off > max(MOVED * calibration.rms_m, SHARE * size):
             camera = f"camera {name}" if name else "the camera"
@@ -68,10 +68,3 @@ def _telling(recording: Recording) -> IntArray:
     seen = np.zeros((len(recording.time_s), len(recording.camera_names)), dtype=np.int64)
     np.add.at(seen, (recording.marker_frame, recording.marker_view), 1)
     return np.flatnonzero(recording.free & (seen >= MARKERS).all(axis=1))
-
-
-def _apart(points: FloatArray, one: FloatArray, other: FloatArray) -> float:
-    """Return how far apart two poses of a camera (4, 4) put points that it sees, root mean square [m]; points (k, 3) are where
-    the first has them."""
-    moved = transform_points(other, transform_points(invert_pose(one), points))
-    return float(np.sqrt(((moved - points) ** 2).sum(axis=1).mean()))

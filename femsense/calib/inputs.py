@@ -60,6 +60,16 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
     return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
 
 
+def most_different(rows: FloatArray, count: int) -> list[int]:
+    """Return indices of some of the rows (n, k), the largest first, each next one as far from the others as can be."""
+    chosen = [int(np.abs(rows).sum(axis=1).argmax())]
+    while len(chosen) < min(count, len(rows)):
+        distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
+        distance[chosen] = -1.0
+        chosen.append(int(distance.argmax()))
+    return chosen
+
+
 def calibrated_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> FloatArray:
     """Return the initial inputs of a calibration in the recording's unit [N] or [m], shape (a,)."""
     table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m

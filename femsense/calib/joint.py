@@ -8,10 +8,11 @@ import numpy as np
 
 from femsense.calib.declared_poses import DECLARED_STD
 from femsense.calib.inputs import input_bounds
+from femsense.calib.marker_fit import MarkerFit, root_mean_square
 from femsense.calib.other_law import with_other_law
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
-from femsense.core.least_squares import FitResult, covariance_of, gauss_newton
+from femsense.core.least_squares import covariance_of, gauss_newton
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene
@@ -36,7 +37,7 @@ def fit_joint(
     *,
     free_inputs: bool = True,
     solver: PathSolver | None = None,
-) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:
+) -> MarkerFit:
     """Fit poses and initial inputs together; the weights of noise and outliers are re-estimated from the residual until they converge.
 
     Declared poses stay fixed. States are solved with the `solver`.
@@ -56,26 +57,20 @@ def fit_joint(
     moved, inputs = problem.place(theta)
     fit = replace(fit, covariance=problem.beside_declared(jet, fit.covariance))
     # an input at its bound is no better determined than others: their common error moves all of them
-    return fit, moved, inputs, jet
+    return MarkerFit(robot, scene, fit, tuple(moved), inputs, jet)
 
 
-def moved_by_law(
-    robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet
-) -> FloatArray:
-    """Return the change of the fit under the neo-Hookean law, shape (p,); 0 if the robot declares its constitutive law.
+def moved_by_law(fit: MarkerFit) -> FloatArray:
+    """Return the change of a fit under the neo-Hookean law, shape (p,); 0 if the robot declares its constitutive law.
 
     One Gauss–Newton step from the solution, −C Jᵀ Δr, with the change Δr of the whitened residual and C = (JᵀJ)⁻¹.
-
-    Arguments:
-        robot, scene: of the fit.
-        fit, poses, initial, jet: results of `fit_joint`.
     """
-    other, nothing = with_other_law(robot), np.zeros(len(fit.theta))
-    if other is None or not np.isfinite(fit.covariance).all():
+    other, nothing, jet = with_other_law(fit.robot), np.zeros(len(fit.result.theta)), fit.jet
+    if other is None or not np.isfinite(fit.result.covariance).all():
         return nothing
-    there = _Problem(other, scene, poses, initial, free_inputs=True, solver=PathSolver(look_at))
+    there = _Problem(other, fit.scene, list(fit.poses), fit.initial, free_inputs=True, solver=PathSolver(look_at))
     there.starts = dict(jet.states)
-    there.weigh(jet, _huber_weights(jet.residual), len(fit.theta))
+    there.weigh(jet, _huber_weights(jet.residual), len(fit.result.theta))
     row = (there.weights / there.std)[:, None, None]
     J = there._jacobian(jet, row)
     try:
@@ -210,8 +205,3 @@ def _huber_weights(residual: FloatArray) -> FloatArray:
 def _noise_std(weighted: FloatArray, rows: float, parameters: int) -> float:
     freedom = max(rows - parameters, 1.0)
     return max(float(np.sqrt((weighted**2).sum() / freedom)), NOISE_FLOOR)
-
-
-def root_mean_square(residual: FloatArray) -> float:
-    """Return the root mean square length of rows (k, c)."""
-    return float(np.sqrt((residual**2).sum(axis=1).mean()))

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.calib.checks import EXPLAINED, LEFT_HANDED, SUSPICIOUS
 from femsense.calib.inputs import first_inputs
 from femsense.calib.joint import fit_joint
-from femsense.calib.pose_search import PosedNames, apart, refine_names, search_poses, squared
+from femsense.calib.marker_readings import LEFT_HANDED, MIRROR
+from femsense.calib.pose_search import PosedNames, refine_names, search_poses, squared
+from femsense.calib.readings import AS_GOOD, EXPLAINED, SUSPICIOUS
+from femsense.calib.rigid import poses_apart
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.core.pose import transform_points
@@ -27,9 +29,6 @@ from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
 from femsense.model.robot import Robot
 
-AS_GOOD = 1.2
-"""Another pose fits equally well if its error is below this multiple of the best one's, for any number of points: model errors are common
-to all points. Wrong poses of data/tentacle have a ratio of at least 1.2, symmetric layouts 1.0."""
 ELSEWHERE = 0.1
 """Poses are different where they place the markers this share of their spread apart."""
 ROUNDS = 4
@@ -150,11 +149,11 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
     for _ in range(ROUNDS):
         frames = np.unique(np.concatenate([one.frames for one in seen]))
         scene = make_scene(robot, _with_names(robot, recording, frames, named.marker), frames)
-        _, poses, initial, jet = fit_joint(robot, scene, list(named.poses), first_inputs(robot, recording), [])
-        model = {k: robot.markers.positions(state.positions) for k, state in jet.states.items()}
+        fit = fit_joint(robot, scene, list(named.poses), first_inputs(robot, recording), [])
+        model = {k: robot.markers.positions(state.positions) for k, state in fit.jet.states.items()}
         nameless = np.setdiff1d(frames, list(model))  # frames in which no point got a name are not in the fit
-        model |= _modelled(robot, recording, nameless, initial)
-        again = _settled(robot, recording, seen, replace(named, poses=tuple(poses)), model)
+        model |= _modelled(robot, recording, nameless, fit.initial)
+        again = _settled(robot, recording, seen, replace(named, poses=fit.poses), model)
         named, before = again, named
         if np.array_equal(before.marker, named.marker):
             break
@@ -230,15 +229,14 @@ def _check_handed(
     spread = _spread(robot)
     if named.error_m < SUSPICIOUS * spread or any(T is not None for T in recording.T_robot_camera):
         return
-    mirror = np.array([-1.0, 1.0, 1.0])
-    turned = replace(recording, unnamed_xyz=freeze(recording.unnamed_xyz * mirror))
-    others = [replace(one, points=tuple(points * mirror for points in one.points)) for one in seen]
+    turned = replace(recording, unnamed_xyz=freeze(recording.unnamed_xyz * MIRROR))
+    others = [replace(one, points=tuple(points * MIRROR for points in one.points)) for one in seen]
     first = _combined(turned, others, [_readings(robot, one, model, None)[0] for one in others])
     left = _fitted(robot, turned, others, first).error_m
     if left * EXPLAINED < named.error_m:
         raise DataError(
             f"the markers without names do not fit the robot: the residual is {1e3 * named.error_m:.3g} mm for a spread of "
-            f"{1e3 * spread:.3g} mm, mirrored {1e3 * left:.3g} mm. {LEFT_HANDED}"
+            f"{1e3 * spread:.3g} mm, mirrored {1e3 * left:.3g} mm. Are the axes left-handed? {LEFT_HANDED}"
         )
 
 
@@ -252,13 +250,13 @@ def _require_one(
     """
     spread = _spread(robot)
     for i, one in enumerate(seen):
-        chosen = PosedNames(best.poses[one.view], readings[i][0].marker, best.error_m)
+        chosen = best.poses[one.view]
         likely = [r for r in readings[i][1:] if r.error_m < EXPLAINED * max(readings[i][0].error_m, 1e-6)]
-        others = [r for r in likely if apart(r, chosen, robot.marker_points) > ELSEWHERE * spread]
+        others = [r for r in likely if poses_apart(r.T_robot_camera, chosen, robot.marker_points) > ELSEWHERE * spread]
         for other in others[:3]:
             first = [other if j == i else r[0] for j, r in enumerate(readings)]
             other_fit = _fitted(robot, recording, seen, _combined(recording, seen, first))
-            away = apart(PosedNames(other_fit.poses[one.view], (), 0.0), chosen, robot.marker_points)
+            away = poses_apart(other_fit.poses[one.view], chosen, robot.marker_points)
             both = (other_fit.marker >= 0) & (best.marker >= 0)
             if (
                 (other_fit.marker != best.marker)[both].any()

@@ -13,10 +13,10 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from femsense.calib.rigid import fit_rigid_robust
+from femsense.calib.rigid import fit_rigid_robust, rotation_between
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.core.pose import invert_pose, transform_points
+from femsense.core.pose import transform_points
 
 TRIANGLES = 30
 """Number of measured triangles that are tried. With a third of outliers, 30 % of the triangles contain none; that none of 30 is clean
@@ -239,16 +239,7 @@ def _sides(corner: FloatArray) -> FloatArray:
 
 
 def _laid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3,
-    3) (Kabsch 1976)."""
+    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3, 3)."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd(np.einsum("hki,kj->hij", a - mean_a[:, None], b - mean_b))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    R = U @ Vt
+    R = rotation_between(a - mean_a[:, None], b - mean_b)
     return R, mean_a - np.einsum("hij,j->hi", R, mean_b)
-
-
-def apart(one: PosedNames, other: PosedNames, model: FloatArray) -> float:
-    """Return how far two poses place the markers (m, 3) apart, root mean square [m]."""
-    T = one.T_robot_camera @ invert_pose(other.T_robot_camera)
-    return float(np.sqrt(((transform_points(T, model) - model) ** 2).sum(axis=1).mean()))

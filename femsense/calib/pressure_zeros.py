@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from femsense.calib.marker_fit import MarkerFit
 from femsense.core.arrays import FloatArray, freeze
-from femsense.core.least_squares import FitResult
 from femsense.model.as_it_is import evaluate_robot
-from femsense.model.observation import Scene, SceneJet
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -25,8 +24,7 @@ WEAK = 0.25
 FARTHEST = 0.5
 """One step goes no farther than this share of the recorded range."""
 
-Fitted = tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]
-Fit = Callable[[Robot], Fitted]
+Fit = Callable[[Robot], MarkerFit]
 """Fits poses and initial inputs of a robot."""
 
 
@@ -68,7 +66,7 @@ def find_pressure_zeros(robot: Robot, recording: Recording, fit: Fit) -> Pressur
     zeros = np.zeros(len(names))
     for _ in range(ROUNDS):
         at = with_initial_pressures(robot, dict(zip(names, zeros)))
-        step, covariance = _step(at, fit(at), scale)
+        step, covariance = _step(fit(at), scale)
         step = np.clip(step, -FARTHEST, FARTHEST) * scale
         zeros += step
         if (np.abs(step) < SETTLED * scale).all():
@@ -85,15 +83,15 @@ def weak_zeros(recording: Recording, zeros: PressureZeros) -> str:
     return ", ".join(f"{name} (± {'∞' if std is None else format(std, '.2g')} Pa)" for name, std in weak)
 
 
-def _step(robot: Robot, fitted: Fitted, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _step(fit: MarkerFit, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the step of the zeros and their covariance, in units of `scale`; shapes (c,), (c, c)."""
-    scene, _, poses, initial, jet = fitted
+    robot, scene, jet = fit.robot, fit.scene, fit.jet
     moving = [c for v, T in enumerate(scene.recording.T_robot_camera) if T is None for c in range(6 * v, 6 * v + 6)]
     rows = jet.residual.size
     columns = [jet.by_pose[:, :, moving].reshape(rows, len(moving)), jet.by_initial.reshape(rows, -1)]
     for j, name in enumerate(robot.body.chamber_names):
         near = with_initial_pressures(robot, {name: DIFFERENCE * float(scale[j])})
-        there = evaluate_robot(near, scene, poses, initial, dict(jet.states))
+        there = evaluate_robot(near, scene, fit.poses, fit.initial, dict(jet.states))
         columns.append(((there.residual - jet.residual) / DIFFERENCE).reshape(rows, 1))
     J, c = np.hstack(columns), len(scale)
     unit = np.maximum(np.linalg.norm(J, axis=0), 1e-300)

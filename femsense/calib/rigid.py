@@ -6,11 +6,21 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, as_points
 from femsense.core.errors import DataError, InputError
-from femsense.core.pose import make_pose
+from femsense.core.pose import invert_pose, make_pose, transform_points
+
+
+def rotation_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the rotations (…, 3, 3) that take centred points b (…, n, 3) best onto a (…, n, 3).
+
+    Kabsch 1976; Umeyama 1991 for the determinant.
+    """
+    U, _, Vt = np.linalg.svd(np.swapaxes(a, -1, -2) @ b)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return np.asarray(U @ Vt)
 
 
 def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray | None = None) -> FloatArray:
-    """Return T_a_b, shape (4, 4), that minimises Σ w ‖T_a_b b − a‖² (Kabsch 1976; Umeyama 1991 for the determinant).
+    """Return T_a_b, shape (4, 4), that minimises Σ w ‖T_a_b b − a‖².
 
     Arguments:
         points_a, points_b: corresponding points [m], shape (n, 3).
@@ -27,11 +37,10 @@ def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray
         raise DataError(f"a pose needs three points that are seen; found {int((w > 0).sum())}")
     w = w / w.sum()
     mean_a, mean_b = w @ a, w @ b
-    U, _, Vt = np.linalg.svd((w[:, None] * (a - mean_a)).T @ (b - mean_b))
     spread = np.linalg.svd(np.sqrt(w)[:, None] * (b - mean_b), compute_uv=False)
     if spread[1] < 1e-6 * max(spread[0], 1e-300):
         raise DataError("a pose needs three points that are not on a line")
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    R = rotation_between(w[:, None] * (a - mean_a), b - mean_b)
     return make_pose(R, mean_a - R @ mean_b)
 
 
@@ -47,3 +56,15 @@ def fit_rigid_robust(points_a: FloatArray, points_b: FloatArray, *, rounds: int 
         weights = 1.0 / (1.0 + (distance / scale) ** 2)
         T = fit_rigid(points_a, points_b, weights=weights)
     return T, weights
+
+
+def poses_apart(T: FloatArray, other: FloatArray, points: FloatArray) -> float:
+    """Return how far two poses of a camera put points that it sees apart, root mean square [m]; points (k, 3) are where the second has them."""
+    moved = transform_points(T @ invert_pose(other), points)
+    return float(np.sqrt(((moved - points) ** 2).sum(axis=1).mean()))
+
+
+def rigid_residual(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a minus the best turned and shifted b [m], shape (n, 3); any number of points (n, 3), in any layout."""
+    p, q = a - a.mean(axis=0), b - b.mean(axis=0)
+    return np.asarray(p - q @ rotation_between(p, q).T)

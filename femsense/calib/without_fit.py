@@ -7,7 +7,8 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.first_poses import first_poses
 from femsense.calib.inputs import first_inputs, initial_state
-from femsense.calib.joint import PLACEMENT_STD_FLOOR, root_mean_square
+from femsense.calib.joint import PLACEMENT_STD_FLOOR
+from femsense.calib.marker_fit import root_mean_square
 from femsense.core.arrays import IntArray
 from femsense.core.errors import DataError
 from femsense.core.least_squares import covariance_of

@@ -228,5 +228,5 @@ def test_another_unit_is_named(factor: float, unit: str) -> None:
 def test_left_handed_axes_are_named(zero: str) -> None:
     recording, _ = record(INPUTS, noise=2e-4, seed=1, zero=zero, initial=None if zero == "absolute" else np.full(4, 0.3))
     bare, _ = nameless(recording, KEPT, seed=1)
-    with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
+    with pytest.raises(DataError, match="Are the axes left-handed"):
         calibrate(lopsided(arm()), replace(bare, unnamed_xyz=bare.unnamed_xyz * [1.0, -1.0, 1.0]))
