@@ -3,7 +3,8 @@
     python benchmarks/xr_stream.py [--seconds S] [--soak S] [--robots N] [--viewers N] [--only latency|flood|slow|soak]
 
 The flood: readings at 500 Hz by UDP, JSON and CSV, through a learnt model and out at 60 Hz; the age of a pose counts from when its
-reading was made, and what still goes out after the last reading is counted. The slow viewers handle 25 frames a second.
+reading was made, and what still goes out after the last reading is counted. Beside it a process that does nothing but sleep shows how late
+this machine wakes a process at that time. The slow viewers handle 25 frames a second.
 
 Clients run in processes of their own and compare clocks of the same machine (CLOCK_MONOTONIC). A pose has 12 bones, 356 bytes,
 60 Hz. The soak: robots at 60 Hz to viewers; one viewer more reads nothing, one sends garbage, floods, asks for files,
@@ -136,6 +137,15 @@ def send_readings(port: int, seconds: float, rate_hz: float, out: Any) -> None:
     out.put((k, time.monotonic()))
 
 
+def sleep_only(seconds: float, out: Any) -> None:
+    """Put the longest delay [s] with which a process that only sleeps for 2 ms at a time is woken."""
+    late, end = 0.0, time.monotonic() + seconds
+    while (now := time.monotonic()) < end:
+        time.sleep(0.002)
+        late = max(late, time.monotonic() - now - 0.002)
+    out.put(late)
+
+
 def line_model() -> Any:
     """A model of five markers on a line, moved by two channels, with twelve bones."""
     from femsense.xr.armature import ArmatureOptions, make_armature
@@ -160,6 +170,7 @@ def flood(seconds: float, rate_hz: float = 500.0) -> None:
     spawn = mp.get_context("spawn")
     out: Any = spawn.Queue()
     sent: Any = spawn.Queue()
+    late: Any = spawn.Queue()
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         model = save_model(line_model(), Path(folder) / "line.onnx")
         probe.bind(("127.0.0.1", 0))
@@ -170,17 +181,21 @@ def flood(seconds: float, rate_hz: float = 500.0) -> None:
             client.start()
             time.sleep(2.0)
             source = spawn.Process(target=send_readings, args=(port, seconds, rate_hz, sent))
+            sleeper = spawn.Process(target=sleep_only, args=(seconds, late))
             source.start()
+            sleeper.start()
             count, ended = sent.get(timeout=seconds + 20.0)
             ages, _, last = out.get(timeout=seconds + 20.0)
-            source.join()
-            client.join()
+            woken = late.get(timeout=seconds + 20.0)
+            for process in (source, sleeper, client):
+                process.join()
             poses, dropped = live.publishers[0].sent, live.sources[0].dropped
     print(f"\n{count} readings at {rate_hz:.0f} Hz, {poses} poses, {dropped} readings replaced by newer ones:\n")
     print("| from a reading to a viewer | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
     print(table_row("flood", ages), flush=True)
     print(
-        f"\nThe oldest pose was {1e3 * max(ages):.1f} ms old; the last arrived {1e3 * (last - ended):.1f} ms after the last reading."
+        f"\nThe oldest pose was {1e3 * max(ages):.1f} ms old; the last arrived {1e3 * (last - ended):.1f} ms after the last reading.\n"
+        f"Meanwhile a process that only sleeps was woken up to {1e3 * woken:.1f} ms late."
     )
 
 

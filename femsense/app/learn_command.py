@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +86,7 @@ def _learnt(task: LearnTask, data: Labelled, other: Labelled | None, progress: C
 def _corrected(task: LearnTask, file: Path, data: Labelled, other: Labelled | None) -> Made:
     """Correct the model of a file by data of another day; `other` are the recordings of the test."""
     from femsense.xr.proprioception.drift import adapt, drift
+    from femsense.xr.proprioception.learn import errors_on
     from femsense.xr.proprioception.model_file import load_model
 
     before = load_model(file)
@@ -96,11 +98,10 @@ def _corrected(task: LearnTask, file: Path, data: Labelled, other: Labelled | No
         )
     document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
     document["shifts"] = found.shifts
+    text += "\n" + "\n".join(interval_text(model.report))
     if other is not None and task.test is not None:
-        document["test"] = _tested(model, other)
-        text += f"\non {task.test[0]}: {_each_text(document['test'])}"
-    if model.spread is not None:
-        text += f"\n95 % interval: {_radius_text(model, data)} (median)"
+        model = replace(model, report={**model.report, "test": errors_on(model, other, model.report["error_mm"])})
+        text += f"\n\n{test_text(model, other, task.test[0])}"
     return model, document, text
 
 
@@ -137,10 +138,15 @@ def report_text(report: dict[str, Any]) -> str:
 
 def interval_text(report: dict[str, Any]) -> list[str]:
     """Return the intervals of a model and their coverage, as lines."""
-    interval, sessions = report["interval"], report["sessions"]
+    interval, sessions, adapted = report["interval"], report["sessions"], "adapted" in report
     radii = ", ".join(f"{name} {radius:.2f} mm" for name, radius in interval["radius_mm"].items())
     coverage = f"{100 * interval['coverage']:.0f} % of the held-out positions lie within it"
-    if sessions > 1:
+    if adapted:
+        validity = (
+            "drifts: interval holds within a session only. From the session that was learnt to this one the error had grown "
+            f"{interval['growth']:.1f} times before the correction"
+        )
+    elif sessions > 1:
         validity = f"it holds what differs between the {sessions} recordings: each was predicted from the others"
     else:
         validity = (
@@ -181,25 +187,6 @@ def frame_text(frame: str) -> str:
         "  markers and bones are in the frame in which they were measured, not the robot's:"
         " -c CALIBRATION takes them there, --robot-frame says that they are there"
     )
-
-
-def _tested(model: ProprioceptiveModel, data: Labelled) -> dict[str, float]:
-    """Return the error of each marker on data that the model was not made from [mm]."""
-    from femsense.xr.proprioception.drift import model_inputs
-    from femsense.xr.proprioception.learn import marker_errors_mm
-
-    return marker_errors_mm(model.network(model_inputs(model, data)) - data.targets, model.marker_names)
-
-
-def _radius_text(model: ProprioceptiveModel, data: Labelled) -> str:
-    """Return the median radius of the interval of each marker."""
-    import numpy as np
-
-    from femsense.xr.proprioception.drift import model_inputs
-
-    assert model.spread is not None
-    radii = np.median(model.spread.radius(model.network, model_inputs(model, data)), axis=0)
-    return _each_text(dict(zip(model.marker_names, (1e3 * radii).tolist())))
 
 
 def _each_text(errors_mm: dict[str, float]) -> str:

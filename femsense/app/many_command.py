@@ -27,6 +27,7 @@ Say = Callable[[str], None]
 Run = Callable[..., Outcome]
 LINE_S = 30.0
 """Period of the lines on progress where no terminal shows a bar."""
+NO_WORKER = "no worker yet"
 LISTED = 5
 """Jobs without a result that are listed."""
 
@@ -107,7 +108,7 @@ def progress_text(now: Progress) -> str:
     parts = [f"{now.finished} of {now.total}"]
     parts += [f"{now.kept} were there"] if now.kept else []
     parts += [f"{now.failed} without a result"] if now.failed else []
-    parts += [f"{now.running} running"]
+    parts += [f"{now.running} running"] if now.running else [NO_WORKER] if now.finished < now.total else []
     parts += [f"{duration(now.seconds_left)} left"] if now.seconds_left is not None and now.finished < now.total else []
     parts += [f"slowest {now.slowest.name} {duration(now.slowest.seconds)}"] if now.slowest is not None else []
     return ", ".join(parts)

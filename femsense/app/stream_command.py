@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
-from femsense.app.stream_log import Streamed, StreamLog, Watched, connection, readings_from
+from femsense.app.stream_log import Streamed, StreamLog, Watched, connection, readings_from, remark
 from femsense.app.stream_options import StreamOptions
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password, without_password
@@ -336,7 +336,7 @@ def _need_known_clients(address: BrokerAddress | None, *, embedded: bool, passwo
 def _watch(live: LiveStream, readings: Readings, shown: str, why: Callable[[], str]) -> None:
     """Report missing readings, and lines that are no readings."""
     live.sources.append(readings)
-    live.watched.append(readings_from(shown, why, lambda: readings.refused))
+    live.watched += [readings_from(shown, why, lambda: readings.refused), remark(lambda: readings.assumed)]
 
 
 def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, readings: str = "") -> Publisher:

@@ -39,6 +39,11 @@ def readings_from(source: str, why: Callable[[], str], refused: Callable[[], str
     return Watched(f"no readings of {source}", f"readings of {source} come", "waiting", why, beside)
 
 
+def remark(text: Callable[[], str]) -> Watched:
+    """Return the observer of a note that is reported once; the text is empty until there is one."""
+    return Watched("", "", "", lambda: "", text)
+
+
 class StreamLog:
     """Reports of each connection and source when it is lost and when it is back."""
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
@@ -35,6 +35,7 @@ FEWEST_DASK = 200
 CONNECT = "10s"
 """A scheduler that does not answer within this time is taken as absent."""
 GONE = "the scheduler is gone, and its workers with it; results so far are kept, and the same command continues"
+DURATIONS = ("--lifetime", "--lifetime-stagger")
 TTL = "1 hour"
 """Longest silence of a dask worker: compiled code can hold Python's lock for minutes."""
 
@@ -297,10 +298,25 @@ def _jobqueue(file: Path, workers: int | None) -> Any:
             expected=f"one of {', '.join(sorted(map(str, kinds)))}",
             hint="femsense docs many shows a file",
         )
+    _check_durations(file, document["jobqueue"][names[0]])
     dask_.config.update(dask_.config.config, document)
     cluster = kinds[names[0]]()
     cluster.scale(jobs=workers or 1)
     return cluster
+
+
+def _check_durations(file: Path, table: Any) -> None:
+    """Raise InputError for a lifetime that dask's workers cannot read: each would end at once, and the driver wait forever."""
+    from dask.utils import parse_timedelta
+
+    table = table if isinstance(table, dict) else {}
+    words = table.get("worker-extra-args") or table.get("worker_extra_args") or ()
+    for flag, value in pairwise(map(str, words)):
+        try:
+            if flag in DURATIONS:
+                parse_timedelta(value)
+        except (ValueError, KeyError):
+            raise InputError("not a duration", where=f"{file}: {flag}", found=value, expected="one unit: 230m, or 3.8h") from None
 
 
 # The registry

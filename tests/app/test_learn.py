@@ -43,11 +43,14 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (
         "not the robot's" in said and "base moved: " in said and "corrected by a rigid motion: " in said and "written: " in said
     )
+    assert "interval holds within a session only. From the session that was learnt to this one the error had grown" in said
     assert run(["learn", *other, "-o", str(mended), "--adapt", str(model), "--test", *files, "--json"]) == 0
-    tested = json.loads(capsys.readouterr().out)["test"]
-    assert list(tested) == ["a", "b", "c"] and all(
-        9.0 < error < 11.0 for error in tested.values()
+    document = json.loads(capsys.readouterr().out)
+    tested = document["test"]
+    assert list(tested["marker_error_mm"]) == ["a", "b", "c"] and all(
+        9.0 < error < 11.0 for error in tested["marker_error_mm"].values()
     )  # what the first day lacks [mm]
+    assert tested["coverage"] < 0.1 and document["error_mm"] == document["adapted"]["error_mm"] < 0.6 < tested["error_mm"]
     assert run(["learn", *other, "-o", str(mended), "--adapt", str(model), "--plane", "0,1,0"]) == 2
     assert "keeps its bones" in capsys.readouterr().err
     row = [0.4, 1.5]

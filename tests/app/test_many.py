@@ -14,8 +14,10 @@ from helpers import write_block_robot
 from rig_scripts import SCRIPT
 
 from femsense.app import cli
+from femsense.app.many_command import progress_text
 from femsense.io.files import folder_hash
 from femsense.io.folder_lock import only_writer
+from femsense.many.drive import Progress
 
 IN_PROCESS = ("--workers", 0)
 
@@ -200,3 +202,11 @@ def test_one_that_cannot_be_read_does_not_stop_the_others(run: Any, lab: Path) -
     said = run("calibrate", lab / "robot", lab / "recordings", "-o", lab / "cal", *IN_PROCESS)
     assert said.status == 1 and "1 failed, 1 done" in said.out and "frames.csv" in said.out
     assert [row["status"] for row in rows_of(lab / "cal")] == ["failed", "done"]
+
+
+@pytest.mark.parametrize(
+    ("finished", "running", "said"), [(0, 0, "0 of 3, no worker yet"), (1, 2, "1 of 3, 2 running"), (3, 0, "3 of 3")]
+)
+def test_progress_says_when_no_worker_has_come(finished: int, running: int, said: str) -> None:
+    now = Progress(total=3, finished=finished, kept=0, failed=0, running=running, seconds=9.0, seconds_left=None, slowest=None)
+    assert progress_text(now) == said

@@ -44,6 +44,13 @@ def test_a_file_declares_one_cluster_of_dask_jobqueue(text: str, found: str, tmp
         pass
 
 
+def test_a_lifetime_that_would_end_each_worker_at_once_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "cluster.yaml"
+    file.write_text("jobqueue: {slurm: {worker-extra-args: [--lifetime, 3h50m]}}\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"--lifetime: not a duration\n  found:    3h50m"), open_engine(2, str(file), None):
+        pass
+
+
 def test_a_scheduler_that_dies_ends_the_run_and_keeps_what_is_done(tmp_path: Path) -> None:
     file = tmp_path / "scheduler.json"
     words = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]

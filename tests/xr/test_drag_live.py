@@ -92,6 +92,7 @@ for (const stop of stops) {
   await page.mouse.move(x - 6, y - 20, { steps: 4 });        // the button is still down
   say({ armed: await on('#arm') });
   await told();
+  say({ reach: await page.textContent('#reach') });
   await page.mouse.up();
 }
 await opened.close();
@@ -204,6 +205,9 @@ def test_a_bystander_s_button_and_anybody_s_escape_key_stop_the_robot(
                 count = len(commands)
                 time.sleep(0.5)
                 assert len(commands) == count  # the held button moves nothing any more
+                server.answer("tip", (0.1, 0.0, 0.0))  # one that was under way
+                time.sleep(0.3)
                 go_on(browser)
+                assert said(browser)["reach"].startswith("Stopped")
         finally:
             browser.kill()

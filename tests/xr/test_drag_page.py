@@ -141,3 +141,41 @@ def test_a_finger_that_covers_a_point_takes_it(request: pytest.FixtureRequest, b
     finally:
         source.close()
         browser.kill()
+
+
+NAMED = """
+const page = await opened.newPage();
+await page.goto(given[0]);
+await page.waitForFunction(() => femsense.shown.robots.get('bar')?.shown, null, { timeout: 60000 });
+const found = [];
+for (const [width, height] of [[390, 844], [844, 390], [1280, 760]]) {
+  await page.setViewportSize({ width, height });
+  await page.waitForFunction((width) => innerWidth === width, width);
+  for (let i = 0; i < 3; i++) await page.evaluate(() => new Promise((done) => requestAnimationFrame(done)));
+  found.push(await page.evaluate(() => {
+    const box = (id) => document.querySelector(id).getBoundingClientRect();
+    const at = (of) => document.elementFromPoint((of.left + of.right) / 2, (of.top + of.bottom) / 2)?.id;
+    const [title, panel] = [document.querySelector('.title').getBoundingClientRect(), box('#panel')];
+    return { stop: at(box('#stop')), apart: panel.top >= title.bottom || panel.left >= title.right, panel: panel.height };
+  }));
+}
+console.log(JSON.stringify(found));
+await opened.close();
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_long_name_leaves_the_stop_button_and_the_panel_where_they_are(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), built_page, still=True, commands=True)
+    model = source.hub.newest()["femsense/bar/model"].payload
+    long = json.dumps({**json.loads(model), "name": "four-leg-with-friction-on-north-and-south-2026-11-28-evening"})
+    source.hub.publish([Message("femsense/bar/model", long.encode())])
+    browser = start_browser(request.config, NAMED, source.server.url)
+    try:
+        found = said(browser)
+    finally:
+        source.close()
+        browser.kill()
+    assert [one["stop"] for one in found] == ["stop"] * 3 and all(one["apart"] and one["panel"] > 50 for one in found)

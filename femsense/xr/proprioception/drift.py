@@ -23,7 +23,7 @@ from femsense.xr.proprioception.corrections import (
 )
 from femsense.xr.proprioception.domain import Domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
-from femsense.xr.proprioception.learn import error_interval
+from femsense.xr.proprioception.learn import error_interval, error_table, marker_errors_mm, median_radius_mm
 from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.selection import marker_rms
@@ -107,16 +107,31 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
     """Return the model corrected by a few labelled frames of another day.
 
     The correction is selected from `corrections.CORRECTIONS`; the report names it with its
-    error on held-out frames.
+    error on held-out frames, which replaces that of the model, and so do the intervals. They are of one session: `growth` is the error of the
+    model before the correction, over the one stated for it.
 
     Raises:
         DataError: fewer than 8 rows.
     """
     frames = _frames(model, few)
     chosen, left = explain(frames)
+    network = corrected(frames, chosen)
+    held = frames.held_out(chosen)
+    spread = make_spread(network, frames.inputs, held)
+    errors = frames.errors(chosen)
+    radius = spread.radius(network, frames.inputs)
+    before, learnt = 1e3 * left["none"], float(model.report.get("error_mm", 0.0))
     report = {
-        **model.report,
-        "adapted": {"by": chosen, "rows": len(few), "error_mm": 1e3 * left[chosen], "before_mm": 1e3 * left["none"]},
+        **{key: value for key, value in model.report.items() if key != "test"},
+        **error_table(errors),
+        "marker_error_mm": marker_errors_mm(errors, model.marker_names),
+        "sessions": 1,
+        "interval": {
+            "radius_mm": median_radius_mm(radius, model.marker_names),
+            "coverage": spread.share_within(held),
+            "growth": before / max(learnt, 1e-9),
+        },
+        "adapted": {"by": chosen, "rows": len(few), "error_mm": 1e3 * left[chosen], "before_mm": before, "learnt_mm": learnt},
     }
     domain = model.domain
     if "channel" in chosen:
@@ -124,8 +139,6 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
         moved = found.by * np.eye(len(model.channels))[found.channel]
         report["adapted"] |= {"channel": model.channels[found.channel], "channel_shift": found.by}
         domain = replace(domain, low=domain.low + moved, high=domain.high + moved, centre=domain.centre + moved)
-    network = corrected(frames, chosen)
-    spread = make_spread(network, frames.inputs, frames.held_out(chosen))
     return replace(model, network=network, bones=None, domain=_wider(domain, few.readings), report=report, spread=spread)
 
 

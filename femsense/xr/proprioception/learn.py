@@ -98,7 +98,7 @@ def learn(
     table = {}
     for item in compared:
         errors = networks[item.plan.kind](kept.inputs(item.plan.memory_s)) - kept.targets
-        table[item.plan.kind] = _row(errors) | {
+        table[item.plan.kind] = error_table(errors) | {
             "blocks_mm": 1e3 * item.rms,
             "median_block_mm": 1e3 * item.typical,
             "memory_s": list(item.plan.memory_s),
@@ -120,7 +120,7 @@ def learn(
         "motion_mm": 1e3 * marker_rms(data.targets - data.targets.mean(axis=0)),
         "sessions": len(np.unique(data.part)),
         "interval": {
-            "radius_mm": dict(zip(data.marker_names, (1e3 * np.median(spread.radius(network, inputs), axis=0)).tolist())),
+            "radius_mm": median_radius_mm(spread.radius(network, inputs), data.marker_names),
             "coverage": coverage(spread, network, inputs, kept.targets),
             "growth": growth(out),
         },
@@ -152,7 +152,7 @@ def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> d
     inputs = data.inputs(model.memory_s)
     errors = model.network(inputs) - data.targets
     table = {
-        **_row(errors),
+        **error_table(errors),
         "marker_error_mm": marker_errors_mm(errors, model.marker_names),
         "rows": len(data),
         "outside": float(1.0 - model.domain.inside(data.readings).mean()),
@@ -230,13 +230,19 @@ def _chain(rest: FloatArray, options: ArmatureOptions) -> Armature | None:
     return make_armature(rest, options) if len(rest) > 1 and (apart > 0).all() else None
 
 
-def _row(errors: FloatArray) -> dict[str, Any]:
+def error_table(errors: FloatArray) -> dict[str, Any]:
+    """Return the root mean square distance of markers [mm] and its 95 % interval, of coordinates [m], shape (rows, 3 m)."""
     return {"error_mm": 1e3 * marker_rms(errors), "error_ci_mm": [1e3 * x for x in error_interval(errors)]}
 
 
 def marker_errors_mm(errors: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
     """Return the root mean square of each marker's distance [mm], of coordinates [m], shape (rows, 3 m)."""
     return {name: 1e3 * marker_rms(errors[:, 3 * i : 3 * i + 3]) for i, name in enumerate(names)}
+
+
+def median_radius_mm(radius: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the median of each marker's radius [mm], of radii [m], shape (rows, m)."""
+    return dict(zip(names, (1e3 * np.median(radius, axis=0)).tolist()))
 
 
 def _bone_error(numbers: FloatArray, chain: Armature, test: Labelled) -> float:

@@ -47,6 +47,10 @@ class Spread:
         """Return s(x), shape (n,), of inputs of the network, shape (n, d)."""
         return np.sqrt(1.0 + self.kappa * leverage(self.root, network, inputs))
 
+    def share_within(self, held: HeldOut) -> float:
+        """Return the share of marker positions on held-out rows that lie within their intervals."""
+        return float((held.distance <= np.sqrt(1.0 + self.kappa * held.leverage)[:, None] * self.quantile).mean())
+
     def radius(self, network: Network, inputs: FloatArray) -> FloatArray:
         """Return the radius of the 95 % interval of each marker [m], shape (n, m)."""
         return np.asarray(self.size(network, inputs)[:, None] * self.quantile)
@@ -122,8 +126,18 @@ def make_spread(network: Network, inputs: FloatArray, held: HeldOut) -> Spread:
     """
     kappa = likeliest_kappa(held)
     groups = [held, *(held.pick(held.group == g) for g in np.unique(held.group) if g != BETWEEN)]
-    quantiles = [np.quantile(one.distance / np.sqrt(1.0 + kappa * one.leverage)[:, None], LEVEL, axis=0) for one in groups]
+    quantiles = [_quantile(one.distance / np.sqrt(1.0 + kappa * one.leverage)[:, None]) for one in groups]
     return Spread(freeze(root_of(network, inputs)), kappa, freeze(np.max(quantiles, axis=0)))
+
+
+def _quantile(values: FloatArray) -> FloatArray:
+    """Return the bound of each column, shape (m,), below which a further value lies with a probability of at least `LEVEL`.
+
+    Of n values it is the ⌈(n + 1) LEVEL⌉-th, at most the largest (split conformal prediction; Lei et al. 2018, Distribution-free
+    predictive inference for regression).
+    """
+    rank = min(int(np.ceil((len(values) + 1) * LEVEL)), len(values))
+    return np.asarray(np.sort(values, axis=0)[rank - 1])
 
 
 def likeliest_kappa(held: HeldOut) -> float:

@@ -2,23 +2,57 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import hmac
 from dataclasses import dataclass, field
 from typing import Any
 
 from amqtt.broker import Broker
+from amqtt.errors import AMQTTError, MQTTError
 from amqtt.plugins.base import BaseAuthPlugin
 from amqtt.session import ApplicationMessage, Session
 
 from femsense.xr.stream.hub import Message
 
 
-class EachOnce(Broker):  # type: ignore[misc]
-    """amqtt's broker, with retained messages sent to a client for its own subscriptions only.
+class NewestToEach(Broker):  # type: ignore[misc]
+    """amqtt's broker, without queues to its clients: of each topic the newest message waits for a client.
 
-    On connection, amqtt 0.12 also sends a client the messages retained for the filters of all others: duplicates of what its own
-    subscriptions bring, and topics without a subscription.
+    amqtt 0.12 queues all messages to all clients: under a flood from one of them, the others receive commands seconds late.
+
+    Retained messages are sent to a client for its own subscriptions only. On connection, amqtt 0.12 also sends it those for the
+    filters of all others: duplicates of what its own subscriptions bring, and topics without a subscription.
     """
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        super().__init__(settings)
+        self._waiting: dict[str, dict[str, tuple[bytes, int]]] = {}  # client → topic → message and quality of service
+        self._deliveries: set[asyncio.Task[None]] = set()
+
+    async def _broadcast_message(self, _from: Session | None, topic: str, data: bytes | None, qos: int | None = None) -> None:
+        """Start to deliver a message to the clients that have subscribed to it; while one is busy, its message waits."""
+        targets = [pair for wanted, pairs in self._subscriptions.items() if self._matches(topic, wanted) for pair in pairs]
+        for target, asked in targets:
+            if target.transitions.state != "connected":
+                continue
+            is_idle = target.client_id not in self._waiting
+            self._waiting.setdefault(target.client_id, {})[topic] = (bytes(data or b""), asked if qos is None else qos)
+            if is_idle:
+                delivery = asyncio.create_task(self._deliver(target))
+                self._deliveries.add(delivery)
+                delivery.add_done_callback(self._deliveries.discard)
+
+    async def _deliver(self, target: Session) -> None:
+        waiting = self._waiting[target.client_id]
+        try:
+            while waiting and (handler := self._get_handler(target)) is not None:
+                topic = next(iter(waiting))
+                data, qos = waiting.pop(topic)
+                with contextlib.suppress(AMQTTError, MQTTError, OSError):  # the client has left
+                    await handler.mqtt_publish(topic, data, qos, retain=False)
+        finally:
+            del self._waiting[target.client_id]
 
     async def _publish_retained_messages_for_subscription(self, subscription: tuple[str, int], session: Session) -> None:
         if any(owner is session for owner, _ in self._subscriptions.get(subscription[0], ())):

@@ -282,7 +282,7 @@ class EmbeddedBroker:
         self._loop = asyncio.new_event_loop()
         keep_quiet(self._loop)
         self._broker: Any = None
-        self._waiting: dict[str, Message] = {}
+        self._deliveries: set[asyncio.Task[None]] = set()
         self._arrived: set[str] = set()
         self._failed: BaseException | None = None
         self._finish = asyncio.Event()
@@ -322,7 +322,7 @@ class EmbeddedBroker:
             self._loop.close()
 
     async def _serve(self, ready: Event) -> None:
-        from femsense.xr.stream.broker_guests import EachOnce
+        from femsense.xr.stream.broker_guests import NewestToEach
 
         for name in ("amqtt", "transitions"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -333,7 +333,7 @@ class EmbeddedBroker:
             listener |= {"ssl": True, "certfile": str(self._access.certificate), "keyfile": str(key)}
         settings = {"listeners": {"default": listener}, "plugins": {"femsense.xr.stream.broker_guests.Guests": guests}}
         try:
-            self._broker = EachOnce(settings)
+            self._broker = NewestToEach(settings)
             await self._broker.start()
         except Exception as error:  # amqtt wraps system errors in its own classes
             self._failed = error.__cause__ or error
@@ -352,22 +352,15 @@ class EmbeddedBroker:
             self._hub.received(message, who)
 
     def _take(self, messages: tuple[Message, ...]) -> None:
-        """Start to deliver, unless the last delivery is still going on: then the newest of each topic waits."""
-        idle = not self._waiting
-        self._waiting.update((message.topic, message) for message in messages)
-        if idle and self._waiting:
-            self._task = self._loop.create_task(self._deliver())
+        delivery = self._loop.create_task(self._deliver(messages))
+        self._deliveries.add(delivery)
+        delivery.add_done_callback(self._deliveries.discard)
 
-    async def _deliver(self) -> None:
-        while self._waiting:
-            messages = list(self._waiting.values())
-            for message in messages:
-                if message.retained:
-                    await self._broker.retain_message(None, message.topic, message.payload, 0)
-                await self._broker.internal_message_broadcast(message.topic, message.payload, 0)
-            for message in messages:
-                if self._waiting.get(message.topic) is message:
-                    del self._waiting[message.topic]
+    async def _deliver(self, messages: tuple[Message, ...]) -> None:
+        for message in messages:
+            if message.retained:
+                await self._broker.retain_message(None, message.topic, message.payload, 0)
+            await self._broker.internal_message_broadcast(message.topic, message.payload, 0)
 
 
 def _free_port() -> int:

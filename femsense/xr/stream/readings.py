@@ -71,6 +71,7 @@ class Readings(Iterator[Reading]):
         self._begun = time.monotonic()
         self._clock, self._slot = SenderClock(), Latest[_Made]()
         self._first: Any = None
+        self._pair: tuple[bytes, FloatArray] | None = None
         self._newest_at = self._late_s = float("nan")
         self.came = float("nan")
         """When the reading that was returned last was made, by its sender's time, else when it arrived [s, monotonic clock]."""
@@ -85,6 +86,8 @@ class Readings(Iterator[Reading]):
         if found is None:
             self._pass_over(item)
             return
+        if self._pair is None and isinstance(item, bytes) and WHOLE_PAIR.fullmatch(item.decode("utf-8", "replace").strip()):
+            self._pair = item, found[1]
         arrived = time.monotonic()
         late = self._clock.age_s(found[0], arrived)
         if late is None:
@@ -135,6 +138,15 @@ class Readings(Iterator[Reading]):
         text = self._first.decode("utf-8", "replace").strip() if isinstance(self._first, bytes) else ""
         comma = ": a decimal comma? Write a point, or semicolons between numbers" if WHOLE_PAIR.fullmatch(text) else ""
         return f"what comes is no reading of its channels, first {_shown(self._first)}{comma}" if self.passed else ""
+
+    @property
+    def assumed(self) -> str:
+        """How a line is read that could be one number with a decimal comma; empty if there was none."""
+        if self._pair is None:
+            return ""
+        line, values = self._pair
+        said = " and ".join(f"{value:g}" for value in values)
+        return f"{_shown(line.strip())} is read as two values, {said}; with a decimal comma, write semicolons between numbers"
 
 
 def readings_of(source: str, channels: Sequence[str], stop: Event) -> Readings:

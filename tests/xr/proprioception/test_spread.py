@@ -19,7 +19,7 @@ from femsense.xr.proprioception.linear import train_ridge
 from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.proprioception.model_file import load_model, save_model
 from femsense.xr.proprioception.selection import marker_rms, train_mlp
-from femsense.xr.proprioception.spread import HeldOut, growth, likeliest_kappa, splits
+from femsense.xr.proprioception.spread import BETWEEN, HeldOut, growth, likeliest_kappa, make_spread, splits
 
 RIDGE = LearnOptions(kinds=("ridge",), memories=((),))
 
@@ -48,6 +48,17 @@ def test_intervals_hold_on_other_sessions_as_often_as_they_say(model: Propriocep
     assert 0.90 < model.report["interval"]["coverage"] < 0.99
     # three normal coordinates of 0.5 mm: 95 % lie within 2.8 of them
     np.testing.assert_allclose(list(model.report["interval"]["radius_mm"].values()), 0.5 * 2.795, rtol=0.12)
+
+
+def test_a_further_error_lies_within_the_interval_of_few_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    network = train_ridge(rng.normal(size=(60, 2)), rng.normal(size=(60, 3)), penalty=1e-3)
+    some, every = rng.normal(size=(40, 2)), np.full(40, BETWEEN)
+    drawn = [
+        make_spread(network, some, HeldOut(np.abs(rng.normal(size=(40, 1))), np.zeros(40), every)).quantile[0] for _ in range(400)
+    ]
+    # the 39th of 40 is above a further one with a probability of 39 / 41
+    assert np.mean(rng.normal(size=20_000)[:, None] ** 2 <= np.square(drawn)) == pytest.approx(39 / 41, abs=0.006)
 
 
 def test_intervals_widen_where_nothing_was_learnt(model: ProprioceptiveModel) -> None:

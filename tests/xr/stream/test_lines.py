@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
+from threading import Event
 
 import numpy as np
 import pytest
 
-from femsense.xr.stream.readings import read_line
+from femsense.xr.stream.readings import Readings, read_line
 
 
 @pytest.mark.parametrize(
@@ -30,3 +32,16 @@ def test_numbers_of_a_line(line: bytes, channels: list[str], time: float, values
 
 def test_a_decimal_comma_is_not_taken_for_a_time_and_a_value() -> None:
     assert read_line(b"0,512", ["a"]) is None
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"0,512\r\n", "'0,512' is read as two values, 0 and 512; with a decimal comma, write semicolons between numbers"),
+        (b"0.1,2", ""),
+    ],
+)
+def test_how_a_comma_between_two_channels_is_read_is_said(line: bytes, said: str) -> None:
+    readings = Readings(partial(read_line, channels=["a", "b"]), Event())
+    readings.hear(line)
+    assert readings.assumed == said

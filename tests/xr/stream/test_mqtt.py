@@ -21,7 +21,15 @@ from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, MqttSource, broker_address, lets_anybody_in
+from femsense.xr.stream.mqtt import (
+    BrokerAddress,
+    EmbeddedBroker,
+    MqttSink,
+    MqttSource,
+    broker_address,
+    lets_anybody_in,
+    make_client,
+)
 from femsense.xr.stream.publisher import Publisher, PublishOptions
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 
@@ -106,6 +114,25 @@ def test_the_embedded_broker_gives_what_is_kept_once_to_each_of_several_and_only
                 assert sorted(one.kinds) == ["glb", "model", "status", "status"]
             assert states.kinds == ["status", "status"]
         assert broker.clients == 3
+
+
+def test_a_client_of_the_embedded_broker_that_does_not_read_holds_up_nobody_and_then_gets_the_newest() -> None:
+    hub, seen = Hub(), []
+    broker = EmbeddedBroker(hub, port=0)
+    reads, sleeps = Heard(broker.port), make_client(BrokerAddress("127.0.0.1", broker.port))
+    sleeps.on_message = lambda _client, _data, got: seen.append(got.payload[0])
+    sleeps.on_subscribe = lambda *_: seen.append(0)
+    with closing(reads, hub):
+        assert within(5.0, reads.source.connected.is_set)
+        sleeps.connect("127.0.0.1", broker.port)
+        sleeps.subscribe("femsense/arm/cloud")
+        assert within(5.0, lambda: sleeps.loop(0.1) == 0 and bool(seen))  # and then it does not read
+        for k in range(1, 151):
+            hub.publish([Message("femsense/arm/cloud", bytes([k]) * 200_000)])
+            assert within(5.0, lambda k=k: reads.messages.get("cloud", b"-")[0] == k)
+        assert within(10.0, lambda: sleeps.loop(0.1) == 0 and seen[-1] == 150)
+        sleeps.disconnect()
+    assert seen == sorted(seen) and len(seen) < 140
 
 
 def test_a_taken_port_is_said() -> None:

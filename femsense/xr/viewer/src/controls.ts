@@ -83,10 +83,12 @@ export function offerHeadset(stage: Stage): void {
   for (const id of ["panel", "dock", "dragging", "top"]) element(id).addEventListener("beforexrselect", (event) => event.preventDefault());
 }
 
-/** Passes the height of the bar to the styles of the elements above it. */
-export function announceDock(): void {
-  const dock = element("dock");
-  new ResizeObserver(() => document.documentElement.style.setProperty("--dock", `${dock.offsetHeight}px`)).observe(dock);
+/** Passes the heights of the title, the buttons next to it and the bar to the styles of the elements between them. */
+export function announceEdges(): void {
+  for (const id of ["top", "actions", "dock"]) {
+    const edge = element(id);
+    new ResizeObserver(() => document.documentElement.style.setProperty(`--${id}`, `${edge.offsetHeight}px`)).observe(edge);
+  }
 }
 
 /** Indicates that the panel continues below its visible part. */

@@ -58,6 +58,7 @@ export class Dragging {
   private shown: Reach | null = null;
   private seq = 0;
   private lease: Lease | null = null;
+  private refused = false; // a stop, or another client: answers do not replace the displayed reason
   /** Identifier of this page among the clients. */
   readonly client = Array.from(crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16).padStart(2, "0")).join("");
   private readonly plane = new Plane();
@@ -123,6 +124,7 @@ export class Dragging {
     this.line.visible = this.target.visible = false;
     element("dragging").hidden = !on;
     this.shown = this.heard; // earlier answers belong to another client
+    this.refused = false;
     if (on) this.tell(HINT, "", "");
     this.stage.panelsChanged();
   }
@@ -144,11 +146,23 @@ export class Dragging {
     const stoppedNow = lease.stopped && lease.number !== this.lease?.number; // it is repeated until somebody holds a lease again
     this.lease = lease;
     if (stoppedNow && (this.armed || this.held !== null)) {
-      this.letGo();
-      this.tell("Stopped. Arm the robot again to go on.", "stopped", "");
+      this.stopped();
     } else if (this.held !== null && lease.client && lease.client !== this.client) {
-      this.tell("Somebody else is dragging this robot: yours comes after.", "stopped", "");
+      this.refuse("Somebody else is dragging this robot: yours comes after.");
+    } else if (lease.client === this.client) {
+      this.refused = false;
     }
+  }
+
+  /** Lets go after a stop, and states it until the robot is armed or a point is held again. */
+  stopped(): void {
+    this.letGo();
+    if (this.subject?.commands) this.refuse("Stopped. Arm the robot again to go on.");
+  }
+
+  private refuse(reason: string): void {
+    this.refused = true;
+    this.tell(reason, "stopped", "");
   }
 
   /** The sender's part of each message: its lease, or 0 to request one. */
@@ -231,7 +245,7 @@ export class Dragging {
     this.heard = reach;
     if (!this.enabled || reach === this.shown) return;
     this.shown = reach;
-    this.tell(reach.text, reach.status, reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`.replaceAll(" ", "\u00a0")).join(" · "));
+    if (!this.refused) this.tell(reach.text, reach.status, reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`.replaceAll(" ", "\u00a0")).join(" · "));
     element("arm").dataset.moving = String(reach.armed);
     if (ghost && this.subject) {
       poseBones(this.reachable().bones, ghost);
@@ -258,6 +272,10 @@ export class Dragging {
 
   private arm(on: boolean): void {
     if (on && this.held === null) this.open(); // after a stop the hand must be opened first
+    if (on && this.refused) {
+      this.refused = false;
+      this.tell(HINT, "", "");
+    }
     this.armed = on && this.subject?.commands === true;
     const button = element("arm");
     button.setAttribute("aria-pressed", String(this.armed));
@@ -288,6 +306,7 @@ export class Dragging {
   }
 
   private begin(index: number): void {
+    this.refused = false;
     this.held = this.chosen = index;
     this.balls[index]!.getWorldPosition(this.wish);
     this.plane.setFromNormalAndCoplanarPoint(this.stage.camera.getWorldDirection(new Vector3()).negate(), this.wish);
@@ -305,6 +324,7 @@ export class Dragging {
   private release(): void {
     if (this.held === null) return;
     this.held = null;
+    this.refused = false;
     this.open();
     this.stage.controls.enabled = true;
     this.line.visible = this.target.visible = false;

@@ -80,7 +80,7 @@ class Streams {
     for (const robot of this.robots.values()) {
       if (robot.model.commands) this.connection.send(pack(robot.id, "stop", { client: this.dragging.client }));
     }
-    this.dragging.letGo();
+    this.dragging.stopped();
   }
 
   private announce(id: string, model: Model | null): void {

@@ -1,7 +1,7 @@
 // The page: a recorded run, or a stream.
 
 import "./style.css";
-import { announceDock, announceMore, notice, offerHeadset } from "./controls";
+import { announceEdges, announceMore, notice, offerHeadset } from "./controls";
 import { showStreams } from "./live";
 import { element } from "./readout";
 import { showRun } from "./recorded";
@@ -13,7 +13,7 @@ async function main(): Promise<void> {
   const stage = openStage();
   offerHeadset(stage);
   announceMore();
-  announceDock();
+  announceEdges();
   const live = document.documentElement.dataset.mode === "live";
   const shown = live ? showStreams(stage) : await showRun(stage);
   Object.assign(globalThis, { femsense: { stage, shown } }); // for the console, and for programs that inspect the scene
