@@ -111,7 +111,8 @@ def _recording(robot: Path, work: Path) -> Path:
     point = nodes[np.linalg.norm(nodes - nodes[body.clamped].mean(axis=0), axis=1).argmax()]
     middle, size = nodes.mean(axis=0), float(np.linalg.norm(np.ptp(nodes, axis=0)))
     push = [0.4 * np.sin(np.pi * k / 24) for k in range(25)] + [0.0] * (FRAMES - FREE - 25)
-    pulls = {name: 0.5 + 1.5 * i for i, name in enumerate(body.cable_names)}  # unequal: a symmetric robot has several poses
+    step = 0.8 if body.mesh.is_quadratic else 1.5  # quadratic elements are softer
+    pulls = {name: 0.5 + step * i for i, name in enumerate(body.cable_names)}  # unequal: a symmetric robot has several poses
     script = {
         "format": "femsense-script-1",
         "seed": 3,
