@@ -133,6 +133,8 @@ class ReadActuation:
         self._asked_s = float("nan")
         self._last_stamp = float("-inf")
         self._stands_since: float | None = None
+        self._heard = np.full(len(columns), -np.inf)
+        """When each column last came [s, monotonic clock]."""
         self._thread = Thread(target=self._read, daemon=True, name="femsense-actuation")
         self._thread.start()
 
@@ -152,16 +154,22 @@ class ReadActuation:
         return (1.0 - share) * before.values + share * after.values
 
     def notices(self) -> dict[Notice, str]:
-        """Return the problems: the source is unreachable, its values are late, or its clock does not advance."""
+        """Return the problems: the source is unreachable, its values or those of one input are late, or its clock does not advance."""
         found: dict[Notice, str] = {}
         with self._lock:
             newest = self._kept[-1].time_s if self._kept else None
-            asked, stands = self._asked_s, self._stands_since
+            asked, stands, heard = self._asked_s, self._stands_since, self._heard
         if trouble := self._readings.away or (newest is None and self._readings.trouble) or "":
             found[Notice.ACTUATION_AWAY] = f"{self._source}: {trouble}; the last values hold"
         elif newest is not None and asked - newest > self._limits.late_s:
             found[Notice.ACTUATION_LATE] = (
                 f"{self._source}: the newest values are {asked - newest:.1f} s older than the frame; they are used until others arrive"
+            )
+        elif silent := [name for name, at in zip(self.columns, heard) if heard.max() - at > self._limits.late_s]:
+            found[Notice.ACTUATION_LATE] = (
+                f"{self._source}: messages arrive without {', '.join(silent)}; "
+                + ("no frame has all inputs yet" if newest is None else "the last value is used until another arrives")
+                + f": they need {', '.join(self.columns)}"
             )
         if stands is not None and self._clock() - stands > self._limits.late_s:
             found[Notice.ACTUATION_FROZEN] = (
@@ -178,6 +186,8 @@ class ReadActuation:
         held = np.full(len(self.columns), np.nan)
         for stamp, values in self._readings:
             held = np.where(np.isfinite(values), values, held)
+            with self._lock:
+                self._heard = np.where(np.isfinite(values), self._clock(), self._heard)
             if stamp <= self._last_stamp:
                 if self._last_stamp - stamp > 1.0:  # the sender restarted
                     self._times.restart()

@@ -175,3 +175,16 @@ def test_frames_bring_their_inputs_or_it_is_said_which_are_missing() -> None:
     assert actuation.of({"cable_side": 1.0, "cable_top": 2.0, "more": 3.0}, "camera").tolist() == [2.0, 1.0]
     with pytest.raises(InputError, match="--actuation SOURCE"):
         actuation.of({"cable_top": 2.0}, "camera")
+
+
+@pytest.mark.parametrize("first", [[1.0, 2.0], [1.0, np.nan]])
+def test_an_input_that_is_missing_in_the_messages_is_named(first: list[float]) -> None:
+    """Misspelt from the start, or from some message on: the others go on arriving."""
+    limits = ActuationLimits(late_s=0.2)
+    rows: list[Reading] = [(0.1 * k, np.array(first if k == 0 else [1.0 + k, np.nan])) for k in range(8)]
+    actuation = reader(rows, limits=limits, paced=True)
+    told = actuation.notices()
+    assert list(told) == [Notice.ACTUATION_LATE]
+    assert "without cable_side" in told[Notice.ACTUATION_LATE] and "need cable_top, cable_side" in told[Notice.ACTUATION_LATE]
+    assert (actuation.at(time.monotonic()) is None) == bool(np.isnan(first[1]))
+    actuation.close()
