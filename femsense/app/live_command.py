@@ -150,8 +150,11 @@ def summary_text(document: dict[str, Any]) -> str:
     lines += [f"{notice['kind']}: {notice['text']}" for notice in d["notices"]]
     if d["link"] != LinkState.STREAMING.value:
         lines.append(f"camera: {d['link_text']}")
-    if d["recording"]:
-        lines.append(f"\nrecorded: {d['recording']}\nlook at it: femsense view {d['recording']}")
+    if not used:
+        lines.append(f"ended before anything was sensed: {d['todo'] or 'no frame came'}")
+    if d["recording"] and received:
+        look = "view" if used else "inspect"
+        lines.append(f"\nrecorded: {d['recording']}\nlook at it: femsense {look} {d['recording']}")
     return "\n".join(lines)
 
 

@@ -100,6 +100,7 @@ class Session:
         self._coverage: Coverage | None = None
         self._calibration: Calibration | None = None
         self._calibrations = self._tares = 0
+        self._lacks = ""
         self._growing: GrowingRecording | None = None
         self._recorder: Recorder | None = None
         self._senser: Senser | None = None
@@ -203,7 +204,7 @@ class Session:
             self._log()
             self._recorder.close()
             self._recorder = None
-        self._phase, self._todo = Phase.ENDED, ""
+        self._phase, self._todo = Phase.ENDED, "" if self._used else self._todo
 
     def _values(self, frame: StampedFrame) -> FloatArray | None:
         """Return inputs, and gravity if frames contain it, at the time of a frame, shape (columns,); None while unknown."""
@@ -250,7 +251,8 @@ class Session:
         else:
             self.skipped(frame)
         doing = "touch nothing" if known else "move the cables, touch nothing"
-        self._todo = f"{doing}: {coverage.missing}" if coverage.missing else ""
+        after = f" (the last calibration did not suffice: {self._lacks})" if self._lacks else ""
+        self._todo = f"{doing}: {coverage.missing}{after}" if coverage.missing else ""
         if told and coverage.suffices and (known or self._calibrate(growing.recording, coverage)):
             self._learn(growing)
 
@@ -273,6 +275,7 @@ class Session:
             return True
         if self._calibrations >= MOST_CALIBRATIONS:
             raise DataError(f"no sufficient calibration after {coverage.count} contact-free frames: {lacks}")
+        self._lacks = lacks
         self._note("calibration", f"not sufficient: {lacks}")
         coverage.want_more(MORE_FRAMES)
         self._phase = Phase.COLLECTING

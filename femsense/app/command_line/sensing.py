@@ -115,8 +115,8 @@ def live(
     from femsense.live.link import LinkState
 
     document = sense_live(robot, camera, options, say=say)
-    lost = document["link"] == LinkState.GAVE_UP.value
-    return Answer(document, summary_text(document), exit_status=1 if lost else 0)
+    failed = document["link"] == LinkState.GAVE_UP.value or not document["frames_used"]
+    return Answer(document, summary_text(document), exit_status=1 if failed else 0)
 
 
 @command()
