@@ -47,7 +47,11 @@ def _averaged(
     parts = []
     for v in np.unique(view):
         own = points[view == v]
-        means, count = _blocks(own, 6.0 * ray_std(own, np.full(len(own), v), noises), float(angles[v]))
+        at = np.floor(own[:, :2] / own[:, 2:] / angles[v]).astype(np.int64)
+        at -= at.min(axis=0)
+        cell = np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0], return_inverse=True)[1]
+        allowed = 6.0 * ray_std(own, np.full(len(own), v), noises) + STEEPEST * angles[v] * own[:, 2]
+        means, count = _blocks(own, cell, allowed)
         parts.append((means, np.full(len(means), v), count))
     if not parts:
         return points, view, np.zeros(0)
@@ -56,20 +60,13 @@ def _averaged(
 
 
 @njit(cache=True)
-def _blocks(points, noise, angle):  # type: ignore[no-untyped-def]
-    """Return the means of square blocks whose depths differ by no more than noise and slope let expect, all other points, and how many each stands for."""
-    n = len(points)
-    at, low, high = np.empty((n, 2), dtype=np.int64), np.full(2, 2**62), np.full(2, -(2**62))
-    for i in range(n):
-        for c in range(2):
-            at[i, c] = int(np.floor(points[i, c] / points[i, 2] / angle))
-            low[c], high[c] = min(low[c], at[i, c]), max(high[c], at[i, c])
-    columns, cells = high[0] - low[0] + 1, (high[0] - low[0] + 1) * (high[1] - low[1] + 1)
+def _blocks(points, cell, allowed):  # type: ignore[no-untyped-def]
+    """Return the means of blocks whose depths differ by no more than noise and slope let expect, all other points, and how many each stands for."""
+    n, cells = len(points), cell.max() + 1
     total, number, first = np.zeros((cells, 3)), np.zeros(cells), np.empty(cells, dtype=np.int64)
     near, far = np.full(cells, np.inf), np.full(cells, -np.inf)
-    cell = np.empty(n, dtype=np.int64)
     for i in range(n):
-        cell[i] = k = (at[i, 1] - low[1]) * columns + at[i, 0] - low[0]
+        k = cell[i]
         if number[k] == 0.0:
             first[k] = i
         total[k] += points[i]
@@ -77,7 +74,7 @@ def _blocks(points, noise, angle):  # type: ignore[no-untyped-def]
         near[k], far[k] = min(near[k], points[i, 2]), max(far[k], points[i, 2])
     means, count, m = np.empty((n, 3)), np.empty(n), 0
     for k in range(cells):
-        if number[k] > 0.0 and far[k] - near[k] <= noise[first[k]] + STEEPEST * angle * points[first[k], 2]:
+        if far[k] - near[k] <= allowed[first[k]]:
             means[m], count[m] = total[k] / number[k], number[k]
             number[k], m = 0.0, m + 1
     for i in range(n):

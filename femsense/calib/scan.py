@@ -148,11 +148,11 @@ def read_scan(
             continue
         cloud, sparse = parts
         outside = undo_depth(sparse, robot.observation)
-        outside = outside[~in_box(outside @ T[:3, :3].T + T[:3, 3], robot.body.mesh.nodes, MARGIN * size) & (outside[:, 2] > 0)]
+        outside = outside[~in_box(outside @ T[:3, :3].T + T[:3, 3], robot.body.mesh.nodes, margin) & (outside[:, 2] > 0)]
         far.append(outside[:: max(1, len(outside) // some)])
         far_view.append(np.full(len(far[-1]), view))
         points = undo_depth(cloud.points, robot.observation)
-        inside = in_box(points @ T[:3, :3].T + T[:3, 3], positions, MARGIN * size) & (points[:, 2] > 0)
+        inside = in_box(points @ T[:3, :3].T + T[:3, 3], positions, margin) & (points[:, 2] > 0)
         points, kept = points[inside], cloud.select(inside)
         segmented = segmented and kept.colors is not None and robot.color_rgb is not None
         mine = _of_robot(robot, kept)

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
+from femsense.core.kernels import njit
 
 PER_CELL = 2.0
 """Rays in a cell of the image plane, on average."""
@@ -37,9 +37,6 @@ class Rays:
     """Side of a cell [1]."""
     columns: int
     """Cells in a row."""
-
-    def __len__(self) -> int:
-        return len(self.uv)
 
     def cast(self, positions: FloatArray, triangles: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the triangle that each ray meets first, −1 for a miss, shape (k,), the barycentric weights there, shape (k, 3), and how far from the

@@ -84,10 +84,8 @@ class Surface:
         """Return how measured points lie to the closest faces that look at their camera; arguments as for `cast`."""
         rays = points - origins
         ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        answer = self._scene.compute_closest_points(_tensor(points))
-        triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
-        hits = self._hits(np.arange(len(points)), triangle, uv, points, ray)
-        gap = np.linalg.norm(points - hits.place(self.positions), axis=1)
+        _, gap, triangle, weights = self.closest_points(points)
+        hits = self._hits(np.arange(len(points)), triangle, weights[:, 1:], points, ray)
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
         return hits.pick((gap <= reach) & looking)
 
