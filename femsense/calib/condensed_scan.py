@@ -43,7 +43,12 @@ def in_blocks(scan: Scan, noises: Sequence[CameraNoise], pixels: Sequence[float]
 def _averaged(
     points: FloatArray, view: IntArray, noises: Sequence[CameraNoise], angles: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return points, each of its camera, with the means of blocks of so many radians in their place, and how many points each stands for."""
+    """Return points in which the mean of each block of pixels replaces its points, shape (m, 3), the camera of each and the number of points it represents,
+    both of shape (m,).
+
+    Arguments:
+        angles: side of a block of each camera [rad].
+    """
     parts = []
     for v in np.unique(view):
         own = points[view == v]
@@ -61,7 +66,7 @@ def _averaged(
 
 @njit(cache=True)
 def _blocks(points, cell, allowed):  # type: ignore[no-untyped-def]
-    """Return the means of blocks whose depths differ by no more than noise and slope let expect, all other points, and how many each stands for."""
+    """Return the means of blocks whose depths differ by no more than is allowed, all other points, and the number of points that each represents."""
     n, cells = len(points), cell.max() + 1
     total, number, first = np.zeros((cells, 3)), np.zeros(cells), np.empty(cells, dtype=np.int64)
     near, far = np.full(cells, np.inf), np.full(cells, -np.inf)
