@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from femsense.calib.from_clouds import free_clouds
+from femsense.calib.other_law import with_other_law
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
@@ -20,6 +21,7 @@ from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
 from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
+from femsense.sensing.law import neo_hookean
 from femsense.sensing.model import STRAY, Fit, Frame, Limits, Model, block_of, pixels_of
 from femsense.sensing.odds import INFERRED
 from femsense.sensing.prepare import pose_covariance
@@ -47,8 +49,13 @@ class ContactFree:
 
 
 def learn(sensor: Sensor) -> Model:
-    """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none."""
-    model = prior_model(sensor)
+    """Return the model of a recording: what its contact-free frames teach, or the prior alone where there are none.
+
+    The states are neo-Hookean where the robot declares no law, unless a contact-free frame has no such equilibrium, as of chambers at high pressures.
+    """
+    sensor = replace(sensor, declares_law=with_other_law(sensor.robot) is None)
+    likely = neo_hookean(sensor)
+    model = prior_model(sensor if likely is None or _lacks_states(likely) else likely)
     for turn in range(2):
         frames = _contact_free(model)
         if not frames:
@@ -61,6 +68,12 @@ def learn(sensor: Sensor) -> Model:
         return model
     background = background_of(model.sensor, frames[0].frame.index)  # from where the cameras are known to be
     return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
+
+
+def _lacks_states(sensor: Sensor) -> bool:
+    """Return whether a contact-free frame has no equilibrium under its inputs."""
+    frames = free_clouds(sensor.recording)
+    return len(list(free_path(sensor.driven, frames))) < len(frames)
 
 
 def prior_model(sensor: Sensor) -> Model:

@@ -21,6 +21,7 @@ from femsense.pointcloud.primitives import Shape
 from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
+from femsense.sensing.law import moved_by_law
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, gap_std, in_touch, is_rigid, is_with
 from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
@@ -56,7 +57,7 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     began = time.perf_counter()
     status = camera_verdict(model, best, checked(model, best))
     stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
-    covariances = [covariance_of(model, best, i) for i in range(len(best.contacts))]
+    covariances = covariances_of(model, best)
     places = best.place_covariance + elsewhere(model, best)
     contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, places, best.state, previous)
     report = FrameReport(
@@ -109,11 +110,15 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     return Estimate(best, before, clock.stages)
 
 
-def covariance_of(model: Model, best: Fit, i: int) -> FloatArray:
-    """Return the covariance of the force of contact i [N²], shape (3, 3): of the fit, and of the model's compliance."""
-    force = best.forces[i]
-    own = best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-    return np.asarray(own + model.compliance_std**2 * np.outer(force, force))
+def covariances_of(model: Model, best: Fit) -> list[FloatArray]:
+    """Return the covariance of the force of each contact [N²], each (3, 3): of the fit, of the compliance, and of the constitutive law."""
+    by_law = moved_by_law(model, best)
+    result = []
+    for i, force in enumerate(best.forces):
+        own = slice(3 * i, 3 * i + 3)
+        model_error = model.compliance_std**2 * np.outer(force, force) + np.outer(by_law[own], by_law[own])
+        result.append(best.covariance[own, own] + model_error)
+    return result
 
 
 def inliers(best: Fit) -> BoolArray:

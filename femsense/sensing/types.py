@@ -257,3 +257,5 @@ class Sensor:
     passing: tuple[Shape, ...] = ()
     """Plates among them through which the body reaches by more than an edge: these do not say where they touch."""
     background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it
+    declares_law: bool = True
+    """Whether the robot itself determines the constitutive law; else forces are known to within the difference of two laws (`law.moved_by_law`)."""

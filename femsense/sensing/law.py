@@ -1,0 +1,58 @@
+"""The constitutive law of the states that are fitted, and how much a force depends on it.
+
+A robot that declares no law is corotational by the contract, which fits small strains. Under contacts strains are large, and in compression rubber stiffens
+as a neo-Hookean body does, so the fitted states are neo-Hookean with the same moduli. The difference between the two laws enters the covariance as one standard
+deviation, as in `calibrate`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.other_law import with_other_law
+from femsense.core.arrays import FloatArray
+from femsense.fem.assembly import internal
+from femsense.sensing.fit import whitened
+from femsense.sensing.model import Fit, Model
+from femsense.sensing.types import Sensor
+
+
+def neo_hookean(sensor: Sensor) -> Sensor | None:
+    """Return the sensor with a neo-Hookean body; None if the robot declares its law, or if forces come from markers, whose camera pose `calibrate` has
+    determined with the declared law."""
+    robot = with_other_law(sensor.robot)
+    if robot is None or not sensor.recording.has_clouds:
+        return None
+    return replace(sensor, robot=robot, driven=replace(sensor.driven, robot=robot))
+
+
+def moved_by_law(model: Model, fit: Fit) -> FloatArray:
+    """Return the change of the forces under the other law, to first order [N], shape (3m,); zero if the robot declares its law.
+
+    Under the other law the same inputs and forces leave the internal forces δr(x) = r_other(x) − r(x) unbalanced, which move the body by −K⁻¹ δr(x). The
+    part that exists without contacts is in the nuisance parameters that the contact-free frames determine. One Gauss–Newton step from the optimum gives
+
+        δp = A⁻¹ Xᵀ W (H K⁻¹) (δr(x) − δr(x₀))
+
+    with x₀ the predicted state, H the derivatives of the rows with the nodes, and X those with all whitened parameters p.
+    """
+    sensor, m = model.sensor, len(fit.contacts)
+    body = sensor.robot.body
+    if sensor.declares_law or not m:
+        return np.zeros(3 * m)
+    law = "corotational" if body.material.law == "neo_hookean" else "neo_hookean"
+    other = body.with_material(replace(body.material, law=law))
+    unbalanced = np.zeros_like(fit.state.positions)
+    for sign, positions in ((1.0, fit.state.positions), (-1.0, fit.frame.predicted.positions)):
+        there, here = internal(other, positions, tangent=False), internal(body, positions, tangent=False)
+        if not np.isfinite(there.energy):  # an inverted element, of which the status tells
+            return np.zeros(3 * m)
+        unbalanced += sign * (there.forces - here.forces)
+    moved = fit.rows.of(fit.linearised.tangent.respond(unbalanced[None]))[:, 0]
+    scale = whitened(model, fit, trust=False)[0]
+    X = np.hstack([fit.J * scale, fit.N])
+    WX = X * fit.weight[:, None]
+    change = scale * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ moved)[: 5 * m]
+    return np.concatenate([axes.T @ change[5 * i : 5 * i + 3] for i, axes in enumerate(fit.axes)])
