@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,6 +20,7 @@ from femsense.inference.nuisance import first_nuisance, fit_nuisance, gram_of, l
 from femsense.inference.pixels import Skin
 from femsense.inference.rows import Rows
 from femsense.model.quasi_static_path import free_path
+from femsense.model.recording_checks import how_to_free
 from femsense.sensing.background import background_of
 from femsense.sensing.fit import fit
 from femsense.sensing.law import neo_hookean
@@ -26,7 +28,7 @@ from femsense.sensing.model import STRAY, Fit, Frame, Limits, Model, block_of, p
 from femsense.sensing.odds import INFERRED
 from femsense.sensing.prepare import pose_covariance
 from femsense.sensing.proposals import inferred_gain
-from femsense.sensing.types import Sensor
+from femsense.sensing.types import Case, Sensor
 
 MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.01, 0.05
 """Prior σ of the relative modulus at most where cable pulls are nuisance parameters too, because the two are nearly collinear, and of each pull."""
@@ -59,6 +61,7 @@ def learn(sensor: Sensor) -> Model:
     for turn in range(2):
         frames = _contact_free(model)
         if not frames:
+            _warn_of_none(sensor)
             return model
         model = _taught(model, [one.fit for one in frames])
         if turn == 0:
@@ -68,6 +71,15 @@ def learn(sensor: Sensor) -> Model:
         return model
     background = background_of(model.sensor, frames[0].frame.index)  # from where the cameras are known to be
     return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
+
+
+def _warn_of_none(sensor: Sensor) -> None:
+    if sensor.recording.has_clouds:
+        warnings.warn(
+            "no contact-free frame can be used: camera pose, noise and model error are those declared, and no status checks whether the model explains"
+            f" a frame; mark frames in which nothing touches the robot {how_to_free(sensor.recording)}",
+            stacklevel=2,
+        )
 
 
 def _lacks_states(sensor: Sensor) -> bool:
@@ -97,7 +109,7 @@ def _contact_free(model: Model) -> list[ContactFree]:
             if scan is None or len(scan.view) < FEWEST:
                 continue
             marked = model.drives > 0 and bool((model.sensor.recording.marker_frame == k).any())
-            frame = Frame(k, model.pixels(scan), scan, state, None, with_markers=marked)
+            frame = Frame(k, Case.CONTACT_FREE, model.pixels(scan), scan, state, None, with_markers=marked)
             found = fit(model, frame, (), np.zeros((0, 3)), state)
         except FemsenseError:
             continue

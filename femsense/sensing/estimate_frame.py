@@ -1,6 +1,6 @@
-"""Contacts and forces of one frame: predict, propose, fit, keep the best, stop.
+"""Contacts and forces of one frame: predict, fit the contacts of the frame before, propose and fit others while J falls, add what touches besides.
 
-docs/method/estimator.md has the objective J, the proposals and the posterior check.
+docs/method/estimator.md has the objective J (`Fit.criterion`), the proposals and the posterior check.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.law import moved_by_law
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, gap_std, in_touch, is_rigid, is_with
-from femsense.sensing.places import away_from_scenery, given_touches, object_touches, objects_near, said_free
+from femsense.sensing.places import away_from_scenery, case_of, given_touches, object_touches, objects_near
 from femsense.sensing.proposals import SAME, elsewhere, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
 from femsense.sensing.status import SQUEEZED, UNDETERMINED, checked, std_along, stretch_under_contacts
 from femsense.sensing.tracks import contacts_of
-from femsense.sensing.types import FrameReport, SensedFrame, Touch
+from femsense.sensing.types import Case, FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
 """Rounds of proposals at most, and proposals that are fitted in each."""
 UNDETERMINED_TAU = 2.0
-"""Prior scale of the force at an object in touch that the data do not determine [N]: what hands and grippers press with."""
+"""Prior scale of the force at an object in touch whose force the data do not determine [N]; hands and grippers press with so much."""
 MANY = 30
 """Pixels of an object without a known shape that may carry a latent force."""
 
@@ -88,25 +88,32 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
 
 
 def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estimate:
-    """Return the hypothesis of frame k with the lowest J.
+    """Return the hypothesis of frame k: no contact, forces at the given places, or the contacts at which a local search for the lowest J ends.
+
+    Arguments:
+        model: of the recording.
+        k: index 0 … F − 1.
+        previous: the frame before; None at the beginning.
 
     Raises:
         FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
     """
     clock = Clock()
     frame = _predicted(model, k, previous, clock)
-    start = _carried_over(model, frame, previous)
-    best = start if start is not None else _without_contacts(model, frame)
-    clock.lap("fit")
-    if said_free(model.sensor, k):
-        pass
-    elif given := given_touches(model.sensor):
-        best = _at_given_places(model, frame, given, best, previous)
+    if frame.case is Case.CONTACT_FREE:
+        best = _without_contacts(model, frame)
+        clock.lap("fit")
+    elif frame.case is Case.GIVEN_PLACES:
+        best = _at_given_places(model, frame, previous)
+        clock.lap("fit")
     else:
-        best = _with_objects_in_touch(model, *_searched(model, best))
+        start = _carried_over(model, frame, previous)
+        best = _without_contacts(model, frame) if start is None else start
+        clock.lap("fit")
+        best = _with_objects_in_touch(model, _searched(model, best))
     clock.lap("search")
     before = rms_of(_without_forces(best), inliers(best))
-    clock.lap("state")
+    clock.lap("rms")
     return Estimate(best, before, clock.stages)
 
 
@@ -143,46 +150,65 @@ def measurements(rows: Rows) -> int:
     return int(rows.pixel.sum()) if rows.pixel.any() else len(rows) // 3
 
 
-def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
-    """Return the best fit after proposals have stopped to lower J, and where seen objects touch there."""
+# --- search ---------------------------------------------------------------------------------------------------------------
+
+
+def _searched(model: Model, best: Fit) -> Fit:
+    """Return the fit at which no proposal lowers J any more, after ROUNDS at most. The first proposal that lowers J is taken."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
-        seen = _seen(model, best)
-        better = next((found for found in _fits(model, best, seen) if found.criterion < best.criterion - TOLERANCE), None)
-        if better is None:
-            return best, seen
-        best = better
-    return best, _seen(model, best)
+        lower = next((fitted for fitted in _fits(model, best) if fitted.criterion < best.criterion - TOLERANCE), None)
+        if lower is None:
+            break
+        best = lower
+    return best
 
 
-def _seen(model: Model, best: Fit) -> list[Touch]:
-    """Return where seen objects touch the state of a fit."""
+def _fits(model: Model, best: Fit) -> Iterator[Fit]:
+    """Yield fits of the most promising proposals, one after the other.
+
+    Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
+    """
+    most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
+    promising = [proposal for proposal in proposals(model, best, _touching(model, best)) if len(proposal.contacts) <= most]
+    for proposal in promising[:FITTED]:
+        start = best.state if best.contacts and proposal.contacts else best.frame.predicted
+        fitted = fit(model, best.frame, proposal.contacts, proposal.forces, start, eta=best.eta, tau=proposal.tau)
+        if fitted is not None:
+            yield fitted
+
+
+def _touching(model: Model, best: Fit) -> list[Touch]:
+    """Return where visible objects touch the state of a fit."""
     return away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.objects, best.state))
 
 
 def _with_objects(model: Model, best: Fit) -> Fit:
-    """Return a fit with the objects near the body where it stands now; where colour does not separate them, of the pixels in front that it does not take
-    for the robot."""
+    """Return a fit with the objects near its state.
+
+    With colour they are segmented again once the state is an edge away from where they were; without, they are the pixels in front that the fit does not
+    take for the robot.
+    """
     frame = best.frame
-    if frame.scan is None or said_free(model.sensor, frame.index):
+    if frame.scan is None or (frame.coloured and _moved_by(frame.objects_at, best.state) <= model.sensor.surface.edge):
         return best
-    if not frame.coloured:
-        objects = _in_front(model, frame, best.rows, inliers(best), best.state)
-    elif _moved_by(frame.objects_at, best.state) > model.sensor.surface.edge:
+    if frame.coloured:
         objects = tuple(objects_near(model.sensor, frame.scan, best.state, frame.seen_before))
         frame = replace(frame, objects_at=best.state.positions)
         best = replace(best, frame=frame)
     else:
-        return best
+        objects = _in_front(model, frame, best.rows, inliers(best), best.state)
     if len(objects) == len(frame.objects) and all(_is_alike(model, a, b) for a, b in zip(objects, frame.objects)):
         return best
-    seen = replace(frame, objects=objects)
-    again = fit(model, seen, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised)
+    with_objects = replace(frame, objects=objects)
+    again = fit(
+        model, with_objects, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised
+    )
     return best if again is None else again
 
 
 def _moved_by(positions: FloatArray | None, state: Equilibrium) -> float:
-    """Return how far any node is from a position [m]; 0 where nothing was looked for yet."""
+    """Return how far the nodes of a state are from positions at most [m], shape (n, 3); 0 without positions, which a frame without pixels has."""
     return 0.0 if positions is None else float(np.linalg.norm(state.positions - positions, axis=1).max())
 
 
@@ -196,46 +222,49 @@ def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: E
 
 
 def _is_alike(model: Model, first: Shape, second: Shape) -> bool:
-    """Return whether two shapes are one up to what is not known of where its surface is: how far a plate or rod was seen to reach does not matter."""
+    """Return whether two shapes agree within the standard deviation of their surfaces; extents of plates, and of rods along their axis, do not count."""
     ways = {"plate": first.axes[2:], "cylinder": first.axes[1:]}.get(first.kind, first.axes)
     apart = float(np.linalg.norm(ways @ (first.center - second.center)))
     return first.kind == second.kind and apart < max(gap_std(model, first), gap_std(model, second))
 
 
-def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
-    """Return the best hypothesis fitted again with all that touches and whose force the data do not determine, where there is any.
+# --- objects in touch whose force the data do not determine -----------------------------------------------------------------
 
-    Objects in touch that are no contacts have no significant force. Left out, they would bias those of their neighbours and make their intervals too narrow.
-    An object whose surface lies at the body's becomes a contact with a wide interval, another one a latent force. So does a visible contact whose force is
-    not significant: of two tips that squeeze a body the pixels tell the difference, and the smallest τ would call both forces zero.
+
+def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
+    """Return a hypothesis fitted again with the objects in touch that are no contacts of it, whatever J says.
+
+    These objects have no significant force. Left out, they would bias the forces of their neighbours and make the neighbours' intervals too narrow. An object
+    whose surface lies at the body's becomes a contact with a wide prior, another object a latent force. Visible contacts without a significant force get the
+    wide prior, too: of two tips that squeeze a body the pixels determine the difference only, and the τ of highest evidence would make both forces zero.
     """
-    others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
+    others = [t for t in _touching(model, best) if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
     if at_surface or latent:
-        best = _fitted_wide(model, replace(best, frame=replace(best.frame, latent=tuple(latent))), at_surface)
-    return _fitted_wide(model, best, ()) if any(_unsized(model, best)) else best
+        best = _under_wide_prior(model, replace(best, frame=replace(best.frame, latent=tuple(latent))), at_surface)
+    return _under_wide_prior(model, best, ()) if any(_insignificant(model, best)) else best
 
 
-def _unsized(model: Model, best: Fit) -> list[bool]:
-    """Return which visible contacts have a force that is not significant under a prior that was sized by it."""
+def _insignificant(model: Model, best: Fit) -> list[bool]:
+    """Return for each contact whether it is visible and its force is not significant, under a prior that was sized by this force."""
     return [
         is_rigid(model, contact) and not contact.undetermined and float(np.linalg.norm(force)) < UNDETERMINED * std_along(best, i)
         for i, (contact, force) in enumerate(zip(best.contacts, best.forces))
     ]
 
 
-def _fitted_wide(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
-    """Return a hypothesis with more contacts fitted again, these and contacts without a significant force under the wide prior.
+def _under_wide_prior(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
+    """Return a hypothesis with more contacts, fitted again with the prior scale UNDETERMINED_TAU for these and for contacts without a significant force.
 
-    The other visible contacts begin with it: their τ was sized while their counterparts had no force.
+    The other visible contacts begin with this scale: their τ was sized while the forces opposite to them were zero.
     """
-    unsized = _unsized(model, best)
+    wide = [contact.undetermined or small for contact, small in zip(best.contacts, _insignificant(model, best))]
     tau = [UNDETERMINED_TAU if is_rigid(model, contact) else own for contact, own in zip(best.contacts, best.tau)]
     again = fit(
         model,
         best.frame,
-        [*(replace(c, undetermined=c.undetermined or wide) for c, wide in zip(best.contacts, unsized)), *more],
+        [*(replace(contact, undetermined=own) for contact, own in zip(best.contacts, wide)), *more],
         np.vstack([best.forces, np.zeros((len(more), 3))]),
         best.state,
         eta=best.eta,
@@ -246,22 +275,9 @@ def _fitted_wide(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
 
 
 def _is_object(contact: Touch) -> bool:
-    """Return whether a contact is with an object of known shape, or with one whose pixels are too many for a scrap of the scene."""
+    """Return whether a contact is with an object of known shape, or of at least MANY pixels: fewer may be a part of the scene."""
     shape = contact.shape
     return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
-
-
-def _fits(model: Model, best: Fit, seen: Sequence[Touch]) -> Iterator[Fit]:
-    """Yield fits of the most promising proposals, one after the other; seen: where seen objects touch.
-
-    Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
-    """
-    most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
-    for one in [one for one in proposals(model, best, seen) if len(one.contacts) <= most][:FITTED]:
-        start = best.state if best.contacts and one.contacts else best.frame.predicted
-        found = fit(model, best.frame, one.contacts, one.forces, start, eta=best.eta, tau=one.tau)
-        if found is not None:
-            yield found
 
 
 # --- predict ------------------------------------------------------------------------------------------------------------
@@ -269,6 +285,7 @@ def _fits(model: Model, best: Fit, seen: Sequence[Touch]) -> Iterator[Fit]:
 
 def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock) -> Frame:
     """Return the frame with its predicted state, its pixels, and the objects near the body."""
+    case = case_of(model.sensor, k)
     tensions = previous.state.segment_tensions if previous is not None and has_history(model.sensor.robot) else None
     predicted = free_state(model.sensor, k, None if previous is None else previous.free_state, tensions)
     clock.lap("equilibrium")
@@ -276,28 +293,32 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
     scan = pixels_of(model, k, expected)
     clock.lap("read")
     if scan is None:
-        return Frame(k, None, None, predicted, tensions)
+        return Frame(k, case, None, None, predicted, tensions)
     if len(scan.view) < FEWEST:
         raise DataError(
             f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
         )
-    seen = () if previous is None else previous.objects
     pixels = model.pixels(scan)
-    if not pixels.coloured:  # most pixels are of something else
+    if not pixels.coloured:  # most pixels show other things than the robot
         pixels = pixels.anchored(model.skin, expected.positions)
-    frame = Frame(k, pixels, scan, predicted, tensions, seen_before=seen)
-    objects: tuple[Shape, ...] = ()
-    objects_at: FloatArray | None = None
-    if not len(model.sensor.places) and not said_free(model.sensor, k):
-        if scan.segmented:
-            objects, objects_at = tuple(objects_near(model.sensor, scan, expected, seen)), expected.positions
-        elif expected is not predicted:
-            rows = model.rows(frame, expected)
-            objects = _in_front(
-                model, frame, rows, misfit(rows.residual / rows.std, rows.log_other, rows.share)[1] > 0.5, expected
-            )
+    frame = Frame(k, case, pixels, scan, predicted, tensions, seen_before=() if previous is None else previous.objects)
+    if case is Case.UNKNOWN_CONTACTS:
+        frame = _with_objects_expected(model, frame, expected)
     clock.lap("objects")
-    return replace(frame, objects=objects, objects_at=objects_at)
+    return frame
+
+
+def _with_objects_expected(model: Model, frame: Frame, expected: Equilibrium) -> Frame:
+    """Return a frame with the objects near the expected state. Without colour there are none before a state has been fitted."""
+    assert frame.scan is not None
+    if frame.coloured:
+        objects = tuple(objects_near(model.sensor, frame.scan, expected, frame.seen_before))
+        return replace(frame, objects=objects, objects_at=expected.positions)
+    if expected is frame.predicted:
+        return frame
+    rows = model.rows(frame, expected)
+    robot = misfit(rows.residual / rows.std, rows.log_other, rows.share)[1] > 0.5
+    return replace(frame, objects=_in_front(model, frame, rows, robot, expected))
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
@@ -316,14 +337,11 @@ def _without_contacts(model: Model, frame: Frame) -> Fit:
 
 
 def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit | None:
-    """Return the fit of the previous frame's contacts where dropping any of them would raise J; else None."""
-    if (
-        previous is None
-        or not previous.touches
-        or not previous.trusted
-        or len(model.sensor.places)
-        or said_free(model.sensor, frame.index)
-    ):
+    """Return the fit of the previous frame's contacts, or that without contacts where it has the lower J; None without previous contacts.
+
+    The fit without contacts is asked for only if the evidence of a contact is below its prior odds.
+    """
+    if previous is None or not previous.touches or not previous.trusted:
         return None
     start = _expected(frame.predicted, previous)
     seen = away_from_scenery(model.sensor, object_touches(model.sensor, frame.objects, start))
@@ -331,38 +349,45 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
     if not kept:
         return None
     contacts = [_followed(model, previous.touches[i], seen) for i in kept]
-    found = fit(model, frame, contacts, previous.forces[kept], start, tau=previous.tau[kept])
-    if found is None:
-        return None
-    alone = None if (found.drop_gain > found.odds).all() else _without_contacts(model, frame)
-    return found if alone is None or found.criterion < alone.criterion else alone
+    carried = fit(model, frame, contacts, previous.forces[kept], start, tau=previous.tau[kept])
+    if carried is None or (carried.drop_gain > carried.odds).all():
+        return carried
+    alone = _without_contacts(model, frame)
+    return carried if carried.criterion < alone.criterion else alone
 
 
-def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
-    """Return a contact of the previous frame at its object, or at one that is seen to touch near it now; inferred where none is."""
-    if own := next((one for one in seen if contact.source == "cloud" and is_with(contact, one.shape)), None):
-        return own
-    distance = [float(np.linalg.norm(one.place - contact.place)) for one in seen] if contact.source == "cloud" else []
-    if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * seen[int(np.argmin(distance))].std_m):
-        return seen[int(np.argmin(distance))]
+def _followed(model: Model, contact: Touch, touching: Sequence[Touch]) -> Touch:
+    """Return a contact of the previous frame where its object touches now, or where another one touches near it; without either it is inferred."""
+    if contact.source == "cloud":
+        with_object = next((touch for touch in touching if is_with(contact, touch.shape)), None)
+        if with_object is not None:
+            return with_object
+        distance = [float(np.linalg.norm(touch.place - contact.place)) for touch in touching]
+        if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * touching[int(np.argmin(distance))].std_m):
+            return touching[int(np.argmin(distance))]
     if contact.source == "shape":
         return contact
     std = float(np.sqrt(model.sensor.surface.area.sum() / (2.0 * np.pi)))
     return replace(contact, source="shape", std_m=std, line=np.zeros(3), expected=contact.place, shape=None, pulls=False)
 
 
-def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: SensedFrame | None) -> Fit:
-    """Return the fit with forces at the given places, whatever its evidence."""
+def _at_given_places(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit:
+    """Return the fit with forces at the given places, whatever its evidence; that without contacts if there is no equilibrium.
+
+    Without colour, the body may be far from the state by which its pixels were separated from the others. There a wide initial κ is tried as well, and
+    once more from where this fit ends.
+    """
+    given = given_touches(model.sensor)
     forces, start = np.zeros((len(given), 3)), frame.predicted
     if previous is not None and len(previous.touches) == len(given):
         forces, start = previous.forces, _expected(frame.predicted, previous)
-    tried = [fit(model, frame, given, forces, start)]
-    if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
-        tried.append(fit(model, frame, given, forces, start, catch=np.inf))
-        if (near := tried[-1]) is not None:  # the noise is widened anew from where that ends
-            tried.append(fit(model, frame, near.contacts, near.forces, near.state, tau=near.tau, catch=np.inf))
-    found = [one for one in tried if one is not None]
-    return min(found, key=lambda one: one.criterion) if found else alone
+    fits = [fit(model, frame, given, forces, start)]
+    if not frame.coloured:
+        fits.append(fit(model, frame, given, forces, start, catch=np.inf))
+        if (last := fits[-1]) is not None:
+            fits.append(fit(model, frame, last.contacts, last.forces, last.state, tau=last.tau, catch=np.inf))
+    found = [fitted for fitted in fits if fitted is not None]
+    return min(found, key=lambda fitted: fitted.criterion) if found else _without_contacts(model, frame)
 
 
 class Clock:

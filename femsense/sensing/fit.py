@@ -1,10 +1,14 @@
 """Fitting a hypothesis: the minimum of Φ over forces, contact points and nuisance parameters, and its Laplace approximation.
 
     Φ = Σ_j (1/T_j) · −2 log[exp(−z_j²/2) + o_j] + |η̃|² + |f̃|² + |s̃|²,   z = (r(x(f, s)) − C(μ + R η̃)) / σ
-    E = min Φ + log det A,   A = I + Jᵀ W J
+    E = min Φ + log det A,   A = I + Xᵀ W X
 
-f̃: force over its prior scale, τ along the normal and τ/2 across; s̃: shift of the contact point over its standard deviation. Gauss–Newton steps over all of
-(f̃, s̃, η̃) with iteratively reweighted rows; each state is a new equilibrium. The tangent is kept while steps succeed (chord method).
+    r: residual of a pixel, marker or gap [m];  σ, T: its noise and overdispersion;  o: odds that it does not show the robot
+    f̃: force over its prior scale;  s̃: shift of the contact point over its standard deviation;  η̃: whitened nuisance with prior mean μ and root R
+    X = [D · scales, N]: derivatives of the modelled rows with (f̃, s̃) and η̃, N = C R;  W: weights of the rows, responsibility/(σ² T)
+
+Gauss–Newton steps over all of (f̃, s̃, η̃) with iteratively reweighted rows; each state is a new equilibrium. The tangent of one state is kept for those near
+it (chord method). E, which is −2 log evidence up to a constant, is the lower the better.
 """
 
 from __future__ import annotations
@@ -28,29 +32,31 @@ from femsense.sensing.touches import moved_to, nodal_forces_by_shift, pressed, t
 from femsense.sensing.types import Touch
 
 ACROSS = 0.5
-"""Prior scale of the force across the normal relative to that along it: friction of skins."""
+"""Prior scale of a force across the normal relative to the scale τ along the normal: friction coefficients of skins."""
 SWAYING = 0.1
-"""The same of a hanging weight, across gravity: a thread that is not quite plumb."""
+"""Prior scale of a hanging weight across gravity relative to the scale along gravity: a thread that is not quite plumb."""
 TAU = (0.02, 5.0)
-"""Bounds of the prior scale of a force [N]."""
-FIRST_TAU, GIVEN_TAU = 0.3, 2.0
-"""Prior scale of a force that is not known yet [N], and at a given place, where the data may not determine it."""
+"""Bounds of τ [N]."""
+GIVEN_TAU = 2.0
+"""First τ of a force at a given place [N]; where the data do not determine the force, τ stays there."""
 CATCH = 3.0
-"""κ at the start at most where colour does not separate the robot."""
+"""Largest factor κ on the noise at the start of a fit, where colour does not separate the robot from other things."""
 TOLD = 0.1
-"""Data determine a force at a given place where they leave less than this share of its prior variance."""
+"""The data determine a force at a given place if its posterior variance is below this share of its prior variance."""
 SIZINGS, SETTLED = 8, 0.02
-"""Updates of τ in one linear problem at most, and the relative change below which one is the last."""
-STEPS, LENGTHS = 25, (1.0, 0.3, 0.1, 0.03)
-"""Gauss–Newton steps at most, and lengths of a step that are tried."""
+"""Updates of τ in one linear problem at most; they end below this relative change."""
+STEPS = 25
+"""Gauss–Newton steps of a fit at most."""
+LENGTHS = (1.0, 0.3, 0.1, 0.03)
+"""Lengths of a step that are tried."""
 JUMP = 5.0
-"""Pixels at the silhouette make Φ jump by a few units: shorter steps are not tried for less."""
+"""Pixels at the silhouette make Φ jump by so much. A step that failed is shortened only if the shorter one promises a larger decrease."""
 TOLERANCE = 0.1
-"""A fit ends where a step lowers Φ by less."""
+"""A fit ends where a step lowers Φ by less, and a search where no proposal lowers J by more."""
 LATENT = 0.2
-"""Prior scale of the force at an object that touches and is no contact of the hypothesis [N]."""
+"""Prior scale of the latent force at an object that touches without being a contact of the hypothesis [N]."""
 CHORD = 0.02
-"""The tangent of a state serves for states whose nodes are nearer than this share of the body's diagonal."""
+"""A tangent is kept for states whose nodes are closer than this share of the body's diagonal to those of its own state."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,7 +94,8 @@ def fit(
         contacts: with their places at the start; forces: at the start [N], shape (m, 3).
         start: a state near by.
         catch: κ at the start at most where colour does not separate the robot.
-        eta, tau, linearised: where the nuisance, the prior scales and the tangent are known from a fit near by.
+        eta, linearised: the nuisance and the tangent, where they are known from a fit near by.
+        tau: prior scales of the forces at the start [N], shape (m,); of contacts at given places they may be left out.
     """
     m, contacts = len(contacts), tuple(contacts)
     forces = np.array(forces, dtype=np.float64).reshape(-1, 3)
@@ -103,17 +110,17 @@ def fit(
         linear = linearised if near and linearised is not None else model.linearised(state)
     except FemsenseError:  # unstable there
         return None
-    scales = [GIVEN_TAU if contact.source == "given" else FIRST_TAU for contact in contacts] if tau is None else tau
-    here = _point(model, frame, contacts, forces, np.array(scales, dtype=np.float64), state, linear)
+    tau = np.full(m, GIVEN_TAU) if tau is None else np.array(tau, dtype=np.float64)
+    here = _point(model, frame, contacts, forces, tau, state, linear)
     eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
         return _finished(model, frame, here, _contact_columns(model, here, linear), linear, eta, True)
     wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=30.0, steps=1)[0]
     kappa = _width(here, wide, frame, catch)
-    J, converged = _contact_columns(model, here, linear), False
+    D, converged = _contact_columns(model, here, linear), False
     for _ in range(STEPS):
-        step = _step(model, here, J, eta, kappa)
+        step = _step(model, here, D, eta, kappa)
         here = replace(here, tau=step.tau)
         lower, settled = _descended(model, frame, here, linear, step, kappa)
         if lower is None:
@@ -126,12 +133,12 @@ def fit(
         if not _near(model, linear.positions, here.state.positions):
             linear = model.linearised(here.state)
             here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
-        J = _contact_columns(model, here, linear)
+        D = _contact_columns(model, here, linear)
         if kappa.narrow and step.phi - lower.phi < TOLERANCE:
             converged = True
             break
         kappa = kappa.narrowed(_width(here, eta, frame, catch))
-    return _in_cones(model, frame, _finished(model, frame, here, J, linear, eta, converged), here)
+    return _in_cones(model, frame, _finished(model, frame, here, D, linear, eta, converged), here)
 
 
 def _loaded(
@@ -242,7 +249,7 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
 
 
 def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
-    """Return J: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
+    """Return D: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
     n = len(here.state.positions)
     loads = []
     for contact, force, own in zip(here.contacts, here.forces, here.axes):
@@ -276,40 +283,43 @@ class Lower:
     phi: float
 
 
-def _step(model: Model, here: Point, J: FloatArray, eta: FloatArray, kappa: Width) -> Step:
-    """Return the Gauss–Newton step from a point.
+def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Width) -> Step:
+    """Return the Gauss–Newton step from a point, and the prior scales τ of the forces for which it is computed.
 
-    τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): its square is the mean square of the whitened components,
-    expected under the posterior (MacKay 1992). At given places, which need no evidence, it stays where the data do not determine the normal force: of two
-    fingers that squeeze a body they tell the difference, and the smallest τ would call both forces zero.
+    τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): τ² is the mean square of the force's whitened components,
+    expected under the posterior (MacKay 1992). τ stays for contacts whose force is known not to be determined, and at given places where the data leave more
+    than TOLD of the prior variance of the normal force: two opposed fingers determine the difference of their forces only, and τ would shrink both to zero.
     """
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
-    A = np.hstack([J, here.N])
-    WA = A * weight[:, None]
-    gram, tau = A.T @ WA, here.tau.copy()
+    DN = np.hstack([D, here.N])
+    weighted = DN * weight[:, None]
+    gram, tau = DN.T @ weighted, here.tau.copy()
     for _ in range(SIZINGS):
         scale, at = whitened(model, replace(here, tau=tau), trust=True)
-        full = np.append(scale, np.ones(here.N.shape[1]))
-        inverse = np.linalg.inv(np.eye(len(full)) + full[:, None] * gram * full)
-        u = inverse @ (full * (WA.T @ (here.residual + J @ (at * scale))))
-        last = tau.copy()
+        scales = np.append(scale, np.ones(here.N.shape[1]))
+        A = np.eye(len(scales)) + scales[:, None] * gram * scales
+        covariance = np.linalg.inv(A)
+        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))))  # of the whitened parameters
+        used = tau.copy()
         for i, contact in enumerate(here.contacts):
-            f = slice(5 * i, 5 * i + 3)
-            left = np.diag(inverse)[f]
-            if not contact.undetermined and (contact.source != "given" or left[0] < TOLD):
-                tau[i] = np.clip(tau[i] * np.sqrt((u[f] ** 2 + left).mean()), *TAU)
-        if np.abs(np.log(tau / last)).max(initial=0.0) < SETTLED:
+            own = slice(5 * i, 5 * i + 3)
+            variance = np.diag(covariance)[own]
+            if not contact.undetermined and (contact.source != "given" or variance[0] < TOLD):
+                tau[i] = np.clip(tau[i] * np.sqrt((minimum[own] ** 2 + variance).mean()), *TAU)
+        if np.abs(np.log(tau / used)).max(initial=0.0) < SETTLED:
             break
-    change = u - np.append(at, eta)
-    decrease = float(change @ (np.eye(len(full)) + full[:, None] * gram * full) @ change)
-    return Step((u[: 5 * m] - at) * scale, u[5 * m :], last, decrease, phi + _prior(model, replace(here, tau=last)))
+    change = minimum - np.append(at, eta)
+    decrease = float(change @ A @ change)
+    # The step belongs to the scales it was computed with; the next one is computed with those that follow from it.
+    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi + _prior(model, replace(here, tau=used)))
 
 
 def _descended(
     model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width
 ) -> tuple[Lower | None, bool]:
-    """Return a point of lower Φ along a step, or none; and whether Φ is least here, to TOLERANCE: else no point had an equilibrium."""
+    """Return a point of lower Φ along a step, or None; and, without one, whether the step ends at a minimum of Φ (True) or because no point along it has
+    an equilibrium (False)."""
     if step.decrease < TOLERANCE:
         return None, True
     refused = False
@@ -345,16 +355,17 @@ def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: Fl
 
 
 def _finished(
-    model: Model, frame: Frame, here: Point, J: FloatArray, linear: Linearised, eta: FloatArray, converged: bool
+    model: Model, frame: Frame, here: Point, D: FloatArray, linear: Linearised, eta: FloatArray, converged: bool
 ) -> Fit:
     """Return the Laplace approximation at a point."""
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta)
     scale, at = whitened(model, here, trust=False)
-    A = np.hstack([J * scale, here.N])
-    H = np.eye(A.shape[1]) + (A * weight[:, None]).T @ A
-    P, q = np.linalg.inv(H), model.nuisance.root.shape[1]
-    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(H)[1])
+    X = np.hstack([D * scale, here.N])
+    A = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X
+    P = np.linalg.inv(A)
+    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(A)[1])
+    q = model.nuisance.root.shape[1]
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
         f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
@@ -363,29 +374,27 @@ def _finished(
         way = ways.T * (scale[s] if here.forces[i].any() else stds)  # without a force the place is where its object was seen
         places[i] = way @ P[s, s] @ way.T
         gain[i] = float(at[f] @ np.linalg.solve(P[f, f], at[f]) + np.linalg.slogdet(P[f, f])[1])
-    odds = np.array([odds_of(model, contact, here.rows) for contact in here.contacts])
-    covariance = force_map @ P[: 5 * m, : 5 * m] @ force_map.T
     return Fit(
-        frame,
-        here.contacts,
-        freeze(here.forces),
-        here.tau,
-        here.axes,
-        here.state,
-        here.rows,
-        linear,
-        here.C,
-        here.N,
-        J,
-        eta,
-        weight,
-        evidence,
-        odds,
-        covariance,
-        places,
-        LATENT * np.column_stack([eta[q:], np.sqrt(np.diag(P)[5 * m + q :])]),
-        gain,
-        converged,
+        frame=frame,
+        contacts=here.contacts,
+        forces=freeze(here.forces),
+        tau=here.tau,
+        axes=here.axes,
+        state=here.state,
+        rows=here.rows,
+        linearised=linear,
+        C=here.C,
+        N=here.N,
+        D=D,
+        eta=eta,
+        weight=weight,
+        evidence=evidence,
+        odds=np.array([odds_of(model, contact, here.rows) for contact in here.contacts]),
+        covariance=force_map @ P[: 5 * m, : 5 * m] @ force_map.T,
+        place_covariance=places,
+        latent_force=LATENT * np.column_stack([eta[q:], np.sqrt(np.diag(P)[5 * m + q :])]),
+        drop_gain=gain,
+        converged=converged,
     )
 
 
@@ -398,5 +407,5 @@ def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:
     if state is None:
         return found
     there = _point(model, frame, found.contacts, inside, found.tau, state, found.linearised)
-    J = _contact_columns(model, there, found.linearised)
-    return _finished(model, frame, there, J, found.linearised, found.eta, found.converged)
+    D = _contact_columns(model, there, found.linearised)
+    return _finished(model, frame, there, D, found.linearised, found.eta, found.converged)

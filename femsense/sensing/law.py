@@ -52,7 +52,7 @@ def moved_by_law(model: Model, fit: Fit) -> FloatArray:
         unbalanced += sign * (there.forces - here.forces)
     moved = fit.rows.of(fit.linearised.tangent.respond(unbalanced[None]))[:, 0]
     scale = whitened(model, fit, trust=False)[0]
-    X = np.hstack([fit.J * scale, fit.N])
+    X = np.hstack([fit.D * scale, fit.N])
     WX = X * fit.weight[:, None]
     change = scale * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ moved)[: 5 * m]
     return np.concatenate([axes.T @ change[5 * i : 5 * i + 3] for i, axes in enumerate(fit.axes)])

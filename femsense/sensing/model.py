@@ -23,7 +23,7 @@ from femsense.pointcloud.primitives import Shape
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.prepare import scan_of
 from femsense.sensing.states import loaded_state
-from femsense.sensing.types import Sensor, Touch
+from femsense.sensing.types import Case, Sensor, Touch
 
 STRAY, UNTOLD = 0.01, 1.0
 """ω of a pixel before contact-free frames are seen: a depth mixed of both sides of an edge, or of something in front where colour does not tell it."""
@@ -181,6 +181,7 @@ class Frame:
     """One frame: what was measured and what is known of it beforehand."""
 
     index: int
+    case: Case
     pixels: Pixels | None
     scan: Scan | None
     predicted: Equilibrium
@@ -226,7 +227,7 @@ class Fit:
     """Derivatives of the rows with η, shape (r, p)."""
     N: FloatArray
     """C R, shape (r, q)."""
-    J: FloatArray
+    D: FloatArray
     """Derivatives of the modelled rows with (force along its axes [N], contact point [m]) of each contact, shape (r, 5m)."""
     eta: FloatArray
     """Whitened nuisance η̃, shape (q,)."""

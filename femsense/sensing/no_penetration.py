@@ -3,10 +3,10 @@
 g(x) is the signed distance of the surface of the body from a completed or declared object, at the surface point where it is least. The row measures the
 object's surface where a pixel measures the body's, so the pose and the error field of the camera move it alike.
 
-An object that does not touch is anywhere within D of the body: density 1/D for g > 0, a Gaussian tail for g < 0. One that touches has g = 0 ± σ_g, or is
+An object that does not touch is anywhere within ℓ of the body: density 1/ℓ for g > 0, a Gaussian tail for g < 0. One that touches has g = 0 ± σ_g, or is
 not where it seems with probability ε. Relative to the first, a contact costs
 
-    −2 log[(1 − ε) D/(√2π σ_g) exp(−z²/2) + ε],   z = g/σ_g
+    −2 log[(1 − ε) ℓ/(√2π σ_g) exp(−z²/2) + ε],   z = g/σ_g
 
 which is negative where the object lies at the surface: there a contact needs no force to be likely.
 """
@@ -95,7 +95,7 @@ def gap_odds(model: Model, contact: Touch) -> float:
 
 
 def _density(model: Model, contact: Touch) -> tuple[float, float]:
-    """Return log[(1 − ε) D/(√2π σ)] and the log odds ε √2π σ / ((1 − ε) D) that the object is not where it seems."""
+    """Return log[(1 − ε) ℓ/(√2π σ)] and the log odds ε √2π σ / ((1 − ε) ℓ) that the object is not where it seems."""
     assert contact.shape is not None
     top = float(np.log((1.0 - MISPLACED) * NEAR * model.sensor.size / (np.sqrt(2.0 * np.pi) * gap_std(model, contact.shape))))
     return top, float(np.log(MISPLACED)) - top

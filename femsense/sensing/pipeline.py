@@ -29,6 +29,7 @@ from femsense.sensing.options import SensingMethod, SensingOptions
 from femsense.sensing.places import near_places
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.states import free_state
+from femsense.sensing.status import Status
 from femsense.sensing.tracks import smoothed
 from femsense.sensing.types import (
     ContactForce,
@@ -151,10 +152,6 @@ def under_inputs(frame: SensedFrame) -> SensedFrame:
     return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), tau=np.zeros(0))
 
 
-PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
-"""Status of a frame without markers and cloud."""
-
-
 def _is_measured(sensor: Sensor, k: int) -> bool:
     """Return whether frame k has a cloud or a marker."""
     recording = sensor.recording
@@ -168,7 +165,7 @@ def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
     state = free_state(sensor, k, None if last is None else last.free_state, before)
     number, stamp, nan = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k]), float("nan")
     done.reports.append(
-        FrameReport(number, stamp, PREDICTED, 0, 0, nan, nan, clock.total_ms, dict(state.tension), dict(state.pressure), {})
+        FrameReport(number, stamp, Status.PREDICTED.value, 0, 0, nan, nan, clock.total_ms, dict(state.tension), dict(state.pressure), {})
     )
     done.states.append(state.positions)
 

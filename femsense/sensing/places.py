@@ -17,7 +17,7 @@ from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, registe
 from femsense.pointcloud.primitives import FEWEST, OUTLIERS, Shape, find_shapes, fit_ball, fit_shape, same_object
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Sensor, Touch
+from femsense.sensing.types import Case, Sensor, Touch
 
 LOCAL = 0.06
 """How much of an object counts for its shape, beyond its nearest point, relative to the body's diagonal."""
@@ -50,9 +50,11 @@ def given_touches(sensor: Sensor) -> list[Touch]:
     return [make_touch(sensor, place, source="given") for place in sensor.places]
 
 
-def said_free(sensor: Sensor, k: int) -> bool:
-    """Return whether the recording says that nothing touches in frame k."""
-    return sensor.recording.free is not None and bool(sensor.recording.free[k])
+def case_of(sensor: Sensor, k: int) -> Case:
+    """Return what is asked of frame k: the recording's column `free` declares contact-free frames."""
+    if sensor.recording.free is not None and sensor.recording.free[k]:
+        return Case.CONTACT_FREE
+    return Case.GIVEN_PLACES if len(sensor.places) else Case.UNKNOWN_CONTACTS
 
 
 def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[Shape] = ()) -> list[Shape]:

@@ -55,9 +55,9 @@ def background_rows(model: Model, frame: Frame) -> Rows | None:
 
 def pose_gain(model: Model, best: Fit) -> float:
     """Return by how much pose steps of any size would lower −2 log evidence next to the contacts of a fit, to first order."""
-    J = best.J
+    D = best.D
     scale, at = whitened(model, best, trust=False)
-    X, p = np.hstack([J * scale, best.N]), np.append(at, best.eta)
+    X, p = np.hstack([D * scale, best.N]), np.append(at, best.eta)
     W, P = best.weight[:, None], best.C[:, : 6 * model.views] * far(model)
     WX, left = X * W, best.left(model.nuisance) * best.rows.std
     S = WX.T @ P
@@ -77,23 +77,23 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
 
     Pixels are reweighted: what a moved camera does not explain may pass for something else.
     """
-    J = best.J
+    D = best.D
     scale, at = whitened(model, best, trust=False)
     kept = np.ones(len(scale), dtype=bool)
     residual = best.left(model.nuisance) * best.rows.std + best.N @ best.eta
     for i in removed:
         kept[5 * i : 5 * i + 5] = False
         own = slice(5 * i, 5 * i + 3)
-        residual = residual + J[:, own] @ (at[own] * scale[own])
-    J, at = J[:, kept] * scale[kept], at[kept]
-    residual = residual + J @ at
+        residual = residual + D[:, own] @ (at[own] * scale[own])
+    D, at = D[:, kept] * scale[kept], at[kept]
+    residual = residual + D @ at
     P = best.C[:, : 6 * model.views] * far(model)
-    rows, A = best.rows, np.hstack([best.N, J, P])
+    rows, A = best.rows, np.hstack([best.N, D, P])
     start = np.concatenate([best.eta, at, np.zeros(P.shape[1])])
     background = background_rows(model, best.frame)
     before = best.evidence
     if background is not None:
-        B = np.hstack([np.zeros((len(background), best.N.shape[1] + J.shape[1])), background.by_pose * far(model)])
+        B = np.hstack([np.zeros((len(background), best.N.shape[1] + D.shape[1])), background.by_pose * far(model)])
         before += misfit(background.residual / background.std, background.log_other, background.share)[0]
         rows, A = stacked([rows, background]), np.vstack([A, B])
         residual = np.append(residual, background.residual)

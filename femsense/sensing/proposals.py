@@ -117,7 +117,7 @@ def vicinity(model: Model, best: Fit) -> Vicinity:
     kappa = first_width(z, rows.pixel, best.frame.coloured, CATCH).of(rows.pixel)
     weight = misfit(z, rows.log_other, rows.share, kappa)[1] * rows.share / (kappa * rows.std) ** 2
     scale, at = whitened(model, best, trust=False)
-    X = np.hstack([best.N, best.J * scale])
+    X = np.hstack([best.N, best.D * scale])
     mean = rows.averaged(weight)
     X, left, weight = mean.of_rows(X), mean.of_rows((z * rows.std)[:, None])[:, 0], mean.weight
     K = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X

@@ -17,7 +17,7 @@ from femsense.sensing.no_penetration import OVERLAPPING
 from femsense.sensing.tracks import size_std
 
 SQUEEZED = 0.6
-"""Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
+"""Elements under a contact that are shorter than this share of their length are beyond their law, and mostly beyond their mesh:
 under a plate on a soft dome elements fall to 0 and the force is half of the true one; on bars and arms the least is 0.91."""
 MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
 """Markers disagree with the cloud where they are off by more than so many times the residual of the calibration, and this share of the diagonal."""
@@ -35,6 +35,7 @@ class Status(Enum):
     """What a frame's result is worth; the value is the text, with its numbers."""
 
     OK = "ok"
+    PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
     NOT_CONVERGED = "not converged: the forces still changed after the last step"
     SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: its force may be far off"
     NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.2f} times what contact-free frames let expect"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,14 @@ class Run:
     def show(self, *, height: int = 480) -> Any:
         """Return the viewer's page in a frame of so many pixels, for a notebook. Raises MissingDependency."""
         return femsense.show_run(self, height=height)
+
+
+class Case(Enum):
+    """What is asked of a frame."""
+
+    CONTACT_FREE = "the recording declares that nothing touches"
+    GIVEN_PLACES = "forces at given places"
+    UNKNOWN_CONTACTS = "number, places and forces of contacts"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
