@@ -21,7 +21,7 @@ from femsense.pointcloud.primitives import Shape
 from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
-from femsense.sensing.law import moved_by_law
+from femsense.sensing.law import BETWEEN, moved_by_law
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import COMPLETED, gap_std, in_touch, is_rigid, is_with
 from femsense.sensing.places import away_from_scenery, case_of, given_touches, object_touches, objects_near
@@ -119,7 +119,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
 
 def covariances_of(model: Model, best: Fit) -> list[FloatArray]:
     """Return the covariance of the force of each contact [N²], each (3, 3): of the fit, of the compliance, and of the constitutive law."""
-    by_law = moved_by_law(model, best)
+    by_law = BETWEEN * moved_by_law(model, best)
     result = []
     for i, force in enumerate(best.forces):
         own = slice(3 * i, 3 * i + 3)

@@ -1,8 +1,8 @@
 """The constitutive law of the states that are fitted, and how much a force depends on it.
 
 A robot that declares no law is corotational by the contract, which fits small strains. Under contacts strains are large, and in compression rubber stiffens
-as a neo-Hookean body does, so the fitted states are neo-Hookean with the same moduli. The difference between the two laws enters the covariance as one standard
-deviation, as in `calibrate`.
+as a neo-Hookean body does, so the fitted states are neo-Hookean with the same moduli. The true law may lie anywhere between the two: of a uniform distribution
+the root mean square deviation from one end is 1/√3 of its width.
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ def neo_hookean(sensor: Sensor) -> Sensor | None:
     if robot is None or not sensor.recording.has_clouds:
         return None
     return replace(sensor, robot=robot, driven=replace(sensor.driven, robot=robot))
+
+
+BETWEEN = 1.0 / np.sqrt(3.0)
+"""Standard deviation of a force due to the law, relative to its change under the other law."""
 
 
 def moved_by_law(model: Model, fit: Fit) -> FloatArray:

@@ -165,7 +165,9 @@ def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
     state = free_state(sensor, k, None if last is None else last.free_state, before)
     number, stamp, nan = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k]), float("nan")
     done.reports.append(
-        FrameReport(number, stamp, Status.PREDICTED.value, 0, 0, nan, nan, clock.total_ms, dict(state.tension), dict(state.pressure), {})
+        FrameReport(
+            number, stamp, Status.PREDICTED.value, 0, 0, nan, nan, clock.total_ms, dict(state.tension), dict(state.pressure), {}
+        )
     )
     done.states.append(state.positions)
 

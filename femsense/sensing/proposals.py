@@ -93,6 +93,12 @@ class Vicinity:
         D3, W3 = (a.reshape(len(a), c, 3).transpose(1, 2, 0) for a in (D, WD))
         return Sites(WD.T @ self.left, W3 @ D3.transpose(0, 2, 1), self.X.T @ WD)
 
+    def forces_after(self, change: FloatArray) -> FloatArray:
+        """Return the forces of the contacts after changes of p, shape (c, p): [N], shape (c, m, 3)."""
+        m = len(self.fit.contacts)
+        whitened_forces = (self.at + change)[:, len(self.at) - 5 * m :].reshape(len(change), m, 5)[:, :, :3]
+        return np.asarray(np.einsum("cmi,mij->cmj", whitened_forces * self.scale.reshape(m, 5)[:, :3], self.fit.axes))
+
     def own(self, i: int) -> slice:
         """Return where the force of contact i stands in p."""
         first = self.X.shape[1] - len(self.scale) + 5 * i
@@ -124,10 +130,20 @@ def vicinity(model: Model, best: Fit) -> Vicinity:
     return Vicinity(model, best, mean.rows, weight, X, left, np.append(best.eta, at), scale, K)
 
 
-def evidence_at(
-    near: Vicinity, sites: Sites, axes: FloatArray, hangs: BoolArray, *, without: int | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return the decrease of −2 log evidence by one more contact at each place, shape (c,), and its force [N], shape (c, 3).
+@dataclass(frozen=True, eq=False, slots=True)
+class Additions:
+    """One more contact at each of c places, to second order about a fit with m contacts."""
+
+    gains: FloatArray
+    """Decrease of −2 log evidence, shape (c,)."""
+    forces: FloatArray
+    """Force of the contact [N], shape (c, 3)."""
+    others: FloatArray
+    """Forces of the contacts of the fit at the same minimum of Φ [N], shape (c, m, 3)."""
+
+
+def evidence_at(near: Vicinity, sites: Sites, axes: FloatArray, hangs: BoolArray, *, without: int | None = None) -> Additions:
+    """Return what one more contact at each place gains.
 
     Arguments:
         axes: of the forces, outward normal (upward for a hanging weight) and two tangents, shape (c, 3, 3).
@@ -136,11 +152,11 @@ def evidence_at(
     """
     c, K, S, b = len(axes), near.K, sites.S, sites.b
     h = near.X.T @ (near.weight * near.left) - near.at
+    kept = np.ones(len(K), dtype=bool)
     if without is not None:
         own = near.own(without)
         force = near.at[own]  # its share of the modelled side goes back to the residual
         b, h = b + S[own].T @ force, h + (K - np.eye(len(K)))[:, own] @ force
-        kept = np.ones(len(K), dtype=bool)
         kept[own.start : own.start + 5] = False
         K, S, h = K[np.ix_(kept, kept)], S[kept], h[kept]
     Y = np.linalg.solve(K, np.column_stack([S, h]))
@@ -163,7 +179,10 @@ def evidence_at(
         f = np.where(outside[:, None], along[:, None] * np.array([1.0, 0.0, 0.0]), f)
         better = np.where(f[:, 0] < 0.0, own_gain, -np.inf) > gain
         gain[better], force[better] = own_gain[better], f[better]
-    return gain, np.einsum("ci,cij->cj", force, axes)
+    force = np.einsum("ci,cij->cj", force, axes)
+    change = np.zeros((c, len(kept)))
+    change[:, kept] = Y[:, -1] - np.einsum("pci,ci->cp", Y[:, :-1].reshape(-1, c, 3), force)
+    return Additions(gain, force, near.forces_after(change))
 
 
 # --- proposals ------------------------------------------------------------------------------------------------------------
@@ -193,16 +212,14 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
     sites = _at_touches(near, new)
     axes, push = axes_at(model, new, best.state), np.zeros(len(new), dtype=bool)
     odds = np.array([odds_of(model, one, best.rows) for one in new])
-    gains, forces = evidence_at(near, sites, axes, push)
-    found = [_added(best, one, f, g - L) for one, g, f, L in zip(new, gains, forces, odds) if g > L - SHORT]
+    added = evidence_at(near, sites, axes, push)
+    gains = added.gains - odds
+    found = [_added(best, new[c], added, int(c), gains[c]) for c in np.flatnonzero(gains > -SHORT)]
     for i, contact in enumerate(best.contacts):
         if contact.source == "shape":
-            gains, forces = evidence_at(near, sites, axes, push, without=i)
-            found += [
-                _replaced(best, i, one, f, g - L + best.odds[i] - best.drop_gain[i])
-                for one, g, f, L in zip(new, gains, forces, odds)
-                if g - L + best.odds[i] - best.drop_gain[i] > -SHORT
-            ]
+            instead = evidence_at(near, sites, axes, push, without=i)
+            gains = instead.gains - odds + best.odds[i] - best.drop_gain[i]
+            found += [_replaced(best, i, new[c], instead, int(c), gains[c]) for c in np.flatnonzero(gains > -SHORT)]
     return found
 
 
@@ -227,22 +244,25 @@ def _at_candidates(near: Vicinity) -> list[Proposal]:
     for pulls in (False, True) if near.model.upward.any() else (False,):
         added = _inferred(near, at, pulls=pulls)
         if added.gain > 0.0:
-            found += [_added(best, contact, force, added.gain) for contact, force in added.places(near.model.sensor)]
+            found += [_added(best, contact, added.at, c, added.gain) for c, contact in added.places(near.model.sensor)]
         for i, odds in enumerate(best.odds):
             moved = _inferred(near, at, pulls=pulls, without=i)
             gain = moved.gain + float(odds)
             if gain > 0.0:
-                found += [_replaced(best, i, contact, force, gain) for contact, force in moved.places(near.model.sensor)]
+                found += [_replaced(best, i, contact, moved.at, c, gain) for c, contact in moved.places(near.model.sensor)]
     return found
 
 
-def _added(best: Fit, contact: Touch, force: FloatArray, gain: float) -> Proposal:
-    return Proposal(float(gain), (*best.contacts, contact), np.vstack([best.forces, force]), np.append(best.tau, _tau(force)))
+def _added(best: Fit, contact: Touch, at: Additions, c: int, gain: float) -> Proposal:
+    """Return the hypothesis with one more contact, at place c of some, all forces at their common minimum."""
+    force = at.forces[c]
+    return Proposal(float(gain), (*best.contacts, contact), np.vstack([at.others[c], force]), np.append(best.tau, _tau(force)))
 
 
-def _replaced(best: Fit, i: int, contact: Touch, force: FloatArray, gain: float) -> Proposal:
-    contacts, forces, tau = list(best.contacts), best.forces.copy(), best.tau.copy()
-    contacts[i], forces[i], tau[i] = contact, force, _tau(force)
+def _replaced(best: Fit, i: int, contact: Touch, at: Additions, c: int, gain: float) -> Proposal:
+    """Return the hypothesis with another contact instead of contact i, at place c of some, all forces at their common minimum."""
+    contacts, forces, tau = list(best.contacts), at.others[c].copy(), best.tau.copy()
+    contacts[i], forces[i], tau[i] = contact, at.forces[c], _tau(at.forces[c])
     return Proposal(float(gain), tuple(contacts), forces, tau)
 
 
@@ -275,23 +295,21 @@ class Inferred:
 
     gain: float
     """By how much it lowers J, marginalised over the candidates; relative to the place of the contact that it replaces."""
-    gains: FloatArray
-    """… at each candidate, shape (c,)."""
-    forces: FloatArray
-    """[N], shape (c, 3)."""
+    at: Additions
+    """At each candidate; its gains are decreases of J."""
     pulls: bool
 
-    def places(self, sensor: Sensor) -> list[tuple[Touch, FloatArray]]:
-        """Return contacts at the best candidates with their forces."""
-        std, top = float(np.sqrt(sensor.surface.area.sum() / (2.0 * np.pi))), float(self.gains.max())
-        found: list[tuple[Touch, FloatArray]] = []
-        for i in np.argsort(-self.gains):
-            place = sensor.robot.body.mesh.nodes[sensor.candidates[i]]
-            if len(found) == SEARCHED or self.gains[i] < top - CLOSE:
+    def places(self, sensor: Sensor) -> list[tuple[int, Touch]]:
+        """Return the best candidates, as (index, contact)."""
+        gains, std = self.at.gains, float(np.sqrt(sensor.surface.area.sum() / (2.0 * np.pi)))
+        found: list[tuple[int, Touch]] = []
+        for c in np.argsort(-gains):
+            place = sensor.robot.body.mesh.nodes[sensor.candidates[c]]
+            if len(found) == SEARCHED or gains[c] < gains.max() - CLOSE:
                 break
-            if all(np.linalg.norm(place - contact.place) > SAME * sensor.size for contact, _ in found):
+            if all(np.linalg.norm(place - contact.place) > SAME * sensor.size for _, contact in found):
                 contact = make_touch(sensor, place, source="shape", std_m=std)
-                found.append((replace(contact, pulls=self.pulls), self.forces[i]))
+                found.append((int(c), replace(contact, pulls=self.pulls)))
         return found
 
 
@@ -302,25 +320,27 @@ def _inferred(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | N
         pulls: ask for hanging weights, whose forces keep to no cone.
         without: a contact of the fit that is removed; the gain is then relative to its own place.
     """
-    gains, forces = _gains(near, at, pulls=pulls, without=without)
+    added = _at_all(near, at, pulls=pulls, without=without)
+    gains = added.gains
     top = float(gains.max())
     if not np.isfinite(top):
-        return Inferred(-np.inf, gains, forces, pulls)
+        return Inferred(-np.inf, added, pulls)
     # All candidates are equally likely beforehand.
     total = (
         top + 2.0 * float(np.log(np.exp(0.5 * (gains - top)).mean()))
         if without is None
         else top - _gain_at_own_place(near, without)
     )
-    return Inferred(total, gains, forces, pulls)
+    return Inferred(total, added, pulls)
 
 
-def _gains(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None) -> tuple[FloatArray, FloatArray]:
-    """Return the decrease of J by one more contact at each candidate, shape (c,), and its force [N], shape (c, 3)."""
+def _at_all(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None) -> Additions:
+    """Return one more contact at each candidate, with the decrease of J as its gain."""
     c = len(at.normals)
     axes = axes_of(np.broadcast_to(near.model.upward, (c, 3)) if pulls else at.normals)
-    gains, forces = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
-    return gains - near.model.inferred_odds - (HANGING if pulls else IN_SIGHT * at.seen), forces
+    added = evidence_at(near, at.sites, axes, np.full(c, pulls), without=without)
+    odds = near.model.inferred_odds + (HANGING if pulls else IN_SIGHT * at.seen)
+    return replace(added, gains=added.gains - odds)
 
 
 def elsewhere(model: Model, best: Fit) -> FloatArray:
@@ -345,7 +365,7 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
         volume = min(2.0 * np.pi * float(np.sqrt(np.prod(np.linalg.eigvalsh(best.place_covariance[i])[1:]))), share)
         points, mass = positions[nodes] - place, np.zeros(len(nodes))
         for pulls in ways:
-            mass += share * _likelihood(_gains(near, at, pulls=pulls, without=i)[0] - own)
+            mass += share * _likelihood(_at_all(near, at, pulls=pulls, without=i).gains - own)
         mass[np.linalg.norm(points, axis=1) < np.sqrt(share)] = 0.0
         if (other := _on_other_side(model, best, i)) is not None:
             way = other.contacts[i].patch.mean(other.state.positions) - place
@@ -389,4 +409,4 @@ def _gain_at_own_place(near: Vicinity, i: int) -> float:
         (XWX[own, own] / np.outer(scale, scale))[None],
         XWX[:, own] / scale,
     )
-    return float(evidence_at(near, sites, np.eye(3)[None], np.array([contact.pulls]), without=i)[0][0])
+    return float(evidence_at(near, sites, np.eye(3)[None], np.array([contact.pulls]), without=i).gains[0])
