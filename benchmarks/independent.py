@@ -29,7 +29,7 @@ def asked(given: argparse.Namespace, case: Case) -> tuple[str, dict[str, Row]]:
     if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():
         return f"{note} left out, no diamond.vtu in {given.diamond}", {}
     if not (folder / "truth.json").exists():
-        truth = make(case, folder, given.seed, diamond=given.diamond, plain=given.plain)
+        truth = make(case, folder, given.seed, diamond=given.diamond, plain=given.plain, stretch_limit=given.gent)
         note += f" made in {truth['made_in_s']} s, {truth['mesh']}, residual {truth['certificate']['worst_residual_n']:.1e} N"
     if not given.run:
         return note, {}
@@ -54,6 +54,13 @@ def main() -> int:
     )
     ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
+    ask.add_argument(
+        "--gent",
+        type=float,
+        default=float("inf"),
+        metavar="JM",
+        help="the truth stiffens when stretched, by Gent's law; 2 is strong",
+    )
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
     ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest, whose forces push")
     ask.add_argument(

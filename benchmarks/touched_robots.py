@@ -1,10 +1,10 @@
 """Forces on the robots that come along, touched in sight of a depth camera: the virtual rig's truth beside what is sensed.
 
-    python benchmarks/touched_robots.py [--robots NAME …] [--seed S] [--out FOLDER]
+    python benchmarks/touched_robots.py [--robots NAME …] [--seed S] [--law NAME] [--out FOLDER]
 
 Each robot pulls its inputs one after the other (free frames), then a ball presses on it, harder from frame to frame, leaves and hovers. The seed draws the
-camera, 2.5 to 3 sizes of the robot away, and the place among those that it sees and that yield. The truth has elements of half the size and the
-neo-Hookean law, which the robot does not declare; markers of the free frames tell the pose. Recordings are kept below OUT.
+camera, 2.5 to 3 sizes of the robot away, and the place among those that it sees and that yield. The truth has elements of half the size and the law
+--law, which the robot does not declare; markers of the free frames tell the pose. Recordings are kept below OUT.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def drawn(robot: Robot, seed: int) -> tuple[FloatArray, FloatArray, float]:
     return eye, place, DEFLECTED * size / most
 
 
-def script_of(robot: Robot, seed: int) -> dict[str, Any]:
+def script_of(robot: Robot, seed: int, law: str) -> dict[str, Any]:
     """Return the script of one recording."""
     eye, place, force = drawn(robot, seed)
     nodes = robot.body.mesh.nodes
@@ -80,7 +80,7 @@ def script_of(robot: Robot, seed: int) -> dict[str, Any]:
                 "force_n": [*np.linspace(0.2 * force, force, TOUCHED).tolist(), *[0.0] * AFTER],
             }
         ],
-        "truth": {"law": "neo_hookean", "substeps": 1},
+        "truth": {"law": law, "substeps": 1},
         "camera": {
             "eye_m": eye.tolist(),
             "target_m": nodes.mean(axis=0).tolist(),
@@ -95,11 +95,11 @@ def script_of(robot: Robot, seed: int) -> dict[str, Any]:
     }
 
 
-def row(name: str, seed: int, folder: Path) -> str:
+def row(name: str, seed: int, law: str, folder: Path) -> str:
     """Return a line of the table."""
-    robot, place = load_robot(name), folder / f"{name}-{seed}"
+    robot, place = load_robot(name), folder / f"{name}-{seed}{'-linear' * (law == 'corotational')}"
     if not (place / "recording.toml").is_file():
-        simulate(robot, script_of(robot, seed), place)
+        simulate(robot, script_of(robot, seed, law), place)
     recording = load_recording(place)
     began = time.process_time()
     calibration = calibrate(robot, recording)
@@ -123,6 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="*", default=list(ROBOTS), choices=ROBOTS)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--law", default="neo_hookean", choices=["neo_hookean", "corotational"], help="of the truth")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -132,7 +133,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|", flush=True)
     for name in asked.robots:
-        print(row(name, asked.seed, folder), flush=True)
+        print(row(name, asked.seed, asked.law, folder), flush=True)
 
 
 if __name__ == "__main__":

@@ -52,14 +52,22 @@ class Take:
     object_color: Array = field(default_factory=lambda: np.zeros(3))
 
 
-def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, plain: bool = False) -> dict[str, object]:
-    """Write one case below a folder and return its truth; `plain`: without the optional tables on noise and tools."""
+def make(
+    case: Case,
+    folder: Path,
+    seed: int,
+    *,
+    diamond: Path | None = None,
+    plain: bool = False,
+    stretch_limit: float = np.inf,
+) -> dict[str, object]:
+    """Write one case below a folder and return its truth; `plain`: without the optional tables on noise and tools; `stretch_limit`: Jm of Gent's law."""
     case = replace(case, declared_noise=False, tool=False) if plain else case
     begin = time.perf_counter()
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     body = bodies.diamond(rng, _needed(diamond)) if case.robot == "diamond" else getattr(bodies, case.robot)(rng)
     body = body.touched_near_clamp() if case.near_clamp else body
-    solid = Solid(body.truth, body.young, body.poisson, body.density, GRAVITY, body.fixed)
+    solid = Solid(body.truth, body.young, body.poisson, body.density, GRAVITY, body.fixed, stretch_limit)
     skin = Skin(solid)
     problem = Problem(solid, [Cable(t.name, solid.rows(t.path), t.pull) for t in body.tendons])
     camera = _camera(case, body, rng)
@@ -79,7 +87,7 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
     truth = {
         "case": case.name,
         "seed": seed,
-        "law": "compressible neo-Hookean with the declared moduli",
+        "law": f"compressible {'neo-Hookean' if np.isinf(stretch_limit) else f'Gent, Jm = {stretch_limit:g},'} with the declared moduli",
         "mesh": f"{solid.mesh.nelements} cells, {len(solid.rest)} nodes, {type(solid.element).__name__}",
         "contacts": take.contacts,
         "T_robot_camera": listed(camera.pose),

@@ -1,6 +1,7 @@
-"""Quasi-static finite deformation of a compressible neo-Hookean body with quadratic elements of scikit-fem.
+"""Quasi-static finite deformation of a compressible rubber body with quadratic elements of scikit-fem.
 
-Energy density W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet & Wood, Nonlinear Continuum Mechanics, eq. 6.27).
+Energy density W = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 (neo-Hookean: Bonet & Wood, Nonlinear Continuum Mechanics, eq. 6.27); with a limit Jm of the
+stretch the first term is -mu Jm/2 ln(1 - (tr C - 3)/Jm) (Gent, Rubber Chem. Technol. 69, 1996), which has the same small-strain moduli.
 """
 
 from __future__ import annotations
@@ -121,7 +122,16 @@ class State:
 class Solid:
     """A clamped body of scikit-fem cells (P2 tetrahedra or 27-node hexahedra)."""
 
-    def __init__(self, mesh: skfem.Mesh, young: float, poisson: float, density: float, gravity: Array, fixed: Array) -> None:
+    def __init__(
+        self,
+        mesh: skfem.Mesh,
+        young: float,
+        poisson: float,
+        density: float,
+        gravity: Array,
+        fixed: Array,
+        stretch_limit: float = np.inf,
+    ) -> None:
         tetra = isinstance(mesh, skfem.MeshTet1)
         self.element = skfem.ElementTetP2() if tetra else skfem.ElementHex2()
         self.mesh, self.tetra = mesh, tetra
@@ -131,7 +141,7 @@ class Solid:
         self.cells = basis.element_dofs.T
         self.slopes = np.stack([np.moveaxis(np.asarray(basis.basis[a][0].grad), 0, -1) for a in range(count)], axis=2)
         self.weight = np.asarray(basis.dx)
-        self.mu = young / (2 * (1 + poisson))
+        self.mu, self.stretch_limit = young / (2 * (1 + poisson)), stretch_limit
         self.lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
         shape = np.stack([np.broadcast_to(np.asarray(basis.basis[a][0]), self.weight.shape) for a in range(count)], axis=-1)
         lumps = np.zeros(len(self.rest))
@@ -169,18 +179,31 @@ class Solid:
             raise Diverged("an element turned inside out")
         return deformation, j, np.linalg.inv(deformation)
 
+    def _stiffening(self, f: Array) -> Array:
+        """Derivative of the first term by (tr C - 3)/2, relative to mu: 1 of the neo-Hookean law, (e, q)."""
+        if not np.isfinite(self.stretch_limit):
+            return np.ones(f.shape[:2])
+        left = 1 - (np.sum(f * f, axis=(2, 3)) - 3) / self.stretch_limit
+        if not np.all(left > 1e-3):
+            raise Diverged("an element is stretched to its limit")
+        return 1 / left
+
     def strain_energy(self, x: Array) -> float:
         """[J]."""
         f, j, _ = self._gradient(x)
         log = np.log(j)
-        density = self.mu / 2 * (np.sum(f * f, axis=(2, 3)) - 3) - self.mu * log + self.lam / 2 * log**2
+        stretch = np.sum(f * f, axis=(2, 3)) - 3
+        if np.isfinite(self.stretch_limit):
+            self._stiffening(f)
+            stretch = -self.stretch_limit * np.log1p(-stretch / self.stretch_limit)
+        density = self.mu / 2 * stretch - self.mu * log + self.lam / 2 * log**2
         return float(np.sum(density * self.weight))
 
     def inner_forces(self, x: Array) -> Array:
         """Derivative of the strain energy by the nodes [N], (n, 3)."""
         f, j, inverse = self._gradient(x)
         turned = np.swapaxes(inverse, 2, 3)
-        stress = self.mu * (f - turned) + (self.lam * np.log(j))[..., None, None] * turned
+        stress = self.mu * (self._stiffening(f)[..., None, None] * f - turned) + (self.lam * np.log(j))[..., None, None] * turned
         at_cell = np.sum((self.slopes @ np.swapaxes(stress, 2, 3)) * self.weight[..., None, None], axis=1)
         out = np.zeros_like(x)
         np.add.at(out, self.cells, at_cell)
@@ -188,7 +211,8 @@ class Solid:
 
     def stiffness(self, x: Array) -> sp.csr_matrix:
         """Second derivative of the strain energy by the free degrees of freedom [N/m]."""
-        _, j, inverse = self._gradient(x)
+        f, j, inverse = self._gradient(x)
+        stiffening = self._stiffening(f)
         cells, points, count, _ = self.slopes.shape
         pushed = self.slopes @ inverse
         flat = pushed.reshape(cells, points, 3 * count)
@@ -199,10 +223,14 @@ class Solid:
         blocks = outer(self.lam * self.weight)
         blocks += np.swapaxes(outer((self.mu - self.lam * np.log(j)) * self.weight), 2, 4)
         wide = np.swapaxes(self.slopes, 1, 2).reshape(cells, count, -1)
-        scaled = np.swapaxes(self.slopes * (self.mu * self.weight)[..., None, None], 1, 2).reshape(cells, count, -1)
+        scaled = np.swapaxes(self.slopes * (self.mu * stiffening * self.weight)[..., None, None], 1, 2).reshape(cells, count, -1)
         plain = scaled @ np.swapaxes(wide, 1, 2)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += plain
+        if np.isfinite(self.stretch_limit):
+            along = (self.slopes @ np.swapaxes(f, 2, 3)).reshape(cells, points, 3 * count)
+            more = 2 * self.mu * stiffening**2 / self.stretch_limit * self.weight
+            blocks += (np.swapaxes(along * more[..., None], 1, 2) @ along).reshape(cells, count, 3, count, 3)
         data = np.add.reduceat(blocks.reshape(-1)[self._keep][self._order], self._starts)
         n = len(self._indptr) - 1
         return sp.csr_matrix((data, self._indices, self._indptr), shape=(n, n))
