@@ -1,4 +1,4 @@
-"""A run beside the truth that the virtual rig leaves with a recording."""
+"""Comparison of a run with the ground truth of a simulated recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TrueContact:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Comparison:
-    """How far a run is from the truth."""
+    """Errors of a run against the ground truth."""
 
     pairs: tuple[tuple[TrueContact, ContactForce], ...]
     """True contacts with those that were found in their place."""
@@ -69,14 +69,27 @@ class Comparison:
 
 
 def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
-    """Return how far a run is from the truth. Forces that noise may make are no contacts, neither are true ones of nothing.
+    """Compare a run with the ground truth of a simulated recording.
+
+    A contact is found if an estimated one lies within a tenth of the robot's size of it. Estimated forces below three σ, and true
+    forces of zero, do not count as contacts.
 
     Arguments:
-        run: of `estimate`.
-        truth: the folder of a recording of the virtual rig, or true contacts.
+        run: result of `estimate`.
+        truth: the folder of a recording of the virtual rig, or the true contacts.
 
     Raises:
-        InputError: a recording without a truth, or one that the run is not of.
+        InputError: a recording without ground truth, or another recording than that of the run.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> folder = fs.robot_names()["finger"] / "recordings" / "press"
+        >>> recording = fs.load_recording(folder)
+        >>> robot = fs.apply_effects(robot, [{"name": "cable_friction", "coefficient": 0.15}])
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
+        >>> comparison = fs.compare(run, folder)
+        >>> comparison.contacts_true, len(comparison.pairs), comparison.contacts_false
+        (3, 3, 0)
     """
     if isinstance(truth, str | Path):
         if not (Path(truth) / "truth" / "contacts.csv").is_file():

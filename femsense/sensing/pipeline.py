@@ -57,24 +57,34 @@ def estimate(
     keep: tuple[str | Path, Mapping[str, Any]] | None = None,
     keep_every_s: float = CHECKPOINT_S,
 ) -> Run:
-    """Find contacts and forces in every frame: from clouds, or from markers where there are none.
+    """Estimate contacts and forces in every frame: from clouds, or from markers in recordings without clouds.
 
-    Known loads (loads.csv) act on the model, except those within a fifth of the body's size of a given place: these are what
-    is to be sensed, and `known_loads` compares.
+    Known loads (loads.csv) act on the model. Those closer to a point of `at` than a fifth of the body's size are left out and
+    estimated instead; `Run.known_loads` compares.
 
     Arguments:
-        robot: the robot.
+        robot: the declared robot.
         recording: clouds or markers, and inputs.
-        calibration: pose and initial inputs.
-        at: places of contact at rest [m], shape (g, 3); needed where there are only markers.
-        options: assumptions.
-        progress: called with (frames done, frames in all).
-        keep: a file that holds the frames that are done, so that an estimate that is killed goes on there, and what it is made from: a file that
-            says something else is not used. It is removed at the end.
-        keep_every_s: seconds of work that a killed estimate may lose.
+        calibration: camera poses and initial inputs.
+        at: known contact points at rest [m], shape (g, 3); required for markers only.
+        options: assumptions on contacts, noise and smoothness.
+        progress: called with (frames done, number of frames).
+        keep: a checkpoint file and the inputs that it must match: an interrupted estimate resumes with the same result, and a file with
+            other inputs is ignored. It is removed at the end.
+        keep_every_s: interval between checkpoints [s].
+
+    Returns:
+        contacts with forces and their standard deviations, the status of each frame, and the deformed states.
 
     Raises:
-        InputError: no clouds and no places; DataError: not one frame gave a result.
+        InputError: neither clouds nor `at`. DataError: no frame has a result.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
+        >>> [round(contact.force_n, 1) for contact in run.contacts]  # N
+        [0.1, 0.3, 0.2]
     """
     if robot.softening:
         warnings.warn(

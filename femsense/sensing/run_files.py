@@ -103,20 +103,31 @@ def write_run(
     seconds: float | None = None,
     calibration: Calibration | None = None,
 ) -> Path:
-    """Write contacts.csv, frames.csv, states.npz, the calibration and at last run.json.
+    """Write a run as contacts.csv, frames.csv, states.npz, calibration.json and, last, run.json.
 
     Arguments:
-        run: of `estimate`.
-        folder: made where it is missing; its other files stay.
-        inputs: of `run_inputs`.
-        seconds: how long the estimate took [s].
-        calibration: what it was made with; stands beside it as calibration.json.
+        run: result of `estimate`.
+        folder: created if missing; its other files are kept.
+        inputs: result of `run_inputs`: the files that the run was computed from.
+        seconds: duration of the estimate [s].
+        calibration: the calibration that was used.
 
     Returns:
         the folder.
 
     Raises:
-        InputError: see `check_run_folder`.
+        InputError: the folder is not writable, or contains another kind of result.
+
+    Example:
+        >>> import tempfile
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> calibration = fs.calibrate(robot, recording)
+        >>> run = fs.estimate(robot, recording, calibration, at=[0.088, 0.0, 0.014])
+        >>> inputs = fs.run_inputs(robot, recording, calibration, at=[0.088, 0.0, 0.014])
+        >>> folder = fs.write_run(run, tempfile.mkdtemp() + "/run", inputs=inputs, calibration=calibration)
+        >>> len(fs.read_run(folder).contacts)
+        3
     """
     check_run_folder(folder)
     with results_folder(folder, "run.json") as part:
