@@ -1,6 +1,6 @@
 """Contacts and forces of one frame: predict, propose, fit, keep the best, stop.
 
-docs/method/estimator.md has the objective J, the proposals and the posterior check.
+The objective J, the proposals and the posterior check are defined in docs/method/estimator.md.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
-"""Rounds of proposals at most, and proposals that are fitted in each."""
+"""Maximum number of rounds of proposals, and of proposals fitted in each."""
 UNDETERMINED_TAU = 2.0
-"""Prior scale of the force at an object in touch that the data do not determine [N]: what hands and grippers press with."""
+"""Prior scale of a force at a touching object that the data do not determine [N]: the usual force of hands and grippers."""
 MANY = 30
-"""Pixels of an object without a known shape that may carry a latent force."""
+"""Minimum number of pixels of an object without a known shape that can carry a latent force."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """A frame, estimated."""
+    """The estimate of a frame."""
 
     best: Fit
     rms_before_m: float
-    """Residual of the predicted state, along the normal or of markers in 3-D."""
+    """Residual of the predicted state: along the normal for pixels, in 3-D for markers [m]."""
     stages_ms: dict[str, float]
 
 
@@ -90,7 +90,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
     """Return the hypothesis of frame k with the lowest J.
 
     Raises:
-        FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
+        FemsenseError: a broken file, no pixel of the robot, or no equilibrium.
     """
     clock = Clock()
     frame = _predicted(model, k, previous, clock)
@@ -110,14 +110,14 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
 
 
 def covariance_of(model: Model, best: Fit, i: int) -> FloatArray:
-    """Return the covariance of the force of contact i [N²], shape (3, 3): of the fit, and of the model's compliance."""
+    """Return the covariance of the force of contact i [N²], shape (3, 3): that of the fit plus that of the model's compliance."""
     force = best.forces[i]
     own = best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
     return np.asarray(own + model.compliance_std**2 * np.outer(force, force))
 
 
 def inliers(best: Fit) -> BoolArray:
-    """Return which rows of the measurements are the robot's with probability above one half, shape (r,)."""
+    """Return which measured rows belong to the robot with probability above one half, shape (r,)."""
     return np.asarray((best.responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
 
 
@@ -139,7 +139,7 @@ def measurements(rows: Rows) -> int:
 
 
 def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
-    """Return the best fit after proposals have stopped to lower J, and where seen objects touch there."""
+    """Return the best fit, after no proposal lowers J any more, and the contacts of observed objects there."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
         seen = _seen(model, best)
@@ -151,13 +151,13 @@ def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
 
 
 def _seen(model: Model, best: Fit) -> list[Touch]:
-    """Return where seen objects touch the state of a fit."""
+    """Return the contacts of observed objects with the body in the state of a fit."""
     return away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.objects, best.state))
 
 
 def _with_objects(model: Model, best: Fit) -> Fit:
-    """Return a fit with the objects near the body where it stands now; where colour does not separate them, of the pixels in front that it does not take
-    for the robot."""
+    """Return a fit with the objects near the body in its fitted state. Without colour, objects consist of the pixels in front that the
+    mixture does not assign to the robot."""
     frame = best.frame
     if frame.scan is None or said_free(model.sensor, frame.index):
         return best
@@ -177,12 +177,12 @@ def _with_objects(model: Model, best: Fit) -> Fit:
 
 
 def _moved_by(positions: FloatArray | None, state: Equilibrium) -> float:
-    """Return how far any node is from a position [m]; 0 where nothing was looked for yet."""
+    """Return the largest distance of a node from an earlier position [m]; 0 if there is none."""
     return 0.0 if positions is None else float(np.linalg.norm(state.positions - positions, axis=1).max())
 
 
 def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: Equilibrium) -> tuple[Shape, ...]:
-    """Return the objects that the pixels in front of a state show that are not the robot's, robot (r,)."""
+    """Return the objects formed by the pixels in front of a state that do not belong to the robot; robot: responsibilities, shape (r,)."""
     assert frame.scan is not None
     pixels = rows.pixel
     other = ~robot[pixels] & (rows.residual[pixels] > 0.0)
@@ -191,18 +191,20 @@ def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: E
 
 
 def _is_alike(model: Model, first: Shape, second: Shape) -> bool:
-    """Return whether two shapes are one up to what is not known of where its surface is: how far a plate or rod was seen to reach does not matter."""
+    """Return whether two shapes are the same within the uncertainty of their surfaces. The visible extent of a plate or rod does not
+    matter."""
     ways = {"plate": first.axes[2:], "cylinder": first.axes[1:]}.get(first.kind, first.axes)
     apart = float(np.linalg.norm(ways @ (first.center - second.center)))
     return first.kind == second.kind and apart < max(gap_std(model, first), gap_std(model, second))
 
 
 def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
-    """Return the best hypothesis fitted again with all that touches and whose force the data do not determine, where there is any.
+    """Return the best hypothesis, refitted with the touching objects whose force the data do not determine.
 
-    Objects in touch that are no contacts have no significant force. Left out, they would bias those of their neighbours and make their intervals too narrow.
-    An object whose surface lies at the body's becomes a contact with a wide interval, another one a latent force. So does a visible contact whose force is
-    not significant: of two tips that squeeze a body the pixels tell the difference, and the smallest τ would call both forces zero.
+    A touching object that is not a contact of the hypothesis has no significant force. Without its force, the forces of its neighbours
+    would be biased and their intervals too narrow. If its surface lies at the body's, it becomes a contact with a wide interval, otherwise
+    a latent force. Visible contacts with insignificant forces are treated alike: if two tips squeeze a body, the pixels determine only the
+    difference of their forces, and the smallest τ would set both to zero.
     """
     others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
@@ -213,7 +215,7 @@ def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -
 
 
 def _unsized(model: Model, best: Fit) -> list[bool]:
-    """Return which visible contacts have a force that is not significant under a prior that was sized by it."""
+    """Return which visible contacts have an insignificant force, with a prior scale that was fitted to it."""
     return [
         is_rigid(model, contact) and not contact.undetermined and float(np.linalg.norm(force)) < UNDETERMINED * std_along(best, i)
         for i, (contact, force) in enumerate(zip(best.contacts, best.forces))
@@ -221,9 +223,8 @@ def _unsized(model: Model, best: Fit) -> list[bool]:
 
 
 def _fitted_wide(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
-    """Return a hypothesis with more contacts fitted again, these and contacts without a significant force under the wide prior.
-
-    The other visible contacts begin with it: their τ was sized while their counterparts had no force.
+    """Return a hypothesis refitted with additional contacts. These and the insignificant ones have the wide prior. The other visible
+    contacts start from it, because their τ was estimated while their counterparts had no force.
     """
     unsized = _unsized(model, best)
     tau = [UNDETERMINED_TAU if is_rigid(model, contact) else own for contact, own in zip(best.contacts, best.tau)]
@@ -241,15 +242,15 @@ def _fitted_wide(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
 
 
 def _is_object(contact: Touch) -> bool:
-    """Return whether a contact is with an object of known shape, or with one whose pixels are too many for a scrap of the scene."""
+    """Return whether a contact is with an object of known shape, or with one of at least MANY pixels."""
     shape = contact.shape
     return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
 
 
 def _fits(model: Model, best: Fit, seen: Sequence[Touch]) -> Iterator[Fit]:
-    """Yield fits of the most promising proposals, one after the other; seen: where seen objects touch.
+    """Yield fits of the most promising proposals, one after the other; seen: contacts of observed objects.
 
-    Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
+    If contacts squeeze the body beyond the range of its law, no contact is added: it would compensate the error of law and mesh.
     """
     most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
     for one in [one for one in proposals(model, best, seen) if len(one.contacts) <= most][:FITTED]:
@@ -278,7 +279,7 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
         )
     seen = () if previous is None else previous.objects
     pixels = model.pixels(scan)
-    if not pixels.coloured:  # most pixels are of something else
+    if not pixels.coloured:  # most pixels belong to something else
         pixels = pixels.anchored(model.skin, expected.positions)
     frame = Frame(k, pixels, scan, predicted, tensions, seen_before=seen)
     objects: tuple[Shape, ...] = ()
@@ -296,7 +297,7 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
-    """Return about where the body is: the previous state, moved as the inputs have moved the predicted one since."""
+    """Return an approximate state of the body: the previous state plus the change of the predicted one."""
     if previous is None or not previous.touches or not previous.trusted:
         return predicted
     moved = previous.state.positions + predicted.positions - previous.free_state.positions
@@ -311,7 +312,7 @@ def _without_contacts(model: Model, frame: Frame) -> Fit:
 
 
 def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit | None:
-    """Return the fit of the previous frame's contacts where dropping any of them would raise J; else None."""
+    """Return the fit of the previous frame's contacts if removing any of them would raise J; else None."""
     if (
         previous is None
         or not previous.touches
@@ -334,7 +335,8 @@ def _carried_over(model: Model, frame: Frame, previous: SensedFrame | None) -> F
 
 
 def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
-    """Return a contact of the previous frame at its object, or at one that is seen to touch near it now; inferred where none is."""
+    """Return a contact of the previous frame at its object, or at another object that now touches near it; without either, as an inferred
+    contact."""
     if own := next((one for one in seen if contact.source == "cloud" and is_with(contact, one.shape)), None):
         return own
     distance = [float(np.linalg.norm(one.place - contact.place)) for one in seen] if contact.source == "cloud" else []
@@ -347,14 +349,14 @@ def _followed(model: Model, contact: Touch, seen: Sequence[Touch]) -> Touch:
 
 
 def _at_given_places(model: Model, frame: Frame, given: Sequence[Touch], alone: Fit, previous: SensedFrame | None) -> Fit:
-    """Return the fit with forces at the given places, whatever its evidence."""
+    """Return the fit with forces at the given contact points, whatever its evidence."""
     forces, start = np.zeros((len(given), 3)), frame.predicted
     if previous is not None and len(previous.touches) == len(given):
         forces, start = previous.forces, _expected(frame.predicted, previous)
     tried = [fit(model, frame, given, forces, start)]
-    if not frame.coloured:  # the body may have moved far from where its pixels are told from the rest
+    if not frame.coloured:  # the body may be far from the state in which its pixels were separated from the rest
         tried.append(fit(model, frame, given, forces, start, catch=np.inf))
-        if (near := tried[-1]) is not None:  # the noise is widened anew from where that ends
+        if (near := tried[-1]) is not None:  # restart from there with a wide noise
             tried.append(fit(model, frame, near.contacts, near.forces, near.state, tau=near.tau, catch=np.inf))
     found = [one for one in tried if one is not None]
     return min(found, key=lambda one: one.criterion) if found else alone
@@ -369,7 +371,7 @@ class Clock:
 
     @property
     def total_ms(self) -> float:
-        """Time since it began [ms]."""
+        """Time since the start [ms]."""
         return 1e3 * (time.perf_counter() - self.began)
 
     def lap(self, name: str) -> None:
