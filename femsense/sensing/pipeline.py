@@ -1,4 +1,4 @@
-"""Contacts and forces of a recording, frame by frame: each starts from the one before where that is trusted."""
+"""Contacts and forces of a recording, frame by frame: each frame is the warm start of the next one if its status allows it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from femsense.sensing.types import (
 )
 
 CHECKPOINT_S = 10.0
-"""Seconds of work that a killed estimate may lose, if nothing else is asked for."""
+"""Interval between checkpoints [s]."""
 
 
 @one_blas_thread()
@@ -120,11 +120,11 @@ def estimate(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Method:
-    """How frames are sensed, and what stays the same over them."""
+    """The method of a recording: its function of a frame, and its constants."""
 
     sensor: Sensor
     sense: Callable[[int, SensedFrame | None], SensedFrame]
-    """(index of a frame, the frame before) → the frame. Raises FemsenseError."""
+    """(index of a frame, previous frame) → the frame. Raises FemsenseError."""
     candidates: Candidates = field(default_factory=Candidates)
 
 
@@ -139,7 +139,7 @@ def _method(
 
 
 def _sense_into(done: Done, method: _Method, k: int) -> None:
-    """Add a frame to those that are done; a wrong state is not handed on as the start of the next one."""
+    """Append frame k. A state that is not trusted is not the warm start of the next frame."""
     sensor = method.sensor
     try:
         if not _is_measured(sensor, k):
@@ -157,7 +157,7 @@ def _sense_into(done: Done, method: _Method, k: int) -> None:
 
 
 def under_inputs(frame: SensedFrame) -> SensedFrame:
-    """Return a frame under its inputs alone: what the next one starts from where its forces are not trusted (friction remembers it)."""
+    """Return a frame reduced to its inputs: the warm start of the next frame if the forces are not trusted. Friction depends on it."""
     return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), tau=np.zeros(0))
 
 
@@ -172,7 +172,7 @@ def _is_measured(sensor: Sensor, k: int) -> bool:
 
 
 def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
-    """Add frame k as the model has it where nothing was measured."""
+    """Append frame k as predicted by the model, without a measurement."""
     clock, last = Clock(), done.last
     before = last.state.segment_tensions if last is not None and has_history(sensor.robot) else None
     state = free_state(sensor, k, None if last is None else last.free_state, before)
@@ -184,7 +184,7 @@ def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
 
 
 def _named(done: Done, contacts: Sequence[ContactForce]) -> list[ContactForce]:
-    """Return contacts with numbers for those that begin a track."""
+    """Return the contacts with numbers for new tracks."""
     result = []
     for contact in contacts:
         if contact.track < 0:
@@ -216,7 +216,7 @@ def _failed(sensor: Sensor, k: int, error: Exception) -> FrameReport:
 def _compare_loads(
     recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float
 ) -> tuple[LoadComparison, ...]:
-    """Return declared next to sensed resultants of the frames whose loads act at the given places."""
+    """Return declared and estimated resultants of the frames with known loads at the given contact points."""
     near = near_places(recording.load_points, places, size)
     result = []
     for k, number in enumerate(recording.frame_numbers):
