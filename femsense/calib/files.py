@@ -55,7 +55,11 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
-    """Write calibration.json and return its path. Raises InputError where a folder or another file stands there."""
+    """Write a calibration as calibration.json, and return the path.
+
+    Raises:
+        InputError: a folder, or a file of another kind, exists at that path.
+    """
     target = Path(path)
     if target.is_dir():
         raise InputError(
@@ -67,10 +71,21 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Read calibration.json (or the one of a folder).
+    """Read calibration.json.
+
+    Arguments:
+        path: the file, or the folder that contains it.
 
     Raises:
-        InputError: another kind of file, or one that is broken; with the key, what was found and what was expected.
+        InputError: the file is missing, broken or of another kind. The error names the key, the value found and the value expected.
+
+    Example:
+        >>> import tempfile
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> calibration = fs.calibrate(fs.load_robot("finger"), recording)
+        >>> path = fs.write_calibration(calibration, tempfile.mkdtemp() + "/calibration.json")
+        >>> fs.read_calibration(path).status
+        'converged'
     """
     file = Path(path).expanduser()
     file = file / "calibration.json" if file.is_dir() else file

@@ -220,7 +220,15 @@ def make_body(
         gravity: [m/s²], shape (3,).
 
     Raises:
-        InputError: where a value is out of its range.
+        InputError: a value is out of its range.
+
+    Example:
+        >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])
+        >>> bar = fs.make_body(mesh, young_modulus=1e6, poisson_ratio=0.45, clamped=mesh.nodes[:, 0] == 0.0)
+        >>> forces = np.zeros_like(mesh.nodes)
+        >>> forces[np.argmax(mesh.nodes.sum(axis=1)), 2] = -0.05  # N, at one corner of the tip
+        >>> fs.solve_equilibrium(bar, nodal_forces=forces).converged
+        True
     """
     n, m = len(mesh.nodes), len(mesh.tets)
     E, nu = (np.broadcast_to(np.asarray(v, dtype=float), (m,)) for v in (young_modulus, poisson_ratio))

@@ -94,7 +94,12 @@ def find_robot(path_or_name: str | Path) -> Path:
 
 
 def robot_names() -> dict[str, Path]:
-    """Return the robots that come with the project: name → folder."""
+    """Return the robots that are installed with femsense: name → folder.
+
+    Example:
+        >>> sorted(fs.robot_names())
+        ['arm', 'finger', 'four-leg', 'gripper', 'pneu-finger']
+    """
     package = Path(femsense.__file__).parent
     folders: dict[str, Path] = {}
     for root in (package.parent / "meshes", package / "meshes"):

@@ -76,20 +76,32 @@ def improve(
     progress: Progress | None = None,
     options: ImproveOptions | None = None,
 ) -> LoopResult:
-    """Find what the model lacks, add it, and report the error on held-out data before and after.
+    """Search for the effects that the declared model lacks, and report the held-out error with and without them.
+
+    Effects are added one at a time. An effect is accepted if its evidence (the decrease of χ² less the BIC penalty of its parameters)
+    is significant and sweeps that were not fitted do not contradict it. Camera poses, modulus and inputs are fitted along.
 
     Arguments:
         robot: the declared robot.
         recordings: data to fit: markers, clouds or depth images.
-        validation: data for the held-out error; by default whole sweeps of `recordings` are held out.
-        effects: names to try; by default all.
-        without: names to leave out.
-        progress: called with a text that names the step, the share of the work that is done and the remaining time; repeated every few
-            seconds, possibly from another thread.
+        validation: data for the held-out error. Default: whole sweeps of `recordings` are held out.
+        effects: names of effects to try (docs/effects). Default: all.
+        without: names of effects to leave out.
+        progress: called every few seconds, possibly from another thread, with a text: step, share of the work, remaining time.
         options: user-defined effects, which measurements are used, computation.
 
+    Returns:
+        the verdict, accepted and rejected effects with their evidence, held-out errors, and the improved robot.
+
     Raises:
-        InputError: unknown names, no recording; DataError: the data do not allow a fit.
+        InputError: an unknown effect, or no recording. DataError: the data do not allow a fit.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> loop = fs.improve(robot, [recording], effects=["cable_friction", "stiffness"])
+        >>> [(effect.name, round(effect.parameters["coefficient"].value, 2)) for effect in loop.effects]  # the truth: 0.15
+        [('cable_friction', 0.15)]
     """
     work, options = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     searched: Sequence[Recording]

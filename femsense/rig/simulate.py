@@ -41,15 +41,15 @@ def simulate(
     progress: Progress | None = None,
     keep: Keep | None = None,
 ) -> Path:
-    """Run a virtual experiment and write its recording, with a folder `truth/` inside.
+    """Simulate an experiment and write its recording, with the ground truth in the folder `truth/` inside.
 
     A frame that does not converge is left out of the recording, with a warning that names it.
 
     Arguments:
-        robot: the robot of the estimator; the truth has the script's mesh, law and effects.
-        script: a script, its plain tables, or the path of a TOML file.
-        out_folder: the recording; an earlier simulated one is replaced, when the new one is complete.
-        progress: called with (frames done, frames in all).
+        robot: the declared robot. The simulated one is finer, neo-Hookean, and has the effects of the script.
+        script: a script, its plain tables, or the path of a TOML file (docs/formats/scripts.md).
+        out_folder: the recording; an earlier simulated one is replaced when the new one is complete.
+        progress: called with (frames done, number of frames).
         keep: a checkpoint file and the inputs that it must match: an interrupted simulation resumes with the same result, and a file with
                     other inputs is ignored. It is removed at the end.
 
@@ -57,7 +57,16 @@ def simulate(
         the folder.
 
     Raises:
-        InputError: the script does not fit, or `out_folder` contains other files. DataError: no frame has an equilibrium.
+        InputError: the script does not fit the robot, or `out_folder` contains other files. DataError: no frame has an equilibrium.
+
+    Example:
+        >>> import tempfile
+        >>> bend = {"label": "bend", "cables": {"flexor": 1.0}}  # to 1 N and back, in six frames
+        >>> script = {"format": "femsense-script-1", "sweeps": [bend], "truth": {"refinements": 0}, "scene": {"floor_z_m": -0.1}}
+        >>> script["camera"] = {"eye_m": [0.05, -0.25, 0.1], "target_m": [0.05, 0.0, 0.0]}
+        >>> folder = fs.simulate(fs.load_robot("finger"), script, tempfile.mkdtemp() + "/bend")
+        >>> fs.load_recording(folder).frame_count
+        6
     """
     check_place(out_folder)
     where = Path(script) if isinstance(script, str | Path) else Path("script")

@@ -1,4 +1,4 @@
-"""What stands around the robot, far from it, as the first free frame shows it: it tells a camera that moved from a body that is pushed."""
+"""The static background of the first contact-free frame. It distinguishes a moved camera from a pushed body."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from femsense.pointcloud.rays import GRAZING
 from femsense.sensing.types import Sensor
 
 MANY = 8000
-"""Points of the background that are kept of the first free frame, of each camera at most."""
+"""Maximum number of background points per camera."""
 FEWEST = 100
-"""Fewer points are no background."""
+"""Minimum number of background points."""
 
 
 def background_of(sensor: Sensor, k: int) -> LocalPlanes | None:
-    """Return the background as frame k shows it, where no camera has moved yet; None where too little is seen of it."""
+    """Return the background in frame k, before any camera has moved; None if too few of its points are visible."""
     poses = sensor.calibration.poses
     scan = read_scan(sensor.robot, sensor.recording, k, poses, sensor.robot.body.mesh.nodes, some=MANY)
     points = np.zeros((0, 3)) if scan is None else scan.background(poses)
@@ -29,13 +29,14 @@ def background_of(sensor: Sensor, k: int) -> LocalPlanes | None:
 def off_background(
     sensor: Sensor, background: LocalPlanes, scan: Scan, poses: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far points of a scan lie off the background, in standard deviations, shape (g,), and how that moves with pose steps, shape (g, 6 v).
+    """Return the distances of scan points from the background in standard deviations, shape (g,), and their derivatives by the poses, shape
+    (g, 6 v).
 
-    Where the background's plane is seen at a grazing angle, a point says nothing, as on the body: both are 0. There depth hardly moves a point off
-    the plane, so that it seemed infinitely sure, and the equations of a frame had no solution.
+    Both are 0 at grazing incidence: there the depth hardly changes the distance from the plane, so that σ of the distance would tend to 0
+    and the normal equations would be singular.
 
     Arguments:
-        poses: of the cameras, as the points are to be placed.
+        poses: of the cameras, with which the points are mapped to the robot frame.
     """
     points = scan.background(poses)
     nearest = background.nearest(points)

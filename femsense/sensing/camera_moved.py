@@ -1,7 +1,7 @@
 """The hypothesis that a camera, or the base of the robot, has moved: its J against that of the contacts.
 
-The pose prior of every camera is widened to FAR; contacts that only the shape shows are left out. Rays are cast anew from where the pose has moved to. What
-stands around the robot is part of both hypotheses: its pixels keep their place before a camera that stands still.
+The pose prior of every camera is widened to FAR, and inferred contacts are removed. Rays are recomputed from the new pose. The pixels of
+the static background are rows of both hypotheses: they do not move before a camera at rest.
 """
 
 from __future__ import annotations
@@ -27,30 +27,31 @@ from femsense.sensing.types import Touch
 MOVED = 2.0 * np.log(1000.0)
 """L of a moved camera: one in 1000 frames."""
 EQUAL = 16.3
-"""Hypotheses whose J differ by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
+"""Hypotheses whose J differs by less are equally plausible: χ² with three degrees of freedom, exceeded once in 1000."""
 LEAST_MM, LEAST_DEG = 0.05, 0.05
-"""A camera that has moved by less has not moved: its pose is known no better."""
+"""Smallest motion that is reported: poses are not known better."""
 CLEAR = 2.0
-"""A moved camera whose J is higher to first order by more than so many times EQUAL is not fitted."""
+"""A moved camera is fitted only if its J to first order is higher by at most this multiple of EQUAL."""
 STEPS, FIRST, STILL = 8, 1, 1e-3
-"""Steps of the pose at most, steps before a search may be given up, and the share of FAR below which a step is the last."""
+"""Maximum number of pose steps, number of steps before the search may be abandoned, and the share of FAR below which a step is the last."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moved:
-    """A frame as moved cameras fit it."""
+    """A frame, fitted with moved cameras."""
 
     step: FloatArray
     """(rotation about the pivot [rad], shift [m]) of all poses, shape (6 v,)."""
     criterion: float
-    """J, with L of the move."""
+    """J, including L of the motion."""
 
 
 def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
-    """Return the verdict of a frame, or that a moved camera fits it as well as its inferred contacts, or better than its contacts.
+    """Return the verdict of a frame: the given one, or that a moved camera fits as well as its inferred contacts, or better than its
+    contacts.
 
-    Asked are frames with inferred contacts, frames that fail the posterior check, and those in which the linearised evidence of a pose step
-    exceeds its prior odds.
+    The hypothesis is fitted in frames with inferred contacts, in frames that fail the posterior check, and if the linearised evidence of a
+    pose step exceeds its prior odds.
     """
     if best.frame.pixels is None or len(model.sensor.places):
         return found
@@ -74,7 +75,7 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
 
 
 def _stands(model: Model, best: Fit, inferred: Sequence[int]) -> bool:
-    """Return whether a camera that stands still explains a frame far better than one that has moved, to first order."""
+    """Return whether, to first order, a camera at rest has a far lower J than a moved one."""
     if not inferred:
         return bool(pose_gain(model, best) < MOVED)
     odds = MOVED - float(best.odds[inferred].sum())
@@ -82,9 +83,9 @@ def _stands(model: Model, best: Fit, inferred: Sequence[int]) -> bool:
 
 
 def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | None:
-    """Return the poses that fit the frame best with its visible contacts alone; None where there is no equilibrium.
+    """Return the poses that fit the frame best with its visible contacts only; None without an equilibrium.
 
-    bound: J that makes the search worth while; after FIRST steps far above it, the search ends.
+    bound: J to be reached; the search is abandoned if J is far above it after FIRST steps.
     """
     visible = [i for i, contact in enumerate(best.contacts) if contact.source != "shape"]
     contacts, forces, tau = [best.contacts[i] for i in visible], best.forces[visible], best.tau[visible]
@@ -107,14 +108,14 @@ def moved_cameras(model: Model, best: Fit, bound: float = np.inf) -> Moved | Non
 
 
 def _stood(model: Model, best: Fit) -> float | None:
-    """Return J of the best hypothesis with the background from where the cameras stood."""
+    """Return J of the best hypothesis with cameras at rest, background included."""
     frame = replace(best.frame, objects=(), background=background_rows(model, best.frame))
     again = fit(model, frame, best.contacts, best.forces, best.state, tau=best.tau, linearised=best.linearised)
     return None if again is None else again.criterion
 
 
 def _at(model: Model, step: FloatArray) -> Model:
-    """Return the model with its cameras moved by a step and free to move on."""
+    """Return the model with its cameras moved by a step, and a wide pose prior about there."""
     sensor, nuisance, v = model.sensor, model.nuisance, len(step)
     poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, step, sensor.pivot))
     mean = nuisance.mean.copy()
@@ -131,7 +132,7 @@ def _seen_from(model: Model, frame: Frame) -> Frame:
 
 
 def _seen_at(model: Model, there: Model, contact: Touch) -> Touch:
-    """Return a contact whose object has moved with the camera that shows most of it."""
+    """Return a contact moved with its object, by the step of the camera that shows most of it."""
     if contact.shape is None:
         return contact
     view = int(np.argmax(contact.shape.seen_by))
@@ -145,7 +146,7 @@ def _misfit_of_background(model: Model, best: Fit) -> float:
 
 
 def _in_words(model: Model, moved: Moved) -> dict[str, Any]:
-    """Return which camera moved farthest and how far."""
+    """Return the text for the camera with the largest motion."""
     steps = moved.step.reshape(-1, 6)
     farthest = int(np.argmax(np.linalg.norm(steps / np.repeat([1.0, model.sensor.size], 3), axis=1)))
     name = model.sensor.recording.camera_names[farthest]

@@ -1,4 +1,4 @@
-"""A run beside the truth that the virtual rig leaves with a recording."""
+"""Comparison of a run with the ground truth of a simulated recording."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from femsense.sensing.types import ContactForce, Run
 
 TRUTH = "femsense-truth-1"
 SAME_PLACE = 0.1
-"""A contact is the true one if it is closer than this times the robot's size."""
+"""Maximum distance between a true contact and its estimate, relative to the robot's size."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueContact:
-    """A contact as it was."""
+    """A contact of the ground truth."""
 
     frame: int
     position_m: FloatArray
@@ -31,33 +31,33 @@ class TrueContact:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Comparison:
-    """How far a run is from the truth."""
+    """Errors of a run against the ground truth."""
 
     pairs: tuple[tuple[TrueContact, ContactForce], ...]
-    """True contacts with those that were found in their place."""
+    """Found contacts: the true and the estimated one."""
     contacts_true: int
-    """Contacts in frames: one that lasts over six frames counts six times."""
+    """Number of true contacts, counted per frame: one that lasts six frames counts six times."""
     contacts_false: int
-    """Contacts in frames that are none."""
+    """Number of estimated contacts without a true one, counted per frame."""
 
     @property
     def contacts_found(self) -> int:
-        """True contacts that were found."""
+        """Number of found contacts."""
         return len(self.pairs)
 
     @property
     def force_errors_n(self) -> FloatArray:
-        """Size of the error of each force that was found [N], shape (k,)."""
+        """Magnitude of the force error of each found contact [N], shape (k,)."""
         return np.array([float(np.linalg.norm(found.force_n_xyz - true.force_n_xyz)) for true, found in self.pairs])
 
     @property
     def place_errors_m(self) -> FloatArray:
-        """Distance of each place that was found from the true one [m], shape (k,)."""
+        """Distance of each found contact point from the true one [m], shape (k,)."""
         return np.array([float(np.linalg.norm(found.position_m - true.position_m)) for true, found in self.pairs])
 
     @property
     def force_shares(self) -> FloatArray:
-        """Errors of the forces relative to their size, shape (k,)."""
+        """Force errors relative to the true magnitude, shape (k,)."""
         return np.asarray(self.force_errors_n / np.array([float(np.linalg.norm(true.force_n_xyz)) for true, _ in self.pairs]))
 
     def __repr__(self) -> str:
@@ -69,14 +69,27 @@ class Comparison:
 
 
 def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
-    """Return how far a run is from the truth. Forces that noise may make are no contacts, neither are true ones of nothing.
+    """Compare a run with the ground truth of a simulated recording.
+
+    A contact is found if an estimated one lies within a tenth of the robot's size of it. Estimated forces below three σ, and true
+    forces of zero, do not count as contacts.
 
     Arguments:
-        run: of `estimate`.
-        truth: the folder of a recording of the virtual rig, or true contacts.
+        run: result of `estimate`.
+        truth: the folder of a recording of the virtual rig, or the true contacts.
 
     Raises:
-        InputError: a recording without a truth, or one that the run is not of.
+        InputError: a recording without ground truth, or another recording than that of the run.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> folder = fs.robot_names()["finger"] / "recordings" / "press"
+        >>> recording = fs.load_recording(folder)
+        >>> robot = fs.apply_effects(robot, [{"name": "cable_friction", "coefficient": 0.15}])
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
+        >>> comparison = fs.compare(run, folder)
+        >>> comparison.contacts_true, len(comparison.pairs), comparison.contacts_false
+        (3, 3, 0)
     """
     if isinstance(truth, str | Path):
         if not (Path(truth) / "truth" / "contacts.csv").is_file():
@@ -90,7 +103,7 @@ def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
 
 
 def read_truth(recording: Path) -> tuple[TrueContact, ...]:
-    """Return the true contacts of a recording of the virtual rig; none where it has no truth beside it."""
+    """Return the true contacts of a simulated recording; empty if it has none."""
     file = recording / "truth" / "contacts.csv"
     if not file.is_file():
         return ()
@@ -102,7 +115,7 @@ def read_truth(recording: Path) -> tuple[TrueContact, ...]:
 
 
 def _check_recording(run: Run, truth: Path) -> None:
-    """Raise InputError unless a run is of the recording beside a truth, or of a copy of it."""
+    """Raise InputError unless the run was computed from this recording or a copy of it."""
     own = run.recording_folder
     if own is not None and own.resolve() == truth.resolve():
         return

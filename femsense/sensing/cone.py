@@ -1,4 +1,5 @@
-"""Forces that contacts can exert, nearest to a fit in the metric of its posterior: pushes within Coulomb's cones about the inward normals, and weights."""
+"""Projection of fitted forces onto the admissible ones in the metric of the posterior: pushes within Coulomb's cones about the inward
+normals, and hanging weights."""
 
 from __future__ import annotations
 
@@ -11,13 +12,14 @@ from femsense.sensing.types import Sensor
 
 SLACK = 1e-9
 LEAST = 1e-3
-"""Normal force from which the search for the nearest force in the cone starts [N]."""
+"""Normal force of the initial guess [N]."""
 
 
 def within_cones(sensor: Sensor, fit: Fit, axes: FloatArray) -> FloatArray | None:
-    """Return the forces (m, 3) [N] within their cones that minimise (f − f₀)ᵀ Σ⁻¹ (f − f₀); None where they lie inside already, or no cone is set.
+    """Return the forces (m, 3) [N] within their cones that minimise (f − f₀)ᵀ Σ⁻¹ (f − f₀); None if f₀ is inside already, or if there is no
+    cone.
 
-    |f_t| ≤ −μ f_n of contacts that push; what hangs does not pull upwards, whichever way it sways.
+    |f_t| ≤ −μ f_n for contacts that push; a hanging weight does not pull upwards.
 
     Arguments:
         fit: forces f₀ and their covariance Σ.

@@ -1,4 +1,5 @@
-"""What contact-free frames teach: the prior of the nuisance parameters, the noise, its overdispersion, and the odds of an inferred contact."""
+"""Estimates from the contact-free frames: the prior of the nuisance parameters, the noise, its overdispersion, and the odds of an inferred
+contact."""
 
 from __future__ import annotations
 
@@ -31,15 +32,17 @@ from femsense.sensing.proposals import inferred_gain
 from femsense.sensing.types import Case, Sensor
 
 MODULUS_STD_BESIDE_PULLS, PULL_STD = 0.01, 0.05
-"""Prior σ of the relative modulus at most where cable pulls are nuisance parameters too, because the two are nearly collinear, and of each pull."""
+"""Maximum prior σ of the relative modulus if cable pulls are nuisance parameters too (the two are nearly collinear), and prior σ of each
+relative pull."""
 FEWEST = 30
-"""Fewer pixels of the robot say nothing of its shape."""
+"""Minimum number of robot pixels of a contact-free frame."""
 SEVERAL = 4
-"""Contact-free frames that are needed to ask what a contact would gain in one of them by what the others teach."""
+"""Minimum number of contact-free frames for leave-one-out estimates of the gain of a false contact."""
 AWAY = (5.0, 15.0)
-"""Pixels so many standard deviations off show something else; nearer ones, which decide, are as dense."""
+"""Range of whitened residuals [σ] in which the density of mixed pixels is estimated. Closer ones, which matter for the fit, are assumed to
+be as dense."""
 FLAG = 1e-3
-"""How often the nuisance of a contact-free frame may be as large by noise alone."""
+"""False-alarm probability of the posterior check of the nuisance parameters, per frame."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,7 +72,7 @@ def learn(sensor: Sensor) -> Model:
     frames = _contact_free(model)
     if not frames:
         return model
-    background = background_of(model.sensor, frames[0].frame.index)  # from where the cameras are known to be
+    background = background_of(model.sensor, frames[0].frame.index)  # with the estimated poses
     return _with_limits(replace(model, sensor=replace(model.sensor, background=background)), frames)
 
 
@@ -101,7 +104,7 @@ def prior_model(sensor: Sensor) -> Model:
 
 
 def _contact_free(model: Model) -> list[ContactFree]:
-    """Return the contact-free frames, each fitted without contacts; a frame that gives nothing is left out."""
+    """Return the contact-free frames, each fitted without contacts. Frames without a fit are left out."""
     result = []
     for k, state in free_path(model.sensor.driven, free_clouds(model.sensor.recording)):
         try:
@@ -119,7 +122,7 @@ def _contact_free(model: Model) -> list[ContactFree]:
 
 
 def _taught(model: Model, frames: Sequence[Fit], *, sizes: tuple[float, float, float] | None = None) -> Model:
-    """Return the model with noise, overdispersion and prior as some contact-free frames show them."""
+    """Return the model with noise, overdispersion and prior estimated from contact-free frames."""
     nuisance, scale, T = model.nuisance, 1.0, model.overdispersion
     for _ in range(2):
         grams, left, seen = [], [], np.zeros(3)
@@ -140,7 +143,7 @@ def _taught(model: Model, frames: Sequence[Fit], *, sizes: tuple[float, float, f
 
 
 def _stray(rows: Rows, z: FloatArray, robot: FloatArray, length: float) -> FloatArray:
-    """Return how many pixels lie between AWAY standard deviations in front and behind, and how many STRAY lets expect there, shape (3,).
+    """Return the number of pixels within AWAY in front of the surface and behind it, and the number expected under STRAY, shape (3,).
 
     z, robot: whitened residuals and probability that a row is the robot's, shape (r,).
     """
@@ -150,7 +153,7 @@ def _stray(rows: Rows, z: FloatArray, robot: FloatArray, length: float) -> Float
 
 
 def _rescaled(rows: Rows, scale: float, T: float) -> Rows:
-    """Return rows whose pixels have another noise and overdispersion; markers keep their own."""
+    """Return the rows with another noise and overdispersion of pixels; markers keep theirs."""
     return replace(rows, std=np.where(rows.pixel, scale, 1.0) * rows.std, share=np.where(rows.pixel, 1.0 / T, rows.share))
 
 
@@ -166,10 +169,10 @@ def _overdispersion(left: Sequence[tuple[FloatArray, FloatArray]], cell: float) 
 
 
 def _at_the_mean(model: Model, frames: Sequence[Fit]) -> Model:
-    """Return the model with cameras and modulus where the contact-free frames show them, so that rays and states are near the true ones.
+    """Return the model re-linearised at the estimated poses and modulus, so that rays and states are close to the true ones.
 
-    Where pulls are nuisance parameters, a pose that is far off and an opposite error field fit a little better together than a small one of each; there
-    the field is held orthogonal to the pose.
+    If pulls are nuisance parameters, a large pose error compensated by an opposite error field fits slightly better than small ones of
+    both. The error field is then made orthogonal to the pose.
     """
     v, sensor, nuisance = 6 * model.views, model.sensor, model.nuisance
     shown = nuisance.mean[: nuisance.common]
@@ -190,8 +193,8 @@ def _at_the_mean(model: Model, frames: Sequence[Fit]) -> Model:
 
 
 def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
-    """Return the model with the odds of an inferred contact and the limits of the posterior check, from what each contact-free frame shows by what the
-    others teach."""
+    """Return the model with the odds of an inferred contact and the limits of the posterior check, by leave-one-out over the contact-free
+    frames."""
     fits = [one.fit for one in frames]
     gains, checks = [], []
     for i, one in enumerate(frames):
@@ -221,7 +224,8 @@ def _with_limits(model: Model, frames: Sequence[ContactFree]) -> Model:
 def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
     """Return the statistics of the posterior check: misfit per pixel, |η̃|² over its quantile at level FLAG, and the share of pixels behind the body.
 
-    The misfit is capped at five standard deviations; where colour does not separate the robot, it is that of the robot's own pixels. With
+    Whitened residuals are capped at five. Without colour that separates the robot, the misfit is that of the pixels assigned to the robot.
+    With
     A = Nᵀ W N, the fitted η̃ has the covariance A (A + 1)⁻¹; its |η̃|² is that of a gamma distribution with the same mean and variance
     (Satterthwaite 1946).
     """
@@ -239,5 +243,5 @@ def check_values(model: Model, found: Fit) -> tuple[float, float, float]:
 
 
 def _limit(seen: FloatArray, least: float) -> float:
-    """Return the largest value to expect of a statistic that was so large in contact-free frames; it scatters by `least` at least."""
+    """Return the limit of a statistic: its maximum over the contact-free frames plus three standard deviations, each at least `least`."""
     return float(seen.max() + 3.0 * max(float(seen.std()), least))

@@ -33,20 +33,20 @@ from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import Case, FrameReport, SensedFrame, Touch
 
 ROUNDS, FITTED = 8, 4
-"""Rounds of proposals at most, and proposals that are fitted in each."""
+"""Maximum number of rounds of proposals, and of proposals fitted in each."""
 UNDETERMINED_TAU = 2.0
 """Prior scale of the force at an object in touch whose force the data do not determine [N]; hands and grippers press with so much."""
 MANY = 30
-"""Pixels of an object without a known shape that may carry a latent force."""
+"""Minimum number of pixels of an object without a known shape that can carry a latent force."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """A frame, estimated."""
+    """The estimate of a frame."""
 
     best: Fit
     rms_before_m: float
-    """Residual of the predicted state, along the normal or of markers in 3-D."""
+    """Residual of the predicted state: along the normal for pixels, in 3-D for markers [m]."""
     stages_ms: dict[str, float]
 
 
@@ -96,7 +96,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
         previous: the frame before; None at the beginning.
 
     Raises:
-        FemsenseError: a broken file, nothing of the robot in view, or no equilibrium.
+        FemsenseError: a broken file, no pixel of the robot, or no equilibrium.
     """
     clock = Clock()
     frame = _predicted(model, k, previous, clock)
@@ -129,7 +129,7 @@ def covariances_of(model: Model, best: Fit) -> list[FloatArray]:
 
 
 def inliers(best: Fit) -> BoolArray:
-    """Return which rows of the measurements are the robot's with probability above one half, shape (r,)."""
+    """Return which measured rows belong to the robot with probability above one half, shape (r,)."""
     return np.asarray((best.responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
 
 
@@ -213,7 +213,7 @@ def _moved_by(positions: FloatArray | None, state: Equilibrium) -> float:
 
 
 def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: Equilibrium) -> tuple[Shape, ...]:
-    """Return the objects that the pixels in front of a state show that are not the robot's, robot (r,)."""
+    """Return the objects formed by the pixels in front of a state that do not belong to the robot; robot: responsibilities, shape (r,)."""
     assert frame.scan is not None
     pixels = rows.pixel
     other = ~robot[pixels] & (rows.residual[pixels] > 0.0)
@@ -322,7 +322,7 @@ def _with_objects_expected(model: Model, frame: Frame, expected: Equilibrium) ->
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:
-    """Return about where the body is: the previous state, moved as the inputs have moved the predicted one since."""
+    """Return an approximate state of the body: the previous state plus the change of the predicted one."""
     if previous is None or not previous.touches or not previous.trusted:
         return predicted
     moved = previous.state.positions + predicted.positions - previous.free_state.positions
@@ -399,7 +399,7 @@ class Clock:
 
     @property
     def total_ms(self) -> float:
-        """Time since it began [ms]."""
+        """Time since the start [ms]."""
         return 1e3 * (time.perf_counter() - self.began)
 
     def lap(self, name: str) -> None:

@@ -61,7 +61,7 @@ CHORD = 0.02
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Point:
-    """Where an iteration stands."""
+    """The current point of an iteration."""
 
     contacts: tuple[Touch, ...]
     forces: FloatArray
@@ -88,7 +88,7 @@ def fit(
     linearised: Linearised | None = None,
     catch: float = CATCH,
 ) -> Fit | None:
-    """Return a hypothesis at the minimum of Φ near a start; None where there is no equilibrium.
+    """Return a hypothesis at the minimum of Φ near a start; None without an equilibrium.
 
     Arguments:
         contacts: with their places at the start; forces: at the start [N], shape (m, 3).
@@ -144,7 +144,8 @@ def fit(
 def _loaded(
     model: Model, frame: Frame, contacts: tuple[Touch, ...], forces: FloatArray, start: Equilibrium
 ) -> tuple[tuple[Touch, ...], FloatArray, Equilibrium | None]:
-    """Return contacts, forces and their equilibrium; under a share of the forces (`LENGTHS`) if Newton's method does not reach all of them from the start."""
+    """Return contacts, forces and their equilibrium. If Newton's method does not converge from the start, the forces are scaled down by
+    `LENGTHS`."""
     for share in LENGTHS:
         part = share * forces
         loaded = tuple(pressed(model.sensor, contact, force) for contact, force in zip(contacts, part))
@@ -155,7 +156,7 @@ def _loaded(
 
 
 def _width(here: Point, eta: FloatArray, frame: Frame, catch: float) -> Width:
-    """Return κ for what is left of the rows."""
+    """Return κ for the residual of the rows."""
     return first_width((here.residual - here.N @ eta) / here.rows.std, here.rows.pixel, frame.coloured, catch)
 
 
@@ -189,13 +190,14 @@ def _latent_columns(model: Model, frame: Frame, rows: Rows, state: Equilibrium, 
 
 
 def axes_at(model: Model, contacts: Sequence[Touch], state: Equilibrium) -> FloatArray:
-    """Return axes of the force of each contact: outward normal and two tangents, or upward and two horizontals where a weight hangs; shape (m, 3, 3)."""
+    """Return the axes of the force of each contact, shape (m, 3, 3): outward normal and two tangents; for a hanging weight, upward and two
+    horizontals."""
     normals = [model.upward if c.pulls else touch_normal(model.sensor, c, state) for c in contacts]
     return axes_of(np.array(normals).reshape(-1, 3))
 
 
 def axes_of(normals: FloatArray) -> FloatArray:
-    """Return rows for each unit normal (m, 3): the normal and two tangents, shape (m, 3, 3)."""
+    """Return an orthonormal basis for each unit normal (m, 3): the normal and two tangents as rows, shape (m, 3, 3)."""
     across = np.cross(normals, np.eye(3)[np.where(np.abs(normals[:, 0]) < 0.8, 0, 1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     return np.stack([normals, across, np.cross(normals, across)], axis=1)
@@ -207,14 +209,14 @@ def force_scale(tau: float, across: float = ACROSS) -> FloatArray:
 
 
 def across(model: Model, contact: Touch) -> float:
-    """Return the prior scale of the force across its first axis relative to that along it: what acts at a given place and may pull, acts any way."""
+    """Return the prior scale of the force across its first axis relative to that along it; 1 for a given contact that may also pull."""
     if contact.pulls:
         return SWAYING
     return 1.0 if contact.source == "given" and not model.sensor.options.push else ACROSS
 
 
 def _place_scale(contact: Touch, force: FloatArray, limit: float = np.inf) -> FloatArray:
-    """Return the standard deviation of a contact point along its two ways [m], shape (2,); 0 where it does not move."""
+    """Return the prior σ of a contact point along its two tangential directions [m], shape (2,); 0 if it is fixed."""
     if contact.std_m == 0.0 or not force.any():
         return np.zeros(2)
     std = ways_of(contact)[1]
@@ -222,7 +224,8 @@ def _place_scale(contact: Touch, force: FloatArray, limit: float = np.inf) -> Fl
 
 
 def _place_offset(contact: Touch) -> FloatArray:
-    """Return s̃ of a contact: how far it is from where its object was seen, in standard deviations; an inferred one may be anywhere. Shape (2,)."""
+    """Return s̃ of a contact, shape (2,): its distance from the observed contact point in standard deviations; 0 for an inferred contact,
+    whose position has a flat prior."""
     if contact.source == "shape" or contact.std_m == 0.0:
         return np.zeros(2)
     ways, std = ways_of(contact)
@@ -235,9 +238,9 @@ def _prior(model: Model, here: Point) -> float:
 
 
 def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArray, FloatArray]:
-    """Return prior scales of (force along its axes, contact point) of all contacts and where they stand in them, shapes (5m,).
+    """Return the prior scales of (force along its axes, contact point) of all contacts, and their whitened values, shapes (5m,).
 
-    trust: the contact point of an inferred contact moves by about an edge in one step.
+    trust: limit the step of an inferred contact point to about an edge (trust region).
     """
     limit = model.sensor.surface.edge if trust else np.inf
     scales, at = [np.zeros(0)], [np.zeros(0)]
@@ -263,20 +266,20 @@ class Step:
     """A Gauss–Newton step from a point."""
 
     change: FloatArray
-    """Of (forces along their axes [N], contact points [m]), shape (5m,)."""
+    """Change of (forces along their axes [N], contact points [m]), shape (5m,)."""
     eta: FloatArray
     """η̃ there."""
     tau: FloatArray
     """Prior scales that maximise the evidence of the linear problem [N], shape (m,)."""
     decrease: float
-    """By how much Φ falls in the linear problem."""
+    """Decrease of Φ in the linear problem."""
     phi: float
-    """Φ where it begins, with these prior scales."""
+    """Φ at the start of the step, with these prior scales."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Lower:
-    """A point of lower Φ."""
+    """A point with lower Φ."""
 
     point: Point
     eta: FloatArray
@@ -371,7 +374,7 @@ def _finished(
         f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
         force_map[3 * i : 3 * i + 3, f] = axes.T * scale[f]
         ways, stds = ways_of(contact)
-        way = ways.T * (scale[s] if here.forces[i].any() else stds)  # without a force the place is where its object was seen
+        way = ways.T * (scale[s] if here.forces[i].any() else stds)  # without a force, the contact point is the observed one
         places[i] = way @ P[s, s] @ way.T
         gain[i] = float(at[f] @ np.linalg.solve(P[f, f], at[f]) + np.linalg.slogdet(P[f, f])[1])
     return Fit(
@@ -399,7 +402,7 @@ def _finished(
 
 
 def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:
-    """Return the fit with its forces moved into their friction cones in the metric of the posterior, where they lie outside."""
+    """Return the fit with its forces projected onto their friction cones in the metric of the posterior."""
     inside = within_cones(model.sensor, found, here.axes)
     if inside is None:
         return found

@@ -1,6 +1,8 @@
 """Markers of a frame as residual rows: three each, along the axes.
 
-σ² = marker noise² + (model error · way from rest)² + σ² of the empirical correction. A marker is the robot's: its row has no other explanation.
+σ² = marker noise² + (model error · displacement from rest)² + σ² of the empirical correction. A marker always belongs to the robot: its row
+has no
+mixture.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
         centres: of the error field, which markers do not share.
 
     Raises:
-        DataError: no marker is seen.
+        DataError: no visible marker.
     """
     recording, robot, calibration = sensor.recording, sensor.robot, sensor.calibration
     known = {name: i for i, name in enumerate(robot.marker_names)}
@@ -42,7 +44,7 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
     way = np.linalg.norm(measured - rest, axis=1)
     noise = sensor.options.marker_std_m or marker_std(calibration)
     std = np.hypot(noise, np.hypot(sensor.options.marker_model_std * way, sensor.correction_std[rows]))
-    # A placement that rest.csv measured moves with the pose: only the motion since then turns.
+    # Marker positions measured in rest.csv rotate with the pose, so only the displacement since then is rotated here.
     placed = np.array([robot.marker_names[m] in calibration.placements_m for m in marker])
     turned = pose_columns(measured, sensor.pivot) - placed[:, None, None] * pose_columns(rest, sensor.pivot)
     by_pose = np.zeros((len(rows), 3, len(calibration.poses), 6))
@@ -66,7 +68,7 @@ def marker_rows(sensor: Sensor, k: int, state: Equilibrium, centres: int) -> Row
 
 
 def as_labelled(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
-    """Return which markers were seen, shape (r,): as named, or put right where labels are swapped, with a warning."""
+    """Return the marker of each row, shape (r,): as labelled, or corrected with a warning if labels are swapped."""
     places, best = sensor.robot.markers.positions(state.positions), marker.copy()
     for v in np.unique(view):
         mine = view == v
@@ -79,12 +81,12 @@ def as_labelled(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray
 
 
 def marker_std(calibration: Calibration) -> float:
-    """Return the noise of a marker along each axis [m]: what the calibration left, or half a millimetre where it had none."""
+    """Return the noise of a marker along each axis [m]: the residual of the calibration, or 0.5 mm if there is none."""
     return max(calibration.rms_m / np.sqrt(3.0), 2e-5) if np.isfinite(calibration.rms_m) else 5e-4
 
 
 def pose_columns(points: FloatArray, pivot: FloatArray) -> FloatArray:
-    """Return how points move with (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
+    """Return the derivatives of points by (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
     arm = points - pivot
     J = np.zeros((len(points), 3, 6))
     J[:, 0, 1], J[:, 0, 2] = arm[:, 2], -arm[:, 1]

@@ -1,4 +1,4 @@
-"""What estimating contacts takes and returns: the model of a recording, a frame, and a fitted hypothesis."""
+"""Types of the estimator: the model of a recording, a frame, and a fitted hypothesis."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from femsense.sensing.states import loaded_state
 from femsense.sensing.types import Case, Sensor, Touch
 
 STRAY, UNTOLD = 0.01, 1.0
-"""ω of a pixel before contact-free frames are seen: a depth mixed of both sides of an edge, or of something in front where colour does not tell it."""
+"""Prior ω of a pixel: that it mixes both sides of a depth edge; and that it shows an object in front, without colour that separates it."""
 STALE = 0.03
-"""Answers at the candidates serve while no node has moved farther than this share of the diagonal: they rank, and do not estimate."""
+"""The compliance at the candidates is reused until a node has moved by more than this share of the diagonal. It only ranks candidates."""
 PIXELS = 6000
-"""Neighbouring pixels of the robot are averaged beyond about so many in the first frame."""
+"""Neighbouring pixels are averaged so that about this many pixels of the robot remain in the first frame."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,24 +43,24 @@ class Model:
     noises: tuple[CameraNoise, ...]
     """Noise of each camera as declared or measured."""
     scale: float = 1.0
-    """Factor on that noise: what contact-free frames scatter."""
+    """Factor on that noise, estimated from contact-free frames."""
     overdispersion: float = 1.0
     """T: variance of sums of whitened residuals over neighbouring pixels, relative to independent ones."""
     inferred_odds: float = 0.0
-    """L of an inferred contact: −2 log of its prior odds, raised by what the search gains in contact-free frames."""
+    """L of an inferred contact: −2 log of its prior odds, raised by the gain of false contacts in contact-free frames."""
     modulus_shift: float = 0.0
-    """Relative softness that contact-free frames asked for and that the body has been given."""
+    """Relative softness estimated from contact-free frames, and already applied to the body."""
     limits: Limits | None = None
-    """What the posterior check compares with; None before contact-free frames are seen."""
+    """Limits of the posterior check; None without contact-free frames."""
     stray: tuple[float, float] = (1.0, 1.0)
-    """How many times more than STRAY pixels of contact-free frames are mixed ones, in front and behind."""
+    """Density of mixed pixels in contact-free frames relative to STRAY, in front and behind."""
     block: int = 1
-    """Side of the blocks of pixels that are averaged, the same in all frames: their noise is one."""
+    """Side of the blocks of averaged pixels. It is the same in all frames, so that their noise is the same."""
     candidates: Candidates = field(default_factory=lambda: Candidates())
 
     @property
     def upward(self) -> FloatArray:
-        """Unit vector against gravity, shape (3,); 0 where the model has no weight."""
+        """Unit vector against gravity, shape (3,); 0 for a weightless model."""
         gravity = self.sensor.robot.body.gravity
         return np.asarray(-gravity / max(float(np.linalg.norm(gravity)), 1e-12))
 
@@ -72,9 +72,9 @@ class Model:
     def compliance_std(self) -> float:
         """Relative standard deviation of the compliance at a contact [1].
 
-        Gravity and cables pull as declared, and yet the model needs another modulus or other pulls to move as the body does (law, mesh, ties): what it
-        needs there, it needs at a contact. The root mean square of the pulls that contact-free frames ask for, and that of the modulus; how well the
-        modulus is known is part of A.
+        Contact-free frames need another modulus, or other pulls, than declared because of errors of law, mesh and cable ties. The same
+        error is assumed at a contact: the root mean square of the estimated relative pulls, and the estimated shift of the modulus. The
+        uncertainty of the modulus itself is part of A.
         """
         softness, pulls = 6 * self.views, np.arange(6 * self.views + 1, self.nuisance.common)
         asked = self.nuisance.mean[pulls] ** 2 + (self.nuisance.root[pulls] ** 2).sum(axis=1)
@@ -94,7 +94,7 @@ class Model:
         return Pixels(scan.points(poses), scan.origins(poses), scan.view, std, others, 1.0 / self.overdispersion, scan.segmented)
 
     def rows(self, frame: Frame, state: Equilibrium) -> Rows:
-        """Return the rows of a frame at a state: its pixels, or its markers where it has none. Raises DataError."""
+        """Return the rows of a frame at a state: its pixels, or its markers if it has no pixels. Raises DataError."""
         if frame.pixels is None:
             return marker_rows(self.sensor, frame.index, state, len(self.skin.field))
         rows = pixel_rows(frame.pixels, self.skin, state.positions, self.views)
@@ -104,11 +104,12 @@ class Model:
         return stacked([rows, *more])
 
     def solve(self, frame: Frame, contacts: Sequence[Touch], forces: FloatArray, start: Equilibrium) -> Equilibrium | None:
-        """Return the equilibrium under the inputs and contact forces (m, 3) [N]; None where there is none near the start."""
+        """Return the equilibrium under the inputs and contact forces (m, 3) [N]; None if none is found from the start."""
         return loaded_state(self.sensor, frame.index, contacts, forces, start, frame.previous_tensions)
 
     def answers_near(self, state: Equilibrium) -> FloatArray:
-        """Return the displacements by unit forces along x, y, z at each candidate [m/N], shape (n, 3, 3c), at this state or one near by."""
+        """Return the displacements under unit forces along x, y, z at each candidate [m/N], shape (n, 3, 3c), at this state or a near
+        one."""
         kept, nodes = self.candidates, self.sensor.candidates
         if kept.state is None or np.abs(kept.state.positions - state.positions).max() > STALE * self.sensor.size:
             kept.state, kept.answers = replace(state, factor=None), None
@@ -121,7 +122,7 @@ class Model:
         return kept.answers
 
     def linearised(self, state: Equilibrium) -> Linearised:
-        """Return how the body answers to small forces, softness and pulls near a state."""
+        """Return the body linearised about a state: with respect to forces, softness and pulls."""
         body = self.sensor.robot.body
         tangent = tangent_at(body, state)
         loads = [internal(body, state.positions, tangent=False).forces]
@@ -138,13 +139,14 @@ class Model:
 
 
 def pixels_of(model: Model, k: int, state: Equilibrium) -> Scan | None:
-    """Return what the cameras see in frame k near a state, the robot's pixels in blocks; None where the recording has no clouds. Raises FemsenseError."""
+    """Return the scan of frame k near a state, with the robot's pixels averaged in blocks; None for a recording without clouds. Raises
+    FemsenseError."""
     scan, recording = scan_of(model.sensor, k, state), model.sensor.recording
     return None if scan is None else in_blocks(scan, model.noises, pixel_angles(recording, k, scan), model.block)
 
 
 def block_of(sensor: Sensor) -> int:
-    """Return the side of blocks that leaves about PIXELS pixels of the robot in the first frame that can be read; 1 without clouds."""
+    """Return the side of the blocks for which about PIXELS pixels of the robot remain in the first readable frame; 1 without clouds."""
     nodes = sensor.robot.body.mesh.nodes
     for k in range(len(sensor.recording.time_s)):
         try:
@@ -158,7 +160,7 @@ def block_of(sensor: Sensor) -> int:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Linearised:
-    """The body near a state."""
+    """The body, linearised about a state."""
 
     positions: FloatArray
     """Nodes of the state [m], shape (n, 3)."""
@@ -169,7 +171,7 @@ class Linearised:
 
 @dataclass(eq=False, slots=True)
 class Candidates:
-    """Answers of the body to unit forces at the candidate nodes near one state, kept while the body stays near it."""
+    """Compliance at the candidate nodes, cached while the body stays close to one state."""
 
     state: Equilibrium | None = None
     answers: FloatArray | None = None
@@ -178,33 +180,34 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frame:
-    """One frame: what was measured and what is known of it beforehand."""
+    """One frame: its measurements and its priors."""
 
     index: int
     case: Case
     pixels: Pixels | None
     scan: Scan | None
     predicted: Equilibrium
-    """Under the inputs without contact forces."""
+    """Equilibrium under the inputs without contact forces."""
     previous_tensions: tuple[FloatArray, ...] | None
     """Tensions along the cables before this frame (friction)."""
     background: Rows | None = None
-    """Rows of what stands around the robot, where it is asked whether a camera has moved."""
+    """Rows of the static background, for the hypothesis of a moved camera."""
     with_markers: bool = False
-    """Whether its markers are rows next to its pixels: of contact-free frames, where they identify pulls and pose."""
+    """Whether its markers are rows in addition to its pixels. True in contact-free frames if pulls are nuisance parameters, which markers
+    help to identify."""
     objects: tuple[Shape, ...] = ()
-    """Rigid objects seen or declared near the body, completed."""
+    """Observed or declared rigid objects near the body, with completed shapes."""
     objects_at: FloatArray | None = None
-    """Nodes of the body where these were told from what a camera adds around its silhouette [m], shape (n, 3)."""
+    """Nodes of the state in which these objects were separated from depth bleeding at the silhouette [m], shape (n, 3)."""
     seen_before: tuple[Shape, ...] = ()
-    """Objects of the frame before."""
+    """Objects of the previous frame."""
     latent: tuple[Touch, ...] = ()
-    """Objects in touch that are no contact of the best hypothesis: each may carry a small force along its normal, which left out would bias those of its
-    neighbours and make their intervals too narrow. Empty while hypotheses are compared."""
+    """Touching objects that are not contacts of the best hypothesis. Each can carry a small normal force; neglecting it would bias the
+    forces of its neighbours and make their intervals too narrow. Empty while hypotheses are compared."""
 
     @property
     def coloured(self) -> bool:
-        """Whether colour separates the robot from the rest."""
+        """Whether colour separates the robot from other objects."""
         return self.pixels is None or self.pixels.coloured
 
 
@@ -215,7 +218,7 @@ class Fit:
     frame: Frame
     contacts: tuple[Touch, ...]
     forces: FloatArray
-    """[N], shape (m, 3)."""
+    """Force of each contact [N], shape (m, 3)."""
     tau: FloatArray
     """Prior scale of each force [N], shape (m,)."""
     axes: FloatArray
@@ -238,9 +241,9 @@ class Fit:
     odds: FloatArray
     """L of each contact, shape (m,)."""
     covariance: FloatArray
-    """Of all force components [N²], shape (3m, 3m)."""
+    """Covariance of all force components [N²], shape (3m, 3m)."""
     place_covariance: FloatArray
-    """Of each contact point [m²], shape (m, 3, 3)."""
+    """Covariance of each contact point [m²], shape (m, 3, 3)."""
     latent_force: FloatArray
     """Force at each object of `Frame.latent` and its standard deviation [N], shape (l, 2)."""
     drop_gain: FloatArray
@@ -258,13 +261,13 @@ class Fit:
         return np.asarray(self.weight * self.rows.std**2 / self.rows.share)
 
     def left(self, nuisance: Nuisance) -> FloatArray:
-        """Return the whitened residual with η fitted, shape (r,)."""
+        """Return the whitened residual at the fitted η, shape (r,)."""
         return np.asarray((self.rows.residual - self.C @ nuisance.mean - self.N @ self.eta) / self.rows.std)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Largest values of the posterior check that contact-free frames let expect."""
+    """Limits of the posterior check, from contact-free frames."""
 
     misfit: float
     nuisance: float

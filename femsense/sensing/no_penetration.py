@@ -1,14 +1,14 @@
 """Rigid objects and the body do not overlap: the gap g between them as residual rows.
 
-g(x) is the signed distance of the surface of the body from a completed or declared object, at the surface point where it is least. The row measures the
-object's surface where a pixel measures the body's, so the pose and the error field of the camera move it alike.
+g(x) is the smallest signed distance between the surface of the body and a completed or declared object. The row measures the object's
+surface as a pixel measures the body's, so pose and error field of the camera enter it in the same way.
 
 An object that does not touch is anywhere within ℓ of the body: density 1/ℓ for g > 0, a Gaussian tail for g < 0. One that touches has g = 0 ± σ_g, or is
 not where it seems with probability ε. Relative to the first, a contact costs
 
     −2 log[(1 − ε) ℓ/(√2π σ_g) exp(−z²/2) + ε],   z = g/σ_g
 
-which is negative where the object lies at the surface: there a contact needs no force to be likely.
+which is negative if the object lies at the surface: such a contact is likely even without a force.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from femsense.sensing.places import NEAR
 from femsense.sensing.types import Touch
 
 MISPLACED = 0.1
-"""ε: probability that a touching object is not where it seems, because its depth errs otherwise than the body's or its shape is another."""
+"""ε: probability that the observed position of a touching object is wrong, because its depth has another error than the body's or its shape
+was not recognised."""
 OVERLAPPING = 0.01
-"""Probability that an object seems to overlap the body although it does not touch."""
+"""Probability that an object apparently overlaps the body although it does not touch."""
 GAP_STD = 1e-4
-"""Standard deviation of a gap beyond that of the object's surface: facets and the seat of the pressure on them [m]."""
+"""Standard deviation of a gap in addition to that of the object's surface: facets, and the position of the pressure on them [m]."""
 LATTICE = np.array([[i, j, 4 - i - j] for i in range(5) for j in range(5 - i)]) / 4.0
-"""Barycentric points of a triangle at which the gap is taken, shape (15, 3)."""
+"""Barycentric points of a triangle at which the gap is evaluated, shape (15, 3)."""
 SLOPE = 1e-5
 """Step of the central difference of a distance [m]."""
 TOUCHING = 2.0
-"""An object is in touch whose gap is below this many standard deviations."""
+"""An object touches if its gap is below this many standard deviations."""
 ZONE = 3.0
-"""Where several contacts are with one object, surface points within this many edges of a contact point belong to it."""
+"""If an object has several contacts, surface points within this many edges of a contact point belong to that contact."""
 COMPLETED = ("sphere", "cylinder", "plate", "known")
-"""Kinds of objects whose surface is known."""
+"""Kinds of objects with a known surface."""
 
 
 def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: FloatArray) -> list[Rows]:
-    """Return one row for each contact with an object whose surface is known, and one for each object that overlaps the body elsewhere."""
+    """Return one row for each contact with an object of known surface, and one for each object that overlaps the body elsewhere."""
     rows = []
     for contact in contacts:
         if is_rigid(model, contact):
@@ -66,22 +67,22 @@ def gap_rows(model: Model, frame: Frame, contacts: Sequence[Touch], positions: F
 
 
 def is_with(contact: Touch, shape: Shape | None) -> bool:
-    """Return whether a contact is with an object, whichever of its sides touches."""
+    """Return whether a contact is with this object, whichever side touches."""
     return contact.shape is not None and shape is not None and same_object(contact.shape, shape)
 
 
 def is_rigid(model: Model, contact: Touch) -> bool:
-    """Return whether a contact is with an object whose surface is known where it touches: of a plate, the side that is seen."""
+    """Return whether a contact is with an object whose surface is known at the contact. Of a plate, this is the visible side."""
     return contact.shape is not None and _is_known(model, contact.shape) and contact.shape.behind_m == 0.0
 
 
 def _is_known(model: Model, shape: Shape) -> bool:
-    """Return whether the surface of an object is known better than the mesh resolves."""
+    """Return whether the uncertainty of an object's surface is below the resolution of the mesh."""
     return shape.kind in COMPLETED and gap_std(model, shape) < model.sensor.surface.edge
 
 
 def in_touch(model: Model, contact: Touch, positions: FloatArray) -> bool:
-    """Return whether an object whose surface is known lies at the surface of the body within two standard deviations."""
+    """Return whether the gap of an object with a known surface is at most two standard deviations."""
     if not is_rigid(model, contact):
         return False
     assert contact.shape is not None
@@ -90,7 +91,8 @@ def in_touch(model: Model, contact: Touch, positions: FloatArray) -> bool:
 
 
 def gap_odds(model: Model, contact: Touch) -> float:
-    """Return −2 log of the density of a gap of 0 of a touching object, relative to one that hovers anywhere near the body; 0 where its surface is not known."""
+    """Return −2 log of the density of a gap of 0 of a touching object, relative to an object anywhere near the body; 0 if its surface is
+    unknown."""
     return -2.0 * _density(model, contact)[0] if is_rigid(model, contact) else 0.0
 
 
@@ -102,15 +104,15 @@ def _density(model: Model, contact: Touch) -> tuple[float, float]:
 
 
 def gap_std(model: Model, shape: Shape) -> float:
-    """Return σ_g of an object [m]: its surface is known as well as its pixels, which err together, and seats on facets."""
+    """Return σ_g of an object [m]: from the correlated noise of its pixels, and from facets."""
     return float(np.hypot(np.sqrt(model.overdispersion) * shape.std_m, GAP_STD))
 
 
 def _closest(model: Model, shape: Shape, positions: FloatArray, near: FloatArray | None) -> tuple[int, FloatArray, float] | None:
-    """Return triangle, barycentric weights and gap [m] of the surface point closest to an object; None where nothing comes near.
+    """Return triangle, barycentric weights and gap [m] of the surface point closest to an object; None if none is near.
 
     Arguments:
-        near: only surface within a zone about this place at rest [m], shape (3,).
+        near: restrict the search to a zone about this point at rest [m], shape (3,).
     """
     sensor, surface = model.sensor, model.sensor.surface
     considered = sensor.touchable
@@ -165,7 +167,7 @@ def _row(
     seen_by = np.pad(shape.seen_by, (0, model.views - len(shape.seen_by)))
     corners = positions[model.skin.triangles[triangle]]
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    # The error field lies along the outward normal of the body, this row about against it.
+    # The error field is defined along the outward normal of the body; this row points approximately the other way.
     facing = float(direction @ normal) / max(float(np.linalg.norm(normal)), 1e-12)
     by_pose = (seen_by[:, None] * rows.by_pose).reshape(1, -1)
     return replace(rows, field=rows.field * facing, camera=seen_by[None], by_pose=by_pose)

@@ -2,10 +2,10 @@
 
 | contact | prior odds | why |
 |---|---|---|
-| visible, at a seen object | 1 : 10 | one in ten objects near the body touches it; times the density of its gap (`no_penetration`) |
-| … whose pixels make no shape | 1 : 10 more | a scrap of the scene, or what a camera adds around a silhouette |
-| inferred | 1 : 1000 | one frame in 1000 has one; contact-free frames of the same recording lower the odds |
-| … that pushes where the surface is in sight | 1 : 10 more | its object would be seen, or hide the surface |
+| visible, at an observed object | 1 : 10 | one in ten objects near the body touches it; times the density of its gap (`no_penetration`) |
+| … whose pixels fit no shape | 1 : 10 more | a fragment of the scene, or depth bleeding at a silhouette |
+| inferred | 1 : 1000 | one frame in 1000; contact-free frames of the same recording lower the odds |
+| … that pushes on a visible part of the surface | 1 : 10 more | its object would be visible, or hide the surface |
 | … that hangs | 1 : 10 more | a thread or a thin hook, along gravity |
 """
 
@@ -30,7 +30,7 @@ UNRESOLVED = float(2.0 * np.log(10.0))
 IN_SIGHT = float(2.0 * np.log(10.0))
 HANGING = float(2.0 * np.log(10.0))
 SEEN_BY = 3
-"""A place is in sight where at least so many pixels of the robot lie within an edge of it."""
+"""A point is visible if at least this many pixels of the robot lie within an edge of it."""
 
 
 def odds_of(model: Model, contact: Touch, rows: Rows) -> float:
@@ -46,7 +46,7 @@ def odds_of(model: Model, contact: Touch, rows: Rows) -> float:
 
 
 def in_sight(model: Model, rows: Rows, places: FloatArray) -> BoolArray:
-    """Return which places at rest (c, 3) [m] the cameras see, shape (c,)."""
+    """Return which points at rest (c, 3) [m] are visible to a camera, shape (c,)."""
     robot = rows.pixel & (np.abs(rows.residual) < 5.0 * rows.std)
     seen = rows.rest[robot]
     if len(seen) < SEEN_BY:

@@ -10,17 +10,17 @@ from femsense.core.options import Flag
 
 
 class SensingMethod(StrEnum):
-    """How forces are found."""
+    """Method of the force estimate."""
 
     rays = "rays"
-    """Every point is a measurement, one objective (docs/method/estimator.md)."""
+    """Every pixel is a measurement; one objective (docs/method/estimator.md)."""
     paper = "paper"
     """The published method: feature points along their normals and one linear step."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensingOptions:
-    """What the data cannot say."""
+    """Assumptions that the data cannot replace."""
 
     method: Annotated[
         SensingMethod,
@@ -34,11 +34,11 @@ class SensingOptions:
     smooth_s: Annotated[float, Flag("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0
     """Time constant over which the forces of one track are averaged [s]. 0: each frame speaks for itself."""
     modulus_std: float = 0.03
-    """What is not known of the modulus before the free frames are seen, relative."""
+    """Prior standard deviation of the modulus, relative."""
     marker_std_m: float | None = None
-    """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
+    """Noise of a marker along each axis [m]. None: from the residual of the calibration."""
     marker_model_std: float = 0.015
-    """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
+    """Model error of frames with markers only, relative to the displacement of a point."""
     correct: Annotated[
         bool, Flag("--correct", help="Use the empirical correction of femsense improve --correct, which applies to markers.")
     ] = False

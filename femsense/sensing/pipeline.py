@@ -1,4 +1,4 @@
-"""Contacts and forces of a recording, frame by frame: each starts from the one before where that is trusted."""
+"""Contacts and forces of a recording, frame by frame: each frame is the warm start of the next one if its status allows it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from femsense.sensing.types import (
 )
 
 CHECKPOINT_S = 10.0
-"""Seconds of work that a killed estimate may lose, if nothing else is asked for."""
+"""Interval between checkpoints [s]."""
 
 
 @one_blas_thread()
@@ -58,24 +58,34 @@ def estimate(
     keep: tuple[str | Path, Mapping[str, Any]] | None = None,
     keep_every_s: float = CHECKPOINT_S,
 ) -> Run:
-    """Find contacts and forces in every frame: from clouds, or from markers where there are none.
+    """Estimate contacts and forces in every frame: from clouds, or from markers in recordings without clouds.
 
-    Known loads (loads.csv) act on the model, except those within a fifth of the body's size of a given place: these are what
-    is to be sensed, and `known_loads` compares.
+    Known loads (loads.csv) act on the model. Those closer to a point of `at` than a fifth of the body's size are left out and
+    estimated instead; `Run.known_loads` compares.
 
     Arguments:
-        robot: the robot.
+        robot: the declared robot.
         recording: clouds or markers, and inputs.
-        calibration: pose and initial inputs.
-        at: places of contact at rest [m], shape (g, 3); needed where there are only markers.
-        options: assumptions.
-        progress: called with (frames done, frames in all).
-        keep: a file that holds the frames that are done, so that an estimate that is killed goes on there, and what it is made from: a file that
-            says something else is not used. It is removed at the end.
-        keep_every_s: seconds of work that a killed estimate may lose.
+        calibration: camera poses and initial inputs.
+        at: known contact points at rest [m], shape (g, 3); required for markers only.
+        options: assumptions on contacts, noise and smoothness.
+        progress: called with (frames done, number of frames).
+        keep: a checkpoint file and the inputs that it must match: an interrupted estimate resumes with the same result, and a file with
+            other inputs is ignored. It is removed at the end.
+        keep_every_s: interval between checkpoints [s].
+
+    Returns:
+        contacts with forces and their standard deviations, the status of each frame, and the deformed states.
 
     Raises:
-        InputError: no clouds and no places; DataError: not one frame gave a result.
+        InputError: neither clouds nor `at`. DataError: no frame has a result.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
+        >>> [round(contact.force_n, 1) for contact in run.contacts]  # N
+        [0.1, 0.3, 0.2]
     """
     if robot.softening:
         warnings.warn(
@@ -111,11 +121,11 @@ def estimate(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Method:
-    """How frames are sensed, and what stays the same over them."""
+    """The method of a recording: its function of a frame, and its constants."""
 
     sensor: Sensor
     sense: Callable[[int, SensedFrame | None], SensedFrame]
-    """(index of a frame, the frame before) → the frame. Raises FemsenseError."""
+    """(index of a frame, previous frame) → the frame. Raises FemsenseError."""
     candidates: Candidates = field(default_factory=Candidates)
 
 
@@ -130,7 +140,7 @@ def _method(
 
 
 def _sense_into(done: Done, method: _Method, k: int) -> None:
-    """Add a frame to those that are done; a wrong state is not handed on as the start of the next one."""
+    """Append frame k. A state that is not trusted is not the warm start of the next frame."""
     sensor = method.sensor
     try:
         if not _is_measured(sensor, k):
@@ -148,7 +158,7 @@ def _sense_into(done: Done, method: _Method, k: int) -> None:
 
 
 def under_inputs(frame: SensedFrame) -> SensedFrame:
-    """Return a frame under its inputs alone: what the next one starts from where its forces are not trusted (friction remembers it)."""
+    """Return a frame reduced to its inputs: the warm start of the next frame if the forces are not trusted. Friction depends on it."""
     return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=(), tau=np.zeros(0))
 
 
@@ -159,7 +169,7 @@ def _is_measured(sensor: Sensor, k: int) -> bool:
 
 
 def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
-    """Add frame k as the model has it where nothing was measured."""
+    """Append frame k as predicted by the model, without a measurement."""
     clock, last = Clock(), done.last
     before = last.state.segment_tensions if last is not None and has_history(sensor.robot) else None
     state = free_state(sensor, k, None if last is None else last.free_state, before)
@@ -173,7 +183,7 @@ def _predict_into(done: Done, sensor: Sensor, k: int) -> None:
 
 
 def _named(done: Done, contacts: Sequence[ContactForce]) -> list[ContactForce]:
-    """Return contacts with numbers for those that begin a track."""
+    """Return the contacts with numbers for new tracks."""
     result = []
     for contact in contacts:
         if contact.track < 0:
@@ -205,7 +215,7 @@ def _failed(sensor: Sensor, k: int, error: Exception) -> FrameReport:
 def _compare_loads(
     recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float
 ) -> tuple[LoadComparison, ...]:
-    """Return declared next to sensed resultants of the frames whose loads act at the given places."""
+    """Return declared and estimated resultants of the frames with known loads at the given contact points."""
     near = near_places(recording.load_points, places, size)
     result = []
     for k, number in enumerate(recording.frame_numbers):

@@ -1,4 +1,4 @@
-"""Where forces may act: given places, or where an object that is seen comes closest to the deformed surface."""
+"""Possible contacts: given contact points, and the closest surface points of observed objects."""
 
 from __future__ import annotations
 
@@ -20,33 +20,34 @@ from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Case, Sensor, Touch
 
 LOCAL = 0.06
-"""How much of an object counts for its shape, beyond its nearest point, relative to the body's diagonal."""
+"""Extent of the part of an object that its shape is fitted to, beyond its nearest point, relative to the body's diagonal."""
 NEAR = 0.08
-"""An object whose visible points all lie farther from the body than this share of its diagonal touches nothing."""
+"""Maximum distance of the visible points of a touching object from the body, relative to the body's diagonal."""
 SLACK = 2.0
-"""A completed object touches where its gap is less than this many standard deviations."""
+"""A completed object touches if its gap is less than this many standard deviations."""
 TILT = 1.5e-4
-"""Gaps along a contact that differ by less than this are alike: a rod along a face touches anywhere on its length [m]."""
+"""Gaps that differ by less than this are equal: a rod along a face touches along its whole length [m]."""
 ZONE = 0.15
-"""Largest extent of a contact about its nearest point, relative to the body's diagonal."""
+"""Maximum extent of a contact about its nearest point, relative to the body's diagonal."""
 HERTZ = float(np.sqrt(5.0 / 2.0))
 """Radius of Hertz's pressure over its root mean square radius."""
 AHEAD = 1e-4
-"""Step by which the slope of a distance is taken [m]."""
+"""Step of the finite difference of a distance [m]."""
 WINDOWED = 2.0
-"""A camera matches windows whose neighbouring pixels err together: the variance of their sums is this many times that of independent ones."""
+"""Overdispersion of objects: stereo matching correlates neighbouring pixels, so that the variance of their sums is this many times that of
+independent pixels."""
 BLEEDING = 3.0
-"""Windows of a stereo camera widen what they see by one to three pixels, with the colour of what is beside it [px]."""
+"""Maximum width of the depth bleeding of a stereo camera, one to three pixels. Bleeding pixels have the colour of the background [px]."""
 AGAIN = 2.0
-"""A ball is the one of the frame before where its points are nearer than so many radii to where that one's centre was."""
+"""A ball is the same as in the previous frame if its points lie within this many radii of the previous centre."""
 SIXTHS = np.array([[i, j, 6 - i - j] for i in range(7) for j in range(7 - i)]) / 6.0
-"""Barycentric points of a triangle at which the distance of an object is taken, shape (28, 3)."""
+"""Barycentric points of a triangle at which the distance of an object is evaluated, shape (28, 3)."""
 FLOOR_STD = 0.0007
-"""The surface between nodes is flat in the model: no place is known better [m]."""
+"""Minimum standard deviation of a contact point [m]: the surface of the model is flat between nodes."""
 
 
 def given_touches(sensor: Sensor) -> list[Touch]:
-    """Return touches at the given places."""
+    """Return contacts at the given contact points."""
     return [make_touch(sensor, place, source="given") for place in sensor.places]
 
 
@@ -58,9 +59,9 @@ def case_of(sensor: Sensor, k: int) -> Case:
 
 
 def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[Shape] = ()) -> list[Shape]:
-    """Return what a scan shows near the body in a state, completed.
+    """Return the objects of a scan near the body in a state, with completed shapes.
 
-    seen: objects of the frame before; a ball keeps its radius where that frame showed it better.
+    seen: objects of the previous frame; a ball keeps its previous radius if that was better determined.
     """
     poses = sensor.calibration.poses
     points = scan.surroundings(poses)
@@ -79,7 +80,7 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
     std = sensor.knowledge.depth_std(np.linalg.norm(points - origins, axis=1), view)
     edges = _edges(sensor, scan, state, body, points, gap, origins, view)
     tools = sensor.recording.tools
-    whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
+    whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is visible, the better its pose
     return find_shapes(
         points,
         std,
@@ -96,23 +97,24 @@ def objects_near(sensor: Sensor, scan: Scan, state: Equilibrium, seen: Sequence[
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Edges:
-    """How points lie to the edges of a body that cameras see, where depth is mixed."""
+    """Positions of points relative to the visible edges of a body, where depth is mixed."""
 
     close: BoolArray
-    """Whether a point lies within what a camera may add to an edge, shape (o,)."""
+    """Whether a point lies within the possible depth bleeding of an edge, shape (o,)."""
     halo: BoolArray
-    """Whether stereo matching may have added it around the silhouette, shape (o,)."""
+    """Whether it may be depth bleeding around the silhouette, shape (o,)."""
     passes: FloatArray
-    """How far its ray passes the body [m], 0 where it meets a face, inf where it passes it by more than a camera may add, shape (o,)."""
+    """Distance at which its ray passes the body [m], shape (o,): 0 if it hits a face, inf beyond the possible depth bleeding."""
     behind: FloatArray
-    """How far behind the point that is [m], inf where the ray passes farther, shape (o,)."""
+    """Distance of that passage behind the point [m], inf if the ray passes farther away, shape (o,)."""
     std: FloatArray
-    """Of each point along its ray, times √T: neighbours err together [m], shape (o,)."""
+    """Noise of each point along its ray, times √T for the correlation of neighbours [m], shape (o,)."""
     model: float
     """Error of the model's surface [m]."""
 
     def consist_of(self, group: IntArray) -> bool:
-        """Return whether points may be of the body's own edge: all lie close to its surface, and not in front of its faces by more than their mean errs."""
+        """Return whether points may belong to the body's own edge: all lie close to its surface, and their mean is not significantly in
+        front of its faces."""
         met = group[self.passes[group] == 0.0]
         if len(met) > 0.5 * len(group):
             noise = float(np.median(self.std[met])) / np.sqrt(len(met))
@@ -131,10 +133,10 @@ def _edges(
     origins: FloatArray,
     view: IntArray,
 ) -> Edges:
-    """Return how points at some gaps from the body (o,) [m] lie to its edges.
+    """Return the positions of points relative to the edges of the body; gaps: distances from the body [m], shape (o,).
 
-    A pixel of the halo has a depth anywhere between the body and what is behind it, and its ray passes the body that closely; or it lies that close to the
-    body in space. What lies in front of a face of the body by as much is none.
+    A pixel of the halo has a depth between the body and the background, and its ray passes close to the body; or it lies close to the body
+    in space. A point that far in front of a face of the body does not belong to the halo.
     """
     known, noises = sensor.knowledge, sensor.knowledge.noises
     pixel = np.array([_pixel_of(sensor, scan, v) for v in range(len(noises))])
@@ -161,7 +163,7 @@ def _pixel_of(sensor: Sensor, scan: Scan, view: int) -> float:
 
 
 def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
-    """Return the shape of points, a ball with the radius that it had in the frame before where that is known better. Arguments as for `fit_tool`."""
+    """Return the shape of points; a ball has its previous radius if that was better determined. Arguments as for `fit_tool`."""
     shape = fit_shape(points, std, origins)
     balls = [one for one in seen if one.kind == "sphere" and one.radius_std < shape.radius_std]
     near = min(balls, key=lambda one: float(np.linalg.norm(one.center - points.mean(axis=0))), default=None)
@@ -171,19 +173,19 @@ def fit_again(seen: Sequence[Shape], points: FloatArray, std: FloatArray, origin
     if ball is None or ball.covariance is None:
         return shape
     look = (points - origins).mean(axis=0)
-    # What is seen stays where it is: a larger ball has its centre farther away.
+    # The visible surface is kept: a larger ball has its centre farther away.
     by_radius = np.append(look / np.linalg.norm(look), 1.0)
     return replace(ball, covariance=ball.covariance + near.radius_std**2 * np.outer(by_radius, by_radius))
 
 
 def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
-    """Return the known object that explains points with their noise, at its pose; where none does, what fits best of all shapes.
+    """Return the known object that fits the points within their noise, at its pose; without one, the best-fitting shape.
 
     Arguments:
-        tools: what is known to touch, not empty.
+        tools: objects that may touch, at least one.
         points: of one object [m], shape (k, 3).
-        std: noise of each along its ray [m], shape (k,).
-        origins: where its ray begins [m], shape (k, 3).
+        std: noise of each point along its ray [m], shape (k,).
+        origins: centre of the camera of each point [m], shape (k, 3).
     """
     if len(points) < FEWEST:
         return fit_shape(points, std, origins)
@@ -200,13 +202,14 @@ def _fit_of(tool: Tool, points: FloatArray, std: FloatArray, origins: FloatArray
 
 
 def object_touches(sensor: Sensor, shapes: Sequence[Shape], state: Equilibrium) -> list[Touch]:
-    """Return where completed objects touch a state, the nearest part of each."""
+    """Return the contacts of completed objects with a state, at the nearest part of each."""
     found = [_touch(sensor, shape, state) for shape in shapes]
     return [touch for touch in found if touch is not None]
 
 
 def away_from_scenery(sensor: Sensor, touches: Sequence[Touch]) -> list[Touch]:
-    """Return the touches that are not where something seems to touch in a free frame too, a holder or the table, nor with what passes through the body."""
+    """Return the contacts without those that also appear in a contact-free frame (a holder, the table), and without those of objects that
+    pass through the body."""
     return [
         t
         for t in touches
@@ -221,7 +224,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     std = float(np.hypot(shape.std_m, FLOOR_STD))
     touching = SLACK * std + shape.behind_m + (0.0 if shape.kind != "points" else 2.0 * shape.std_m)
     corner = shape.distance(corners, within=touching + 3.0 * sensor.surface.edge)
-    if corner.min() > touching + 2.0 * sensor.surface.edge:  # too far for any point between the nodes
+    if corner.min() > touching + 2.0 * sensor.surface.edge:  # too far for every point between the nodes
         return None
     by_node = np.full(len(state.positions), np.inf)
     by_node[sensor.surface.nodes] = corner
@@ -259,17 +262,17 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
 
 
 def _face_towards(shape: Shape, place: FloatArray, normals: FloatArray, faces: IntArray) -> int:
-    """Return which of the faces that meet in a place (3,) looks at the object most: on an edge, the other one is beside it."""
+    """Return which of the faces that meet at a point (3,) faces the object most. This matters on an edge."""
     step = AHEAD * np.eye(3)
     towards = shape.distance(place - step) - shape.distance(place + step)
     return int(faces[np.argmax(normals[faces] @ towards)])
 
 
 def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatArray, apart: FloatArray) -> FloatArray:
-    """Return up to which difference [m] gaps are alike that lie so far apart from the smallest one [m], shape (k,).
+    """Return the difference below which gaps are equal [m], shape (k,), as a function of their distance from the smallest gap [m].
 
-    What model and camera share between neighbours moves near places alike, and those farther apart than it reaches each on its own: a rod that lies on the
-    body touches where that lets it.
+    Correlated errors of model and camera move neighbouring points together, and points farther apart than the correlation length
+    independently. The tolerance of a rod along the body therefore grows with the distance.
     """
     known = sensor.knowledge
     node = int(np.argmin(((state.positions - best) ** 2).sum(axis=1)))
@@ -280,13 +283,13 @@ def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatA
 
 
 def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:
-    """Return whether a place touches the clamp: a force there does not move the body, and a holder always touches it."""
+    """Return whether a point lies on the clamp: a force there does not deform the body, and the holder always touches it."""
     clamped = sensor.robot.body.mesh.nodes[sensor.robot.body.clamped]
     return bool(len(clamped)) and bool(np.linalg.norm(clamped - place, axis=1).min() < sensor.surface.edge)
 
 
 def near_places(points: FloatArray, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:
-    """Return which known loads act near a given place."""
+    """Return which known loads act near a given contact point."""
     if not len(places) or not len(points):
         return np.zeros(len(points), dtype=bool)
     distance = np.linalg.norm(points[:, None] - places[None], axis=2).min(axis=1)

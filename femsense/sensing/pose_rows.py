@@ -1,4 +1,4 @@
-"""What poses alone move: the background as rows, and by how much a step of the poses would raise the evidence."""
+"""Rows that depend on the poses only (the background), and the linearised evidence of a pose step."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from femsense.sensing.fit import whitened
 from femsense.sensing.model import Fit, Frame, Model
 
 FAR = 0.1
-"""Prior of a pose that has moved: one standard deviation in radians and in shares of the body's diagonal."""
+"""Prior σ of a moved pose: in radians, and relative to the body's diagonal."""
 OTHER = float(np.log(1e-2))
-"""Log odds that a pixel of the background shows something new."""
+"""Log odds that a pixel of the background shows another object."""
 HUBER = 2.5
 """Whitened residuals of the background beyond this count linearly."""
 
@@ -28,7 +28,7 @@ def far(model: Model) -> FloatArray:
 
 
 def background_rows(model: Model, frame: Frame) -> Rows | None:
-    """Return the rows of the background of a frame, which move with the poses alone; None where no contact-free frame shows enough of it."""
+    """Return the rows of the background of a frame, which depend on the poses only; None if no contact-free frame shows enough of it."""
     sensor = model.sensor
     if sensor.background is None or frame.scan is None or not len(frame.scan.far):
         return None
@@ -73,9 +73,9 @@ def pose_gain(model: Model, best: Fit) -> float:
 
 
 def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
-    """Return by how much −2 log evidence rises where poses are free to move and some contacts of a fit are removed, to first order in all parameters.
+    """Return the increase of −2 log evidence if poses are free and some contacts of a fit are removed, to first order in all parameters.
 
-    Pixels are reweighted: what a moved camera does not explain may pass for something else.
+    Pixels are reweighted: those that a moved camera does not fit may be assigned to another object.
     """
     D = best.D
     scale, at = whitened(model, best, trust=False)
@@ -102,6 +102,6 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
 
 
 def _lowered(gradient: FloatArray, curvature: FloatArray) -> float:
-    """Return by how much parameters with unit priors lower −2 log evidence, to second order; gradient (q,), curvature (q, q)."""
+    """Return the decrease of −2 log evidence by parameters with unit priors, to second order; gradient (q,), curvature (q, q)."""
     H = np.eye(len(gradient)) + curvature
     return float(gradient @ np.linalg.solve(H, gradient) - np.linalg.slogdet(H)[1])

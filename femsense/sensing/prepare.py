@@ -1,4 +1,4 @@
-"""What stays the same from frame to frame, and what the free frames teach before the first frame is sensed."""
+"""Constants of a recording: what is the same in every frame."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ from femsense.sensing.places import near_places, object_touches, objects_near
 from femsense.sensing.types import Knowledge, Sensor
 
 POSE_STD = 0.3 * DECLARED_STD
-"""How well a declared pose is known beforehand beside clouds: 0.15° and 0.3 mm along each axis. What the model sags too much or too little looks like
-a turn beside another modulus, and takes up what it is allowed; poses that are 0.8° and 1 mm off are still told (`benchmarks/declared_pose.py`)."""
+"""Prior σ of a declared pose in recordings with clouds: 0.15° and 0.3 mm along each axis. An error of the sag resembles a rotation and a
+change of the modulus, so that a wider prior would absorb it; poses that are wrong by 0.8° and 1 mm are still corrected
+(`benchmarks/declared_pose.py`)."""
 CANDIDATES = 120
-"""Places at which hidden contacts are searched (METHODS section 3)."""
+"""Number of surface points at which inferred contacts are searched."""
 
 
 def make_sensor(
@@ -46,15 +47,15 @@ def make_sensor(
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
 ) -> Sensor:
-    """Return what stays the same from frame to frame, before any contact-free frame is seen.
+    """Return the constants of a recording, before contact-free frames are used.
 
     Arguments:
         robot, recording, calibration: as for `estimate`.
-        at: places of contact at rest [m], shape (g, 3).
+        at: known contact points at rest [m], shape (g, 3).
         options: assumptions.
 
     Raises:
-        InputError: nothing says where to look for forces.
+        InputError: neither clouds nor known contact points.
     """
     options = options or SensingOptions()
     recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
@@ -94,10 +95,11 @@ def make_sensor(
 
 
 def pose_covariance(recording: Recording, calibration: Calibration) -> FloatArray:
-    """Return how well poses are known before a free frame is seen, shape (6 v, 6 v): beside clouds, those that nobody fitted as declared ones are.
+    """Return the prior covariance of the poses, shape (6 v, 6 v). In recordings with clouds, poses that were not fitted have that of
+    declared ones.
 
-    By markers alone it is the pose under the robot's own law: the same law explains the frames that are sensed.
-    A pose that was 0.1° and 0.07 mm off, taken for exact, made five of seven touches of `bar-gray` be taken for parts of the scene.
+    With markers only it is the covariance under the declared law, since the same law is used for the estimate. A pose that was wrong by
+    0.1° and 0.07 mm and assumed exact made five of seven contacts of `bar-gray` look like parts of the scene.
     """
     covariance = calibration.joint_covariance.copy()
     for view in np.flatnonzero(_declared(calibration) & recording.has_clouds):
@@ -110,14 +112,15 @@ def pose_covariance(recording: Recording, calibration: Calibration) -> FloatArra
 
 
 def _declared(calibration: Calibration) -> BoolArray:
-    """Return which cameras have a pose that nobody fitted, shape (v,)."""
+    """Return which cameras have a declared pose that was not fitted, shape (v,)."""
     return np.asarray(~calibration.joint_covariance.reshape(len(calibration.poses), -1).any(axis=1))
 
 
 def _corrected(
     robot: Robot, recording: Recording, calibration: Calibration, options: SensingOptions
 ) -> tuple[Recording, FloatArray]:
-    """Return the recording with its markers moved by the robot's correction where that is asked for, and the correction's standard deviation [m], (K,).
+    """Return the recording with the robot's correction subtracted from its markers, if requested, and the standard deviation of the
+    correction [m], shape (K,).
 
     Raises:
         InputError: no correction, one for other inputs, or no markers.
@@ -142,7 +145,7 @@ def _corrected(
 
 
 def scan_of(sensor: Sensor, k: int, state: Equilibrium) -> Scan | None:
-    """Return what cameras see in frame k near a state; None where the recording has no clouds at all."""
+    """Return the scan of frame k near a state; None for a recording without clouds."""
     if not sensor.recording.has_clouds:
         return None
     return read_scan(sensor.robot, sensor.recording, k, sensor.calibration.poses, state.positions)
@@ -159,7 +162,8 @@ def _with_placements(robot: Robot, calibration: Calibration) -> Robot:
 
 
 def _without_sensed_frames(recording: Recording, places: FloatArray, size: float) -> Recording:
-    """Return the recording whose frames with a known load near a given place do not count as contact-free: that load is to be sensed."""
+    """Return the recording without the contact-free mark of frames whose known load acts near a given contact point: that load is to be
+    estimated."""
     sensed_here = near_places(recording.load_points, places, size)
     if recording.free is None or not sensed_here.any():
         return recording
@@ -169,7 +173,7 @@ def _without_sensed_frames(recording: Recording, places: FloatArray, size: float
 
 
 def _driven(robot: Robot, recording: Recording, calibration: Calibration, places: FloatArray, size: float) -> DrivenRobot:
-    """Return what drives the robot, without the known loads that are to be sensed."""
+    """Return the inputs and known loads, without the loads that are to be estimated."""
     initial = None
     if recording.actuation_zero == "unknown":
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
@@ -187,7 +191,7 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
 
 
 def _with_scenery(sensor: Sensor) -> Sensor:
-    """Return the sensor with what seems to touch or overlap the body in the first free frame with a cloud."""
+    """Return the sensor with the objects that touch or overlap the body in the first contact-free frame with a cloud."""
     for k, state in free_path(sensor.driven, free_clouds(sensor.recording)[:1]):
         try:
             scan = scan_of(sensor, k, state)

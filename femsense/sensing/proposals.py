@@ -1,4 +1,5 @@
-"""Hypotheses next to a fitted one: a contact dropped, added at a seen object, added where the linearised evidence is highest, or moved elsewhere.
+"""Hypotheses that differ from a fitted one in one contact: removed, added at an observed object, added where the linearised evidence is
+highest, or moved.
 
 To first order, a force f at a candidate lowers −2 log evidence by  max_f [2 gᵀf − fᵀ(M + D⁻²)f] − log det(I + D M D),  D = diag(τ, τ/2, τ/2):
 g and M are the gradient and curvature of Φ with all parameters of the fit profiled out (`Vicinity`). Each proposal carries its expected decrease of J.
@@ -24,20 +25,21 @@ from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
 
 SIZES = (0.05, 0.2, 0.8)
-"""Prior scales τ of a force for which the linearised evidence is taken [N]."""
+"""Prior scales τ of a force for which the linearised evidence is evaluated [N]."""
 SAME = 0.08
-"""Contacts within this share of the body's diagonal are one."""
+"""Contacts closer than this share of the body's diagonal are the same."""
 SHORT = 10.0
-"""By how much the linearised gain of a contact at a seen object may fall short of the fitted one: it keeps the contact points."""
+"""Tolerance on the linearised gain of a contact at an observed object: the linearisation keeps the contact points fixed and therefore
+underestimates it."""
 FIRST = 0.1
-"""A line through the body begins so many edges below its surface."""
+"""Depth below the surface at which a line through the body starts [edges]."""
 SEARCHED, CLOSE = 2, 20.0
-"""Candidates that are fitted, the best first, and by how much −2 log evidence of the last may be below the first."""
+"""Maximum number of fitted candidates, and maximum difference of −2 log evidence to the best one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
-    """A hypothesis that is worth a fit."""
+    """A hypothesis to be fitted."""
 
     gain: float
     """Expected decrease of J."""
@@ -47,14 +49,15 @@ class Proposal:
 
 
 def proposals(model: Model, best: Fit, seen: Sequence[Touch]) -> list[Proposal]:
-    """Return hypotheses next to the best one so far, the most promising first; seen: where seen objects touch."""
+    """Return hypotheses that differ from the best one so far in one contact, the most promising first; seen: contacts of observed
+    objects."""
     near = vicinity(model, best)
     found = [*_dropped(best), *_at_objects(near, seen), *_at_candidates(near)]
     return sorted(found, key=lambda one: -one.gain)
 
 
 def inferred_gain(model: Model, best: Fit) -> float:
-    """Return by how much one more contact, pushing where no camera sees it, lowers J of a fit, marginalised over the candidates."""
+    """Return the decrease of J by an additional inferred contact, marginalised over the candidates."""
     near = vicinity(model, best)
     return _inferred(near, at_candidates(near), pulls=False).gain
 
@@ -64,7 +67,7 @@ def inferred_gain(model: Model, best: Fit) -> float:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Vicinity:
-    """Φ next to a fit, to second order in the parameters p of the fit, whitened, and in forces f that are added:
+    """Φ about a fit, to second order in its whitened parameters p and in additional forces f:
 
     Φ(δp, f) = Φ + δpᵀ K δp + 2 δpᵀ S f + fᵀ Q f − 2 hᵀ δp − 2 bᵀ f
     """
@@ -72,22 +75,22 @@ class Vicinity:
     model: Model
     fit: Fit
     rows: Rows
-    """Pixels averaged over triangles, and all other rows."""
+    """Rows: pixels averaged over triangles, and all others."""
     weight: FloatArray
-    """W of these [1/m²], shape (r,)."""
+    """W of these rows [1/m²], shape (r,)."""
     X: FloatArray
     """Their derivatives by p: η̃, then (force along its axes, contact point) of each contact; shape (r, p)."""
     left: FloatArray
     """Their residual [m], shape (r,)."""
     at: FloatArray
-    """Where the fit stands in p, shape (p,)."""
+    """Value of p at the fit, shape (p,)."""
     scale: FloatArray
     """Prior standard deviations of (force, contact point) of the contacts, shape (5 m,)."""
     K: FloatArray
     """I + Xᵀ W X."""
 
     def sites(self, answers: FloatArray) -> Sites:
-        """Return what forces add whose unit answers are (n, 3, 3c) [m/N]."""
+        """Return the terms of Φ for forces at c points; answers: displacements under unit forces [m/N], shape (n, 3, 3c)."""
         D = self.rows.of(np.moveaxis(answers, 2, 0))
         WD, c = D * self.weight[:, None], answers.shape[2] // 3
         D3, W3 = (a.reshape(len(a), c, 3).transpose(1, 2, 0) for a in (D, WD))
@@ -100,25 +103,25 @@ class Vicinity:
         return np.asarray(np.einsum("cmi,mij->cmj", whitened_forces * self.scale.reshape(m, 5)[:, :3], self.fit.axes))
 
     def own(self, i: int) -> slice:
-        """Return where the force of contact i stands in p."""
+        """Return the indices of the force of contact i in p."""
         first = self.X.shape[1] - len(self.scale) + 5 * i
         return slice(first, first + 3)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sites:
-    """Terms of Φ with forces at c places, three components each."""
+    """Terms of Φ for forces at c points, with three components each."""
 
     b: FloatArray
     """Dᵀ W r, shape (3c,)."""
     Q: FloatArray
-    """Dᵀ W D of each place, shape (c, 3, 3)."""
+    """Dᵀ W D of each point, shape (c, 3, 3)."""
     S: FloatArray
     """Xᵀ W D, shape (p, 3c)."""
 
 
 def vicinity(model: Model, best: Fit) -> Vicinity:
-    """Return the vicinity of a fit, its noise widened to what it leaves."""
+    """Return the expansion of Φ about a fit, with its noise widened to the residual."""
     rows, z = best.rows, best.left(model.nuisance)
     kappa = first_width(z, rows.pixel, best.frame.coloured, CATCH).of(rows.pixel)
     weight = misfit(z, rows.log_other, rows.share, kappa)[1] * rows.share / (kappa * rows.std) ** 2
@@ -147,7 +150,7 @@ def evidence_at(near: Vicinity, sites: Sites, axes: FloatArray, hangs: BoolArray
 
     Arguments:
         axes: of the forces, outward normal (upward for a hanging weight) and two tangents, shape (c, 3, 3).
-        hangs: places of hanging weights, whose forces keep to no cone, shape (c,).
+        hangs: which points are hanging weights, whose forces have no cone, shape (c,).
         without: a contact of the fit that is removed.
     """
     c, K, S, b = len(axes), near.K, sites.S, sites.b
@@ -155,7 +158,7 @@ def evidence_at(near: Vicinity, sites: Sites, axes: FloatArray, hangs: BoolArray
     kept = np.ones(len(K), dtype=bool)
     if without is not None:
         own = near.own(without)
-        force = near.at[own]  # its share of the modelled side goes back to the residual
+        force = near.at[own]  # its contribution is added to the residual again
         b, h = b + S[own].T @ force, h + (K - np.eye(len(K)))[:, own] @ force
         kept[own.start : own.start + 5] = False
         K, S, h = K[np.ix_(kept, kept)], S[kept], h[kept]
@@ -204,7 +207,7 @@ def _dropped(best: Fit) -> list[Proposal]:
 
 
 def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
-    """Return additions at seen objects that are no contact yet, and inferred contacts replaced by them."""
+    """Return additional contacts at observed objects, and observed objects in place of inferred contacts."""
     model, best = near.model, near.fit
     new = [one for one in seen if not _is_there(model, best, one)]
     if not new:
@@ -224,21 +227,22 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
 
 
 def _at_touches(near: Vicinity, touches: Sequence[Touch]) -> Sites:
-    """Return what forces at some touches add."""
+    """Return the terms of Φ for forces at possible contacts."""
     best, n = near.fit, len(near.fit.state.positions)
     loads = np.array([one.patch.spread(axis, n) for one in touches for axis in np.eye(3)])
     return near.sites(np.moveaxis(best.linearised.tangent.respond(loads), 0, 2))
 
 
 def _is_there(model: Model, best: Fit, seen: Touch) -> bool:
-    """Return whether a hypothesis has a contact at a seen object."""
+    """Return whether a hypothesis has a contact at an observed object."""
     reach = max(SAME * model.sensor.size, 2.0 * seen.std_m)
     near = [c for c in best.contacts if c.source == "cloud" and float(np.linalg.norm(c.place - seen.place)) < reach]
     return bool(near) or any(is_with(contact, seen.shape) for contact in best.contacts)
 
 
 def _at_candidates(near: Vicinity) -> list[Proposal]:
-    """Return inferred contacts, pushing or hanging where there is gravity: added, and in place of each contact where they fit better without it."""
+    """Return inferred contacts (pushing; hanging too if there is gravity): additional ones, and replacements of contacts without which they
+    fit better."""
     best, at = near.fit, at_candidates(near)
     found = []
     for pulls in (False, True) if near.model.upward.any() else (False,):
@@ -272,17 +276,17 @@ def _tau(force: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AtCandidates:
-    """What an inferred contact adds at each candidate."""
+    """Terms of Φ for an inferred contact at each candidate."""
 
     sites: Sites
     normals: FloatArray
-    """Outward, shape (c, 3)."""
+    """Outward normals, shape (c, 3)."""
     seen: BoolArray
-    """Whether the place is in sight, shape (c,)."""
+    """Whether the candidate is visible, shape (c,)."""
 
 
 def at_candidates(near: Vicinity) -> AtCandidates:
-    """Return what an inferred contact adds at each candidate next to a fit."""
+    """Return the terms of Φ for an inferred contact at each candidate, about a fit."""
     model, best = near.model, near.fit
     nodes, x = model.sensor.candidates, best.state.positions
     normals = vertex_normals(x, model.sensor.surface.triangles)[nodes]
@@ -291,7 +295,7 @@ def at_candidates(near: Vicinity) -> AtCandidates:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Inferred:
-    """One more contact at any of the candidates."""
+    """An additional contact at one of the candidates."""
 
     gain: float
     """By how much it lowers J, marginalised over the candidates; relative to the place of the contact that it replaces."""
@@ -314,11 +318,11 @@ class Inferred:
 
 
 def _inferred(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | None = None) -> Inferred:
-    """Return what one more contact at the candidates gains.
+    """Return the gain of an additional contact at the candidates.
 
     Arguments:
-        pulls: ask for hanging weights, whose forces keep to no cone.
-        without: a contact of the fit that is removed; the gain is then relative to its own place.
+        pulls: consider hanging weights, whose forces have no cone.
+        without: a contact of the fit that is removed; the gain is then relative to its own position.
     """
     added = _at_all(near, at, pulls=pulls, without=without)
     gains = added.gains
@@ -344,11 +348,12 @@ def _at_all(near: Vicinity, at: AtCandidates, *, pulls: bool, without: int | Non
 
 
 def elsewhere(model: Model, best: Fit) -> FloatArray:
-    """Return what the posterior probability of all other places adds to the covariance of each contact point [m²], shape (m, 3, 3); 0 where the place is
-    seen or given.
+    """Return the covariance of each contact point due to the posterior probability of other candidates [m²], shape (m, 3, 3); 0 for visible
+    and given contacts.
 
-    A thin body hardly shows on which of its sides it is pushed or pulled: the Laplace approximation about the best place does not know of the other side,
-    where the contact is fitted again. That point has the Laplace volume of the place itself, each candidate its share of the surface.
+    The deformation of a thin body hardly depends on the side on which a force acts. The Laplace approximation about the best point ignores
+    the other side, so the contact is fitted there too. That point has the Laplace volume of the best one; each candidate has its share of
+    the surface.
     """
     added = np.zeros((len(best.contacts), 3, 3))
     inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
@@ -360,7 +365,7 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
     ways = (False, True) if model.upward.any() else (False,)
     for i in inferred:
         place, own = best.contacts[i].patch.mean(positions), _gain_at_own_place(near, i) - best.odds[i]
-        if not np.isfinite(own):  # to first order no force may act there at all
+        if not np.isfinite(own):  # no admissible force there, to first order
             continue
         volume = min(2.0 * np.pi * float(np.sqrt(np.prod(np.linalg.eigvalsh(best.place_covariance[i])[1:]))), share)
         points, mass = positions[nodes] - place, np.zeros(len(nodes))
@@ -377,13 +382,13 @@ def elsewhere(model: Model, best: Fit) -> FloatArray:
 
 
 def _likelihood(gain: FloatArray) -> FloatArray:
-    """Return posterior odds of a decrease of J; of one that the search refused, 1."""
+    """Return the posterior odds of a decrease of J; at most 1, since the search rejected larger ones."""
     return np.asarray(np.exp(0.5 * np.minimum(gain, 0.0)))
 
 
 def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
-    """Return the fit with an inferred contact where the line of its force leaves the body on the other side: a push where the force points into the body
-    there, else a weight that hangs; None where neither may be."""
+    """Return the fit with an inferred contact at the opposite side of the body along its force: a push if the force points into the body
+    there, else a hanging weight; None if neither is admissible."""
     positions, contact = best.state.positions, best.contacts[i]
     axis, place = best.axes[i][0], contact.patch.mean(positions)
     body, within = Surface(positions, model.sensor.surface.triangles), FIRST * model.sensor.surface.edge
@@ -393,14 +398,14 @@ def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
             touch = make_touch(model.sensor, hits.place(model.skin.rest)[0], source="shape", std_m=contact.std_m)
             contacts = list(best.contacts)
             contacts[i] = replace(touch, pulls=bool(best.forces[i] @ hits.normal[0] >= 0.0))
-            if contacts[i].pulls and best.forces[i] @ model.upward >= 0.0:  # no weight pulls that way
+            if contacts[i].pulls and best.forces[i] @ model.upward >= 0.0:  # not the direction of a weight
                 return None
             return fit(model, best.frame, contacts, best.forces, best.state, eta=best.eta, tau=best.tau)
     return None
 
 
 def _gain_at_own_place(near: Vicinity, i: int) -> float:
-    """Return the decrease of −2 log evidence by contact i at its own place."""
+    """Return the decrease of −2 log evidence by contact i at its own position."""
     own, contact = near.own(i), near.fit.contacts[i]
     scale = near.scale[5 * i : 5 * i + 3]
     XWX = near.K - np.eye(len(near.K))

@@ -13,11 +13,11 @@ from femsense.core.errors import MissingDependency
 
 AXES = "xyz"
 NOISE = 3.0
-"""What is less than so many standard deviations noise may make."""
+"""A force is significant above this many standard deviations."""
 
 
 class RunLike(Protocol):
-    """A run, as far as it is looked at here."""
+    """The part of a run that these functions use."""
 
     @property
     def contacts(self) -> tuple[Any, ...]: ...
@@ -28,37 +28,37 @@ class RunLike(Protocol):
 
 
 def forces_of(run: RunLike) -> FloatArray:
-    """Return the forces of the tracks [N], shape (frames, tracks, 3), nan where a track is not there."""
+    """Return the forces of the tracks [N], shape (frames, tracks, 3); nan in frames without the track."""
     return _filled(run, "force_n_xyz")
 
 
 def positions_of(run: RunLike) -> FloatArray:
-    """Return the places of the tracks on the deformed body [m], shape (frames, tracks, 3), nan where a track is not there."""
+    """Return the contact points of the tracks on the deformed body [m], shape (frames, tracks, 3); nan in frames without the track."""
     return _filled(run, "position_m")
 
 
 def sensed(contacts: Iterable[Any]) -> list[Any]:
-    """Return the contacts whose force is more than noise may make: a given place without a force is no contact."""
+    """Return the contacts with a significant force. A given contact point without a force is not a contact."""
     return [c for c in contacts if more_than_noise(c.force_n, c.std_n, c.force_n_xyz, c.force_std_n_xyz)]
 
 
 def undetermined(contacts: Iterable[Any]) -> list[Any]:
-    """Return the contacts that a camera saw and whose force is not more than noise may make."""
+    """Return the visible contacts whose force is not significant."""
     contacts = list(contacts)
     felt = {id(c) for c in sensed(contacts)}
     return [c for c in contacts if c.source == "cloud" and id(c) not in felt]
 
 
 def undetermined_text(force_n: float, std_n: float) -> str:
-    """Return what is said of such a contact."""
+    """Return the note about a visible contact whose force is not significant."""
     return f"contact, size not determined ({force_n:.2g} ± {std_n:.2g} N)"
 
 
 def more_than_noise(size_n: npt.ArrayLike, std_n: npt.ArrayLike, force_n: FloatArray, force_std_n: FloatArray) -> BoolArray:
-    """Return whether forces are away from zero by NOISE deviations: their sizes (k,), or one of their components (k, 3).
+    """Return whether forces are significant: their magnitude (k,), or one of their components (k, 3), exceeds NOISE standard deviations.
 
-    A slender body tells well what bends it and hardly what acts along it. Its contacts may be sure while their sizes are not. Components
-    without a deviation (0 or nan) say nothing.
+    Slender bodies are sensitive to transverse forces and insensitive to axial ones. A contact can therefore be significant although its
+    magnitude is poorly determined. Components without a standard deviation (0 or nan) are ignored.
     """
     size_n = np.asarray(size_n)
     component = (np.abs(force_n) >= NOISE * force_std_n) & (force_std_n > 0.0)
@@ -66,15 +66,14 @@ def more_than_noise(size_n: npt.ArrayLike, std_n: npt.ArrayLike, force_n: FloatA
 
 
 def count_of(run: RunLike) -> int:
-    """Return how many contacts a run has: one over time counts once."""
+    """Return the number of contacts of a run; a track counts once."""
     felt = {id(contact) for contact in sensed(run.contacts)}
     return len({track for contact, track in zip(run.contacts, identities_of(run)) if id(contact) in felt})
 
 
 def tracks_of(run: RunLike) -> tuple[int, ...]:
-    """Return the identities of the contacts, in the order of the second axis of `forces_of`.
-
-    These are their tracks; their numbers in the frame where two of a frame have one track.
+    """Return the tracks of the contacts, in the order of the second axis of `forces_of`; the numbers in the frame if two contacts of a
+    frame have the same track.
     """
     return tuple(sorted(set(identities_of(run))))
 
@@ -93,7 +92,7 @@ def data_frame_of(run: RunLike) -> Any:
 
 
 def describe_run(run: RunLike) -> str:
-    """Return a run in one line; its largest force is that of a frame that is ok."""
+    """Return a summary of a run in one line, with the largest force of the frames that are ok."""
     ok = {frame.frame for frame in run.frames if frame.status == "ok"}
     count, sizes = count_of(run), [contact.force_n for contact in sensed(run.contacts) if contact.frame in ok]
     forces = f"{count} contact{'s' if count > 1 else ''}" if count else "no contact"

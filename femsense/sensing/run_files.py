@@ -1,7 +1,7 @@
-"""What the commands leave behind: calibration.json, the files of a run, loop.json with the improved robot.
+"""Results on disk: calibration.json, the files of a run, loop.json with the improved robot.
 
-Everything is written beside and renamed. run.json and loop.json are the last of their folder to appear and the first to go,
-so that a folder that has them is complete; they hold what it was made from, so that a second run sees that nothing is to be done.
+Files are written next to their final name and then renamed. run.json and loop.json are written last and deleted first, so that a folder
+that has them is complete. They contain the inputs, so that a second run can tell that the result is up to date.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CONTACT_COLUMNS = (
     "std_n",
     "source",
 )
-"""What every run says of a contact."""
+"""Columns of contacts.csv in every run."""
 MORE_CONTACT_COLUMNS = (
     "track",
     "x_std_m",
@@ -61,7 +61,7 @@ MORE_CONTACT_COLUMNS = (
     "fz_std_n",
 )
 NOTE_COLUMN = "note"
-"""Last column of frames.csv where a run has such: a contact that was seen and whose size is not determined."""
+"""Last column of frames.csv if a run has notes: visible contacts whose force has no determined magnitude."""
 FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before_m", "rms_after_m", "ms")
 
 
@@ -76,12 +76,12 @@ def run_inputs(
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
 ) -> dict[str, Any]:
-    """Return what a run is made from: name or place and SHA-256 of each input, and the options.
+    """Return the inputs of a run: path and SHA-256 of each input file, and the options.
 
     Arguments:
         robot, recording: as loaded.
-        calibration: None where the run calibrates by itself.
-        at: declared places of contact [m], shape (k, 3).
+        calibration: None if the run calibrates itself.
+        at: known contact points at rest [m], shape (k, 3).
         options: of the estimate.
     """
     own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
@@ -103,20 +103,31 @@ def write_run(
     seconds: float | None = None,
     calibration: Calibration | None = None,
 ) -> Path:
-    """Write contacts.csv, frames.csv, states.npz, the calibration and at last run.json.
+    """Write a run as contacts.csv, frames.csv, states.npz, calibration.json and, last, run.json.
 
     Arguments:
-        run: of `estimate`.
-        folder: made where it is missing; its other files stay.
-        inputs: of `run_inputs`.
-        seconds: how long the estimate took [s].
-        calibration: what it was made with; stands beside it as calibration.json.
+        run: result of `estimate`.
+        folder: created if missing; its other files are kept.
+        inputs: result of `run_inputs`: the files that the run was computed from.
+        seconds: duration of the estimate [s].
+        calibration: the calibration that was used.
 
     Returns:
         the folder.
 
     Raises:
-        InputError: see `check_run_folder`.
+        InputError: the folder is not writable, or contains another kind of result.
+
+    Example:
+        >>> import tempfile
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> calibration = fs.calibrate(robot, recording)
+        >>> run = fs.estimate(robot, recording, calibration, at=[0.088, 0.0, 0.014])
+        >>> inputs = fs.run_inputs(robot, recording, calibration, at=[0.088, 0.0, 0.014])
+        >>> folder = fs.write_run(run, tempfile.mkdtemp() + "/run", inputs=inputs, calibration=calibration)
+        >>> len(fs.read_run(folder).contacts)
+        3
     """
     check_run_folder(folder)
     with results_folder(folder, "run.json") as part:
@@ -136,19 +147,19 @@ def write_run(
 
 
 def check_run_folder(folder: str | Path) -> None:
-    """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where another file has its name."""
+    """Raise InputError if a run cannot be written to a folder: it is a robot, a recording or a loop, or a file."""
     check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"), RUN)
 
 
 def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
-    """Read a run back.
+    """Read a run that `write_run` or `femsense estimate` wrote.
 
     Arguments:
-        folder: of `write_run`.
-        robot: by default loaded from where run.json says it was.
+        folder: the folder of the run.
+        robot: the robot of the run. Default: loaded from the path in run.json.
 
     Raises:
-        InputError: files are missing or broken, or the robot is no longer there.
+        InputError: files are missing or broken, or the robot no longer exists.
     """
     from femsense.sensing.types import Run
 
@@ -183,7 +194,7 @@ def read_states(path: str | Path) -> States:
     try:
         with np.load(file, allow_pickle=False) as data:
             arrays = {name: data[name] for name in ("time_s", "nodes_m", "tets", "rest_nodes_m")}
-    except Exception as error:  # whatever the archive reader meets in a broken file
+    except Exception as error:  # any error of the archive reader in a broken file
         raise InputError("not readable", where=file, found=error, expected="arrays time_s, nodes_m, tets, rest_nodes_m") from None
     return States(
         time_s=freeze(arrays["time_s"]),
@@ -205,7 +216,7 @@ def _frame_row(frame: FrameReport, cables: Sequence[str], chambers: Sequence[str
 
 
 def _notes(run: Run) -> dict[int, str]:
-    """Return what frames.csv adds to a frame, by its number."""
+    """Return the notes of frames.csv by frame number."""
     notes: dict[int, list[str]] = {}
     for contact in undetermined(run.contacts):
         notes.setdefault(contact.frame, []).append(undetermined_text(contact.force_n, contact.std_n))

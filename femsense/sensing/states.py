@@ -1,4 +1,4 @@
-"""The equilibrium of a frame under its inputs, alone or with forces at some places."""
+"""The equilibrium of a frame under its inputs, without or with contact forces."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from femsense.sensing.touches import nodal_forces
 from femsense.sensing.types import Sensor, Touch
 
 EXACT, ROUGH = 1e-9, 1e-5
-"""Unbalanced force relative to all loads: of a result, and of a state on the way."""
+"""Equilibrium residual relative to all loads: of a result, and of an intermediate state."""
 
 
 def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
-    """Return the state of frame k under its inputs alone. Raises DataError.
+    """Return the predicted state of frame k: the equilibrium under its inputs without contacts. Raises DataError.
 
     Arguments:
-        start: a state near by.
-        before: tensions along the cables until now (friction).
+        start: an initial guess.
+        before: previous tensions along the cables (friction).
     """
     options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=EXACT)
     state = solve_frame(sensor.driven, k, start=start, options=options)
@@ -39,7 +39,7 @@ def loaded_state(
     *,
     exact: bool = False,
 ) -> Equilibrium | None:
-    """Return the state of frame k under its inputs and forces (m, 3) [N] at some places; None where there is none near the start."""
+    """Return the equilibrium of frame k under its inputs and contact forces (m, 3) [N]; None if none is found from the start."""
     options = SolveOptions(before=before, reuse_factor=True, relative_tolerance=EXACT if exact else ROUGH, rough=not exact)
     loads = nodal_forces(touches, forces, len(start.positions)) if len(touches) else None
     state = solve_frame(sensor.driven, k, start=start, nodal_forces=loads, options=options)

@@ -1,4 +1,4 @@
-"""The status of a frame: an enum with a text; the posterior check that sets it."""
+"""The status of a frame, and the posterior check that sets it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond their law, and mostly beyond their mesh:
 under a plate on a soft dome elements fall to 0 and the force is half of the true one; on bars and arms the least is 0.91."""
 MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
-"""Markers disagree with the cloud where they are off by more than so many times the residual of the calibration, and this share of the diagonal."""
+"""Markers and cloud disagree if their distance exceeds this multiple of the calibration residual, and this share of the diagonal."""
 MARKERS_MISFIT = 9.0
-"""Mean square of the whitened residuals of markers above which a frame is not explained: three standard deviations everywhere."""
+"""Maximum mean square of the whitened residuals of markers: three standard deviations everywhere."""
 UNDETERMINED = 3.0
-"""A force below so many standard deviations has no determined size."""
+"""A force below this many standard deviations has no determined magnitude."""
 UNKNOWN = 0.1
-"""An object in touch whose force is known no better than this may hide a touch [N]."""
+"""A latent force with a larger standard deviation can hide a contact [N]."""
 OVERLAP = 3.0
-"""Objects overlap the body by more than so many standard deviations of their gap."""
+"""Objects overlap the body if their gap is negative by more than this many standard deviations."""
 
 
 class Status(Enum):
-    """What a frame's result is worth; the value is the text, with its numbers."""
+    """The status of a frame; the value is its text, with placeholders for numbers."""
 
     OK = "ok"
     PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
@@ -61,7 +61,7 @@ class Status(Enum):
 
 
 TRUSTED = (Status.OK, Status.SEEN_ELSEWHERE, Status.UNDETERMINED, Status.MAY_TOUCH)
-"""Frames from which the next one starts."""
+"""Statuses with which a frame is the warm start of the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Verdict:
 
     @property
     def trusted(self) -> bool:
-        """Whether the next frame may start from this one."""
+        """Whether the frame may be the warm start of the next one."""
         return self.status in TRUSTED
 
 
@@ -148,7 +148,8 @@ def _pixels_fail(model: Model, best: Fit) -> Verdict | None:
 
 
 def std_along(best: Fit, i: int) -> float:
-    """Return the standard deviation of a force along itself [N], or along the normal where it is smaller than a thousandth of that."""
+    """Return the standard deviation of a force along its direction [N]; along the normal if the force is smaller than a thousandth of
+    that."""
     force, covariance = best.forces[i], best.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
     normal = best.axes[i][0]
     across = float(np.sqrt(normal @ covariance @ normal))
@@ -158,11 +159,11 @@ def std_along(best: Fit, i: int) -> float:
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:
-    """Return the least principal stretch of the elements that have one of some nodes [1]; negative where one is inside out, 1 without nodes.
+    """Return the smallest principal stretch of the elements that contain some nodes [1]; negative if one is inverted, 1 without nodes.
 
     Arguments:
         mesh: at rest.
-        positions: of its nodes [m], shape (n, 3).
+        positions: positions of its nodes [m], shape (n, 3).
         carrying: nodes that carry contacts, shape (k,).
     """
     tets = mesh.tets[np.isin(mesh.tets, carrying).any(axis=1), :4]

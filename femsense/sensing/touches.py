@@ -1,4 +1,4 @@
-"""Where a force may act: its contact patch, its normal, its friction cone, and the nodal forces it stands for."""
+"""A possible contact: its patch, its normal, its friction cone, and the nodal forces of its force."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from femsense.model.contact_patch import ContactPatch, closest_surface_point, pa
 from femsense.sensing.types import Sensor, Touch
 
 PATCH = 0.455
-"""Radius over which a point force is spread, in edges of elements. A linear element's shape functions are an edge wide themselves: a patch as wide
-as the edge would press on the faces beside the one that is touched."""
+"""Radius over which a point force is spread, in edges of elements. The shape functions of a linear element are an edge wide themselves:
+with a patch as wide as an edge, the force would also act on the neighbouring faces."""
 DENT = 0.035
-"""Markers do not show over what area a force acts at a given place: it is spread over so much of the body's diagonal, so that a marker beside it
-does not feel a dent that is not there (the beam of the beam study: 1 mm at the marker on its upper edge)."""
+"""Radius of the patch of a given contact with markers only, relative to the body's diagonal. Markers do not show the area of a contact, and
+a small patch would move a neighbouring marker by a dent that does not exist (1 mm at the upper marker of the beam of the beam study)."""
 ALIKE = 0.05
-"""Patches whose radii differ by less than this share are alike: any other value changes forces by 0.1 % (docs/appendix/forces-before-0.2.md)."""
+"""Patches with radii that differ by less than this share are equal. Other values change forces by 0.1 %
+(docs/appendix/forces-before-0.2.md)."""
 
 
 def make_touch(
@@ -33,7 +34,7 @@ def make_touch(
     radius: float = np.inf,
     spread: float = 0.0,
 ) -> Touch:
-    """Return a touch at the point of the surface at rest that is closest to a place at rest [m], shape (3,)."""
+    """Return a contact at the surface point closest to a given point, both at rest [m], shape (3,)."""
     nodes = sensor.robot.body.mesh.nodes
     at = closest_surface_point(sensor.surface, nodes, place, facing=normal)
     patch = _patch(sensor, at, normal, spread)
@@ -48,14 +49,14 @@ def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None, spread:
 
 
 def _radius(sensor: Sensor) -> float:
-    """Return the least radius of a patch [m]."""
-    halved = sensor.robot.body.mesh.is_quadratic  # the surface halves edges of quadratic elements
+    """Return the minimum radius of a patch [m]."""
+    halved = sensor.robot.body.mesh.is_quadratic  # the edges of the surface are half those of quadratic elements
     edge = sensor.surface.edge * (2.0 if halved else 1.0)
     return PATCH * edge if sensor.recording.has_clouds else max(PATCH * edge, DENT * sensor.size)
 
 
 def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
-    """Return a touch with the patch that its object makes under a force [N], shape (3,), where that is wider than what the mesh can tell from a point."""
+    """Return a contact with the patch of its object under a force [N], shape (3,), if that is larger than the resolution of the mesh."""
     if touch.source != "cloud" or not np.isfinite(touch.object_radius_m):
         return touch
     spread = contact_radius(sensor, touch.object_radius_m, float(np.linalg.norm(force)))
@@ -66,7 +67,7 @@ def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
 
 
 def contact_radius(sensor: Sensor, radius: float, force: float) -> float:
-    """Return the radius of the patch of a rigid ball [m] by Hertz: a³ = 3 F R (1 − ν²) / (4 E), half an edge where R is not known."""
+    """Return the radius of the patch of a rigid ball [m] by Hertz: a³ = 3 F R (1 − ν²) / (4 E), half an edge if R is unknown."""
     material = sensor.robot.body.material
     if not np.isfinite(radius):
         return 0.5 * sensor.surface.edge
@@ -75,39 +76,39 @@ def contact_radius(sensor: Sensor, radius: float, force: float) -> float:
 
 
 def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray:
-    """Return the outward unit normal of the deformed surface at a touch, shape (3,)."""
+    """Return the outward unit normal of the deformed surface at a contact, shape (3,)."""
     mean = touch.patch.mean(vertex_normals(state.positions, sensor.surface.triangles))
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
 def tangents_of(normal: FloatArray) -> FloatArray:
-    """Return two unit vectors across a normal, shape (2, 3)."""
+    """Return two orthonormal tangents, shape (2, 3)."""
     return np.asarray(np.linalg.svd(normal[None])[2][1:])
 
 
 def ways_of(touch: Touch) -> tuple[FloatArray, FloatArray]:
-    """Return two unit vectors along the surface at rest, shape (2, 3), and how well the place is known along each [m], shape (2,)."""
+    """Return two tangents of the surface at rest, shape (2, 3), and the prior σ of the contact point along each [m], shape (2,)."""
     along = touch.line - touch.normal * (touch.line @ touch.normal)
     size = float(np.linalg.norm(along))
-    if size < 0.1:  # no line, or one that goes into the body where the place has moved to
+    if size < 0.1:  # no line, or one that points into the body at the new contact point
         return tangents_of(touch.normal), np.full(2, touch.std_m)
     stds = np.array([touch.std_m, touch.across_m]) if touch.std_m > 0 else np.zeros(2)
     return np.stack([along / size, np.cross(touch.normal, along / size)]), stds
 
 
 def moved_to(sensor: Sensor, touch: Touch, place: FloatArray) -> Touch:
-    """Return a touch at the point of the surface at rest closest to another place [m], shape (3,); what is expected of it stays."""
+    """Return the contact moved to the surface point closest to another point at rest [m], shape (3,); its prior is kept."""
     there = make_touch(sensor, place, source=touch.source, spread=touch.spread_m)
     return replace(touch, place=there.place, normal=there.normal, patch=there.patch)
 
 
 def nodal_forces(touches: Sequence[Touch], forces: FloatArray, nodes: int) -> FloatArray:
-    """Return the forces on so many nodes that forces (m, 3) at some touches stand for [N], shape (nodes, 3)."""
+    """Return the nodal forces of contact forces (m, 3) [N], shape (nodes, 3)."""
     return np.asarray(sum((t.patch.spread(f, nodes) for t, f in zip(touches, forces)), np.zeros((nodes, 3))))
 
 
 def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, force: FloatArray) -> FloatArray:
-    """Return how nodal forces change when the place moves along a tangent, per metre [N/m], shape (n, 3)."""
+    """Return the derivative of the nodal forces by the contact point along a tangent [N/m], shape (n, 3)."""
     n, step = len(sensor.robot.body.mesh.nodes), 0.5 * sensor.surface.edge
     if touch.std_m == 0 or not force.any():
         return np.zeros((n, 3))

@@ -1,4 +1,4 @@
-"""Contacts of a frame, who they were in the frame before, and their forces averaged over time."""
+"""Contacts of a frame, their identity over frames (tracks), and their forces averaged over time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from femsense.sensing.touches import contact_radius, touch_normal
 from femsense.sensing.types import ContactForce, SensedFrame, Sensor, Touch
 
 SAME = 0.15
-"""A contact nearer than this share of the body's diagonal to one of the frame before is the same one: it slid."""
+"""A contact closer than this share of the body's diagonal to one of the previous frame is the same: it slid."""
 
 
 def contacts_of(
@@ -26,13 +26,13 @@ def contacts_of(
     state: Equilibrium,
     previous: SensedFrame | None,
 ) -> tuple[ContactForce, ...]:
-    """Return the contacts of frame k; those that begin a track have track −1, those at given places the number of their place.
+    """Return the contacts of frame k. New ones have track −1, those at given contact points the number of that point.
 
     Arguments:
         forces: [N], shape (m, 3).
-        covariances: of each force [N²], shape (3, 3).
-        place_covariances: of each place [m²], shape (3, 3).
-        state: with the forces.
+        covariances: covariance of each force [N²], shape (3, 3).
+        place_covariances: covariance of each contact point [m²], shape (3, 3).
+        state: the equilibrium under the forces.
     """
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     found: list[ContactForce] = []
@@ -60,31 +60,32 @@ def contacts_of(
 
 
 def place_of(sensor: Sensor, touch: Touch) -> int:
-    """Return which of the given places a touch is at."""
+    """Return which of the given contact points a contact is at."""
     return int(np.linalg.norm(sensor.places - touch.place, axis=1).argmin())
 
 
 def size_std(force: FloatArray, covariance: FloatArray) -> float:
-    """Return the root mean square by which the size of a force may be off [N], to second order in its components.
+    """Return the root mean square error of the magnitude of a force [N], to second order in its components.
 
-    Its variance along the force, and what the components across add: one that the shape hardly shows shrinks to zero in the fit, so that it
-    can only make the force larger. With C across and f the size: (2 tr C² + (tr C)²) / 4f².
+    With the variance σ² along the force, the covariance C across it and the magnitude f: σ² + (2 tr C² + (tr C)²) / 4f². The second term matters
+    because a poorly determined transverse component shrinks to zero in the fit and can only increase the magnitude.
 
     Arguments:
-        force: [N], shape (3,), not zero.
-        covariance: of its components [N²], shape (3, 3).
+        force: the force [N], shape (3,), not zero.
+        covariance: covariance of its components [N²], shape (3, 3).
     """
     size = float(np.linalg.norm(force))
     along = force / size
     project = np.eye(3) - np.outer(along, along)
     across = project @ covariance @ project
     second = (2.0 * float((across**2).sum()) + float(np.trace(across)) ** 2) / (4.0 * size**2)
-    second = min(second, float(np.trace(across)))  # a force that is little beside its deviation: no more than that
+    second = min(second, float(np.trace(across)))  # limit for forces that are small relative to their standard deviation
     return float(np.sqrt(max(float(along @ covariance @ along), 0.0) + second))
 
 
 def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[ContactForce]:
-    """Return contacts whose forces are averaged over their track (first order, lagging by the time constant) [s]; 0 leaves them as they are."""
+    """Return the contacts with forces averaged over their track by a first-order low-pass filter with this time constant [s]; 0:
+    unchanged."""
     if time_constant_s <= 0.0:
         return list(contacts)
     last: dict[int, ContactForce] = {}
@@ -101,7 +102,7 @@ def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[C
 
 
 def tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach: float) -> list[ContactForce]:
-    """Return contacts with the tracks of the nearest ones of the frame before, each taken once."""
+    """Return the contacts with the tracks of the nearest ones of the previous frame; each track is used once."""
     pairs = sorted(
         (float(np.linalg.norm(c.position_m - b.position_m)), i, j) for i, c in enumerate(contacts) for j, b in enumerate(before)
     )

@@ -1,4 +1,4 @@
-"""What sensing takes and returns."""
+"""Types of force sensing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from femsense.sensing.options import SensingOptions
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ContactForce:
-    """One contact in one frame, robot frame."""
+    """A contact in one frame of a recording: contact point, force, and their standard deviations, in the robot's coordinate system."""
 
     frame: int
     """Number of the frame as in frames.csv."""
@@ -36,40 +36,40 @@ class ContactForce:
     contact: int
     """Number of the contact in its frame, from 0."""
     position_m: FloatArray
-    """Place on the deformed body, shape (3,)."""
+    """Contact point on the deformed body [m], shape (3,)."""
     normal: FloatArray
-    """Outward unit normal there, shape (3,)."""
+    """Outward unit normal of the body there, shape (3,)."""
     force_n_xyz: FloatArray
     """Force on the body [N], shape (3,)."""
     force_n: float
-    """Its size [N]."""
+    """Magnitude of the force [N]."""
     std_n: float
-    """By how much its size may be off, one standard deviation; what is not known across the force counts to second order [N]."""
+    """Standard deviation of the magnitude [N]: that along the force, and to second order that across it."""
     source: str
-    """"cloud", "shape" or "given"."""
+    """"cloud": visible contact, its object was observed; "shape": inferred from the deformation alone; "given": at a point of `at`."""
     track: int = 0
-    """Its identity over the frames."""
+    """Identity of the contact over the frames."""
     position_std_m: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """One standard deviation of its place along each axis [m], shape (3,)."""
+    """Standard deviation of the contact point along each axis [m], shape (3,)."""
     radius_m: float = 0.0
-    """Radius of its patch [m]."""
+    """Radius of the contact patch [m]."""
     force_std_n_xyz: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """One standard deviation of each component of the force [N], shape (3,)."""
+    """Standard deviation of each component of the force [N], shape (3,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameReport:
-    """What became of one frame."""
+    """Status, residuals and times of one frame."""
 
     frame: int
     time_s: float
     status: str
-    """"ok", or what is wrong with the result or why there is none."""
-    contacts: int  # whose force is more than noise may make
+    """"ok", or the reason why the result is not to be trusted or missing (docs/guides/statuses.md)."""
+    contacts: int  # number of contacts with a significant force
     matched: int
-    """Points or markers that were used."""
+    """Number of pixels or markers used."""
     rms_before_m: float
-    """Residual of the model without contact forces: normal distance for clouds, 3-D for markers."""
+    """Residual of the model without contact forces [m]: along the normal for clouds, in 3-D for markers."""
     rms_after_m: float
     ms: float
     tension_n: dict[str, float]
@@ -80,7 +80,7 @@ class FrameReport:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class States:
-    """The deformed body over the frames."""
+    """The deformed body in each frame."""
 
     time_s: FloatArray
     """shape (F,)."""
@@ -93,21 +93,24 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class LoadComparison:
-    """A declared load beside the force that was sensed at its place."""
+    """A declared load and the force estimated at its point."""
 
     frame: int
     """Its number."""
     declared_n: float
-    """Size of the sum of what acts there [N]."""
+    """Magnitude of the declared resultant [N]."""
     sensed_n: float
-    """Size of the sum of the forces that were sensed [N]."""
+    """Magnitude of the estimated resultant [N]."""
     error_percent: float
-    """By how much the sensed one is larger [%]."""
+    """Relative error of the estimate [%]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Run:
-    """The result of `estimate`."""
+    """The result of `estimate`: contacts, status of each frame, and deformed states.
+
+    `forces` and `positions` are arrays over frames and contacts; `to_dataframe`, `plot` and `show` serve notebooks.
+    """
 
     contacts: tuple[ContactForce, ...]
     frames: tuple[FrameReport, ...]
@@ -115,19 +118,19 @@ class Run:
     robot: Robot
     recording_folder: Path | None
     known_loads: tuple[LoadComparison, ...] = ()
-    """Declared loads at the given places beside what was sensed."""
+    """Declared loads at the given contact points, and their estimates."""
 
     def __repr__(self) -> str:
         return run_arrays.describe_run(self)
 
     @property
     def forces(self) -> FloatArray:
-        """Forces [N], shape (frames, contacts, 3); nan where a contact is not there."""
+        """Forces [N], shape (frames, contacts, 3); nan in frames without the contact."""
         return run_arrays.forces_of(self)
 
     @property
     def positions(self) -> FloatArray:
-        """Their places on the deformed body [m], shape (frames, contacts, 3); nan where a contact is not there."""
+        """Contact points on the deformed body [m], shape (frames, contacts, 3); nan in frames without the contact."""
         return run_arrays.positions_of(self)
 
     def to_dataframe(self) -> Any:
@@ -139,7 +142,7 @@ class Run:
         return femsense.plot_run(self)
 
     def show(self, *, height: int = 480) -> Any:
-        """Return the viewer's page in a frame of so many pixels, for a notebook. Raises MissingDependency."""
+        """Return the viewer's page for a notebook, `height` pixels high. Raises MissingDependency."""
         return femsense.show_run(self, height=height)
 
 
@@ -153,40 +156,40 @@ class Case(Enum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Touch:
-    """A place where a force may act, and what is known of it before the shape is asked."""
+    """A possible contact, with its prior."""
 
     place: FloatArray
-    """On the surface at rest [m], shape (3,)."""
+    """Contact point on the surface at rest [m], shape (3,)."""
     normal: FloatArray
     """Outward unit normal of the surface at rest there, shape (3,)."""
     patch: ContactPatch
-    """What carries the force."""
+    """Contact patch: the weights of the nodes that carry the force."""
     expected: FloatArray
-    """Where it is expected, on the surface at rest [m], shape (3,)."""
+    """Prior mean of the contact point, on the surface at rest [m], shape (3,)."""
     std_m: float
-    """How well that is known along the surface [m]; 0: exactly."""
+    """Prior standard deviation along the surface [m]; 0: fixed."""
     source: str  # "cloud", "shape" or "given"
-    object_radius_m: float = np.inf  # of curvature [m]; inf: flat or not known
-    spread_m: float = 0.0  # radius of the zone where it touches, if that is wider than what the mesh can tell from a point [m]
+    object_radius_m: float = np.inf  # radius of curvature [m]; inf: flat or unknown
+    spread_m: float = 0.0  # radius of the contact zone, if larger than the resolution of the mesh [m]
     line: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """Unit vector at rest along which alone it is known no better than that, as along a rod; zero: all ways alike."""
-    across_m: float = 0.0  # how well it is known across the line [m]
-    pulls: bool = False  # whether a weight hangs there, as on a thread: along gravity, not about the normal
-    undetermined: bool = False  # an object in touch whose force the data do not determine
-    shape: Shape | None = None  # the rigid object that touches there, where one is seen or declared
+    """Direction at rest to which `std_m` applies, such as the axis of a rod, unit vector; zero: to all tangential directions."""
+    across_m: float = 0.0  # prior standard deviation across the line [m]
+    pulls: bool = False  # whether it is a hanging weight, with a force along gravity
+    undetermined: bool = False  # a touching object whose force the data do not determine
+    shape: Shape | None = None  # the touching rigid object, if one is observed or declared
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SensedFrame:
-    """One frame, sensed, as the next one starts from it."""
+    """The result of one frame, from which the next one starts."""
 
     touches: tuple[Touch, ...]
     state: Equilibrium
-    """With the forces."""
+    """Equilibrium under the forces."""
     forces: FloatArray
     """[N], shape (m, 3)."""
     free_state: Equilibrium
-    """Under the inputs alone."""
+    """Equilibrium under the inputs without contacts (the predicted state)."""
     report: FrameReport
     contacts: tuple[ContactForce, ...]
     tau: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -194,40 +197,40 @@ class SensedFrame:
     trusted: bool = True
     """Whether the next frame may start from this one."""
     objects: tuple[Shape, ...] = ()
-    """What was seen near the body: a ball keeps its radius."""
+    """Observed objects near the body, so that a ball keeps its radius."""
 
 
 @dataclass(eq=False, slots=True)
 class Done:
-    """The frames of a recording that are sensed so far."""
+    """The completed frames of a recording."""
 
     reports: list[FrameReport] = field(default_factory=list)
     contacts: list[ContactForce] = field(default_factory=list)
     states: list[FloatArray] = field(default_factory=list)
-    """Node positions [m], shape (n, 3), one array a frame."""
+    """Node positions of each frame [m], shape (n, 3)."""
     last: SensedFrame | None = None
-    """The last frame that gave a result to start from."""
+    """The warm start of the next frame."""
     tracks: int = 0
-    """Contacts distinguished so far."""
+    """Number of tracks so far."""
     answered_at: Equilibrium | None = None
-    """The state near which the answers at the candidates were computed: an estimate that was stopped goes on with the same."""
+    """The state at which the compliance at the candidates was computed, so that a resumed estimate uses the same."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Knowledge:
-    """Noise of the cameras, and the errors that neighbouring pixels share."""
+    """Noise of the cameras, and correlated errors of neighbouring pixels."""
 
     noises: tuple[CameraNoise, ...]
-    """One a camera."""
+    """Noise of each camera."""
     bias_m: float
-    """Size of the shared error that does not depend on motion (camera) [m]."""
+    """Standard deviation of the error field of the camera [m]."""
     model_share: float
-    """Size of the shared error relative to the way from rest (model) [1]."""
+    """Standard deviation of the error field of the model, relative to the displacement [1]."""
     together: float = 1.0
-    """T: how many pixels count as one, since neighbours err together."""
+    """T: number of correlated pixels that count as one independent measurement."""
 
     def depth_std(self, depth: FloatArray, view: IntArray) -> FloatArray:
-        """Return the noise of points at some depths (k,) [m], each of its camera (k,), shape (k,) [m]."""
+        """Return the noise of points [m], shape (k,), from their depths [m] and cameras, shape (k,)."""
         std = np.empty(len(depth))
         for v, noise in enumerate(self.noises):
             std[view == v] = noise.std(depth[view == v])
@@ -236,7 +239,7 @@ class Knowledge:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensor:
-    """Everything that stays the same from frame to frame."""
+    """The constants of a recording."""
 
     robot: Robot
     recording: Recording
@@ -245,24 +248,24 @@ class Sensor:
     surface: BodySurface
     options: SensingOptions
     places: FloatArray
-    """Given places of contact at rest [m], shape (g, 3)."""
+    """Given contact points at rest [m], shape (g, 3)."""
     touchable: IntArray
-    """Triangles of the surface that are not on the clamp, where a holder always touches, shape (t,)."""
+    """Triangles of the surface outside the clamp, which a holder always touches, shape (t,)."""
     candidates: IntArray
-    """Surface nodes at which hidden contacts are searched, shape (c,)."""
+    """Surface nodes at which inferred contacts are searched, shape (c,)."""
     pivot: FloatArray
-    """Point about which pose steps turn [m], shape (3,)."""
+    """Point about which pose steps rotate [m], shape (3,)."""
     size: float
     """Diagonal of the body at rest [m]."""
     error_field: ErrorField
-    """Over the surface of the body."""
+    """Error field over the surface of the body."""
     knowledge: Knowledge
     correction_std: FloatArray
     """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""
     scenery: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """Where something seems to touch in a free frame, on the body at rest [m], shape (s, 3)."""
+    """Points at rest where an object appears to touch in a contact-free frame [m], shape (s, 3)."""
     overlapping: tuple[Shape, ...] = ()
-    """Completed objects that overlap the body in a free frame: a floor that is said to pass through it."""
+    """Completed objects that overlap the body in a contact-free frame, such as a floor that passes through it."""
     passing: tuple[Shape, ...] = ()
     """Plates among them through which the body reaches by more than an edge: these do not say where they touch."""
     background: LocalPlanes | None = None  # None: no cloud of a free frame shows enough of it

@@ -159,6 +159,12 @@ def make_armature(rest_points: npt.ArrayLike, options: ArmatureOptions | None = 
 
     Raises:
         InputError: fewer than two points, neighbours that coincide, arc lengths beyond the chain, an impossible normal.
+
+    Example:
+        >>> chain = np.c_[np.linspace(0.0, 0.1, 6), np.zeros((6, 2))]  # m
+        >>> armature = fs.make_armature(chain)
+        >>> armature(chain).T_robot_bone.shape
+        (8, 4, 4)
     """
     options = options or ArmatureOptions()
     x = as_points(rest_points, "rest_points")

@@ -74,6 +74,15 @@ def export_glb(
 
     Raises:
         InputError: another suffix, a foreign file at that path, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
+
+    Example:
+        >>> import tempfile
+        >>> robot = fs.load_robot("finger")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
+        >>> report = fs.export_glb(run, tempfile.mkdtemp() + "/finger.glb", bones=8)
+        >>> report.bones, report.frames
+        (8, 12)
     """
     target = Path(path).expanduser()
     if target.suffix.lower() not in ENDINGS:

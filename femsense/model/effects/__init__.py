@@ -66,7 +66,15 @@ OF_BODY: tuple[str, ...] = tuple(name for name in CALIBRATED if name not in OF_I
 
 
 def find_effect(name: str) -> Effect:
-    """Return the effect of a name. Raises InputError."""
+    """Return the built-in effect with this name.
+
+    Raises:
+        InputError: no effect has this name; the most similar name is suggested.
+
+    Example:
+        >>> fs.find_effect("cable_friction").lacks
+        'loss where a cable bends or rubs; depends on the direction of motion'
+    """
     for effect in EFFECTS:
         if effect.name == name:
             return effect
@@ -81,7 +89,20 @@ def find_effect(name: str) -> Effect:
 
 
 def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
-    """Return the robot with the effects of `[[effects]]`, one after the other. Raises InputError."""
+    """Return a robot with effects added, in the order given.
+
+    Arguments:
+        robot: the robot; it does not change.
+        entries: tables as under `[[effects]]` of robot.toml: `name` and the parameters of the effect (docs/effects).
+
+    Raises:
+        InputError: an unknown effect or parameter, or a value out of its bounds.
+
+    Example:
+        >>> soft = fs.apply_effects(fs.load_robot("finger"), [{"name": "stiffness", "scale": 0.8}])
+        >>> round(float(soft.body.material.young_modulus.max()) / 1e6, 2)  # MPa; 1.2 as declared
+        0.96
+    """
     for entry in entries:
         rest = {key: value for key, value in entry.items() if key != "name"}
         effect = find_effect(str(entry.get("name"))) if "file" not in entry else _own(entry, robot)

@@ -1,1 +1,1 @@
-"""The published method, as a baseline to compare with: its matching, its contact detection, one linear step."""
+"""The published method as a baseline: its contact detection, its matching, and one linear step per frame."""

@@ -1,4 +1,4 @@
-"""Where something touches the robot.
+"""Contact detection by distance between robot points and surrounding points.
 
 Source: "Calibration and force sensing with an RGB-D camera", section V.A.3–4, Algorithm 2.
 """
@@ -18,14 +18,14 @@ from femsense.pointcloud.objects import euclidean_clusters
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Contacts:
-    """Places of contact, the one with the most points first."""
+    """Contact points, in order of decreasing number of points."""
 
     positions: FloatArray
     """Mean of each group of contact points [m], shape [k, 3]."""
     counts: IntArray
-    """Surrounding points in each group, shape [k]."""
+    """Number of surrounding points in each group, shape [k]."""
     radius: FloatArray
-    """Root mean square distance of a group's points from their mean [m], shape [k]: the size of the patch."""
+    """Root mean square distance of a group's points from their mean: the size of the contact patch [m], shape [k]."""
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -40,20 +40,20 @@ def detect_contacts(
     cluster_distance_m: float,
     min_points: int = 1,
 ) -> Contacts:
-    """Return the places where surrounding points come close to the robot (Algorithm 2).
+    """Return the contact points of a frame (Algorithm 2).
 
-    A surrounding point is a contact point where at least min_neighbors robot points lie within search_radius_m;
-    contact points closer than cluster_distance_m to each other form a group; a group's mean is a place of contact.
+    A surrounding point touches if at least min_neighbors robot points lie within search_radius_m of it. Touching points that are closer to
+    each other than cluster_distance_m form a group, and the mean of a group is a contact point.
 
     Arguments:
-        surroundings: points of everything but the robot [m], shape (m, 3).
+        surroundings: points that do not belong to the robot [m], shape (m, 3).
         robot: points of the robot [m], shape (r, 3).
-        search_radius_m: [m]; above the spacing of the points and the noise.
-        min_neighbors: robot points that make a contact, at least 1.
-        cluster_distance_m: gap that parts two contacts [m].
-        min_points: contact points of the smallest group.
+        search_radius_m: [m]; larger than the spacing of the points and the noise.
+        min_neighbors: minimum number of robot points, at least 1.
+        cluster_distance_m: minimum distance between two groups [m].
+        min_points: minimum number of points of a group.
     Returns:
-        Contacts, ordered by falling count, then by x, y, z; empty where nothing touches.
+        the contacts, ordered by decreasing count, then by x, y, z; empty if there is none.
     Raises:
         InputError: wrong shapes, or numbers that are not positive.
     """
@@ -66,11 +66,11 @@ def detect_contacts(
 
 
 def map_to_features(positions: npt.ArrayLike, feature_points: npt.ArrayLike) -> IntArray:
-    """Return the index of the feature point that is closest to each position, shape (k,).
+    """Return the index of the closest feature point of each position, shape (k,).
 
     Arguments:
-        positions: places of contact [m], shape (k, 3).
-        feature_points: [m], shape (e, 3); of two at the same distance the first is taken.
+        positions: contact points [m], shape (k, 3).
+        feature_points: feature points of the robot [m], shape (e, 3); the first one wins a tie.
     Raises:
         InputError: wrong shapes, or no feature points.
     """

@@ -1,9 +1,9 @@
 # mypy: allow-untyped-decorators
-"""Where the observed surface crosses the normal of each feature point.
+"""Matching of feature points to the observed surface along their normals.
 
-Source: "Calibration and force sensing with an RGB-D camera", section V.A.5, Algorithm 3. Beyond it:
-points are restricted to ±d_l along the normal before the nearest one is chosen, hidden sides are left out,
-and a local fit averages the camera's noise and says how far it can be trusted.
+Source: "Calibration and force sensing with an RGB-D camera", section V.A.5, Algorithm 3. In addition to it, points farther than d_l along
+the normal are excluded before the nearest one is chosen, features that face away from the camera are excluded, and a local fit averages the
+noise of the camera and gives its standard deviation.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ _PRIOR_DOF = 4.0  # weight of the scatter that all features share, in degrees of
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Matches:
-    """One row per feature point; rows that were not found hold NaN (line_distance: inf) and point −1."""
+    """One row per feature point. Unmatched rows are NaN (line_distance: inf), with point −1."""
 
     found: BoolArray
     """Whether the observed surface crosses the feature's normal, shape [e]."""
     distance: FloatArray
     """Signed distance of that crossing from the feature along the normal, outwards > 0 [m], shape [e]."""
     std: FloatArray
-    """Standard deviation of distance [m], shape [e]; inf where too few points were there to tell."""
+    """Standard deviation of distance [m], shape [e]; inf if there were too few points to estimate it."""
     line_distance: FloatArray
     """Distance of the nearest point from the normal line [m], shape [e]."""
     point: IntArray
     """Index of that nearest point, shape [e]."""
     count: IntArray
-    """Points that the distance rests on, shape [e]."""
+    """Number of points used for the distance, shape [e]."""
     hidden: BoolArray
     """Features that face away from every camera, shape [e]."""
 
@@ -48,17 +48,17 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class MatchingOptions:
-    """How a match is made of its candidates."""
+    """How a match is computed from its candidates."""
 
     average: bool = False
-    """Use the local fit in place of the nearest point."""
+    """Use the local fit instead of the nearest point."""
     order: int = 2
-    """Of the fit: 2 follows the curvature of the body, 1 is quieter but off by about d_m²/(4 · radius of curvature).
+    """Of the fit: 2 follows the curvature of the body; 1 has less variance and a bias of about d_m²/(4 · radius of curvature).
     Fewer than 10 (order 2) or 5 (order 1) candidates lower it."""
     min_facing: float = 0.15
     """Smallest cosine between a normal and the direction to a camera [1]; below it the feature is hidden."""
     std_floor_m: float = 0.0
-    """What averaging cannot remove (correlated noise, calibration) [m]; added to every std in squares."""
+    """Error that averaging does not reduce (correlated noise, calibration) [m]; added to each std in quadrature."""
 
 
 def match_along_normals(
@@ -80,23 +80,23 @@ def match_along_normals(
 
         offset(u, v) = c₀ + c₁ u + c₂ v + c₃ u² + c₄ u v + c₅ v²        (order 2; the first 3 terms for order 1, c₀ for 0)
 
-    after points far from the nearest layer are set aside. With `average` the distance is c₀, the value on the line, with
+    after points far from the nearest layer are excluded. With `average` the distance is c₀, the value on the line, with
     std² = s² (AᵀA)⁻¹₀₀; without, it is the offset of the nearest point, with std² = s² + (slope · line_distance)².
-    The scatter s is that of the feature's own residuals, drawn to the median of all features with the weight of four points.
+    The scatter s is that of the feature's residuals, shrunk towards the median of all features with the weight of four points.
 
     Arguments:
         features: predicted positions of the feature points [m], shape (e, 3).
-        normals: their outward normals, shape (e, 3); made unit here.
+        normals: their outward normals, shape (e, 3); need not be unit vectors.
         robot_points: observed points of the robot [m], shape (r, 3).
-        d_m: largest distance from the normal line [m]; farther: the feature is hidden.
-        d_l: largest distance along the normal [m]; farther: the point belongs to something else.
+        d_m: maximum distance from the normal line [m]; a feature without points within it is hidden.
+        d_l: maximum distance along the normal [m]; points farther away belong to another object.
         camera_position: of one camera [m], shape (3,), or of several, shape (c, 3).
-        view_direction: instead, for a camera far away: where it looks, shape (3,) or (c, 3).
-        robot_normals: normals of the robot points, shape (r, 3); points that face away from the feature's normal are left
-            out. Needed for thin bodies in clouds of several cameras.
-        options: how a match is made of its candidates.
+        view_direction: instead of camera_position, for a distant camera: its viewing direction, shape (3,) or (c, 3).
+        robot_normals: normals of the robot points, shape (r, 3); points that face away from the feature's normal are excluded. Required for
+            thin bodies in clouds of several cameras.
+        options: local fit, hidden features.
     Returns:
-        Matches.
+        the matches.
     Raises:
         InputError: wrong shapes, thresholds that are not positive, both camera_position and view_direction.
     """
@@ -117,7 +117,7 @@ def match_along_normals(
 
 
 def _facing(cloud: FloatArray, normals: npt.ArrayLike | None) -> FloatArray:
-    """Return the points' normals, (0, 3) where there are none."""
+    """Return the normals of the points, shape (0, 3) if there are none."""
     return np.zeros((0, 3)) if normals is None else surface_pair(cloud, normals, "robot_points", "robot_normals")[1]
 
 
@@ -150,7 +150,7 @@ def _sorted(grid: VoxelGrid, facing: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def _matches(raw: tuple[FloatArray, IntArray], grid: VoxelGrid, visible: BoolArray, average: bool, floor: float) -> Matches:
-    """Turn the kernel's columns into standard deviations and the frozen result."""
+    """Return the result with standard deviations computed from the columns of the kernel."""
     numbers, whole = raw
     nearest, count, fitted, terms = whole.T
     line, offset, value, slope, squares, leverage = numbers.T
@@ -171,7 +171,7 @@ def _matches(raw: tuple[FloatArray, IntArray], grid: VoxelGrid, visible: BoolArr
 
 
 def _pooled_variance(squares: FloatArray, dof: IntArray) -> FloatArray:
-    """Return the scatter² of each feature (e,) [m²] from its sum of squares, drawn to the median; inf where nothing tells."""
+    """Return the scatter² of each feature (e,) [m²] from its sum of squares, shrunk towards the median; inf if there are no residuals."""
     own = dof >= 1
     if not own.any():
         return np.full(len(squares), np.inf)
@@ -257,7 +257,7 @@ def _candidates(
 
 @njit(cache=True)
 def _nearest_to_line(local: FloatArray, index: IntArray) -> int:
-    """Return the row nearest to the line; of equals (to 1e-12) the one with the smaller |offset|."""
+    """Return the row nearest to the line; ties (to 1e-12) go to the smaller |offset|."""
     best = 0
     for i in range(1, len(index)):
         gain = (local[best, 0] ** 2 + local[best, 1] ** 2) - (local[i, 0] ** 2 + local[i, 1] ** 2)
@@ -268,7 +268,7 @@ def _nearest_to_line(local: FloatArray, index: IntArray) -> int:
 
 @njit(cache=True)
 def _layer(local: FloatArray, nearest: int, across: float) -> FloatArray:
-    """Return the rows that lie in one sheet with the nearest point: closer in offset than 2 · d_m (a slope of 60°)."""
+    """Return the rows in the same layer as the nearest point: their offsets differ by less than 2 · d_m (a slope of 60°)."""
     same = np.abs(local[:, 2] - local[nearest, 2]) <= 2.0 * across
     sheet: FloatArray = local[same]
     return sheet
@@ -278,7 +278,7 @@ def _layer(local: FloatArray, nearest: int, across: float) -> FloatArray:
 def _fit(layer: FloatArray, across: float, order: int, out: FloatArray) -> int:
     """Write value on the line, slope, sum of residual squares and leverage; return the number of terms.
 
-    Rows beyond four scatters of a first fit (by the median) are left out of a second one;
+    Rows beyond four scatters of a first fit (by the median) are excluded from a second one;
     the sum of squares is scaled to all rows.
     """
     terms = 6 if order == 2 and len(layer) >= 10 else 3 if order >= 1 and len(layer) >= 5 else 1
@@ -305,7 +305,7 @@ def _fit(layer: FloatArray, across: float, order: int, out: FloatArray) -> int:
 
 @njit(cache=True)
 def _median(values: FloatArray) -> float:
-    """Return the median (shell sort: NumPy's would take longer to compile than all else here)."""
+    """Return the median (shell sort: np.median would dominate the compile time of this module)."""
     ordered, gap = values.copy(), len(values) // 2
     while gap > 0:
         for i in range(gap, len(ordered)):

@@ -1,4 +1,4 @@
-"""The published method, as a baseline: feature points along their normals, normal forces, one linear step a frame.
+"""The published method as a baseline: feature points along their normals, normal forces, one linear step per frame.
 
 Source: "Calibration and force sensing with an RGB-D camera", section V: segmentation by colour, Algorithm 2 (contacts), Algorithm 3 (matching), equation 12.
 """
@@ -37,7 +37,7 @@ VOXEL = 0.01
 LINE, REACH = 0.03, 0.2
 """d_m and d_l of Algorithm 3: largest distances from the normal line and along it, relative to the diagonal."""
 NEIGHBORS = 3
-"""Robot points that make a contact (Algorithm 2)."""
+"""Minimum number of robot points near a contact (Algorithm 2)."""
 
 
 def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedFrame:
@@ -68,7 +68,7 @@ class _Matches:
     """Feature points found in the cloud."""
 
     at: IntArray
-    """Their nodes, shape (r,)."""
+    """Nodes of the features, shape (r,)."""
     normals: FloatArray
     """Outward, shape (r, 3)."""
     distance: FloatArray
@@ -82,7 +82,7 @@ class _Matches:
 
 
 def _segmented(sensor: Sensor, k: int, state: Equilibrium) -> tuple[PointCloud, PointCloud]:
-    """Return robot and surroundings, filtered, robot frame."""
+    """Return the filtered points of the robot and of its surroundings, robot frame."""
     parts = []
     for view, T in enumerate(sensor.calibration.poses):
         cloud = read_frame_cloud(sensor.recording, k, view=view)
@@ -128,7 +128,7 @@ def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> _Matches:
 
 
 def _touches(sensor: Sensor, robot: PointCloud, others: PointCloud, state: Equilibrium, k: int) -> list[Touch]:
-    """Return the given places, or where surroundings touch the robot (Algorithm 2)."""
+    """Return the given contact points, or those that Algorithm 2 detects."""
     if len(sensor.places):
         return [make_touch(sensor, place, source="given") for place in sensor.places]
     if sensor.recording.free is not None and sensor.recording.free[k]:
