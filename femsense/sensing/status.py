@@ -17,8 +17,8 @@ from femsense.sensing.no_penetration import OVERLAPPING
 from femsense.sensing.tracks import size_std
 
 SQUEEZED = 0.6
-"""Elements under a contact that are shorter than this share of their length are beyond their law, and mostly beyond their mesh:
-under a plate on a soft dome elements fall to 0 and the force is half of the true one; on bars and arms the least is 0.91."""
+"""Minimum principal stretch of the elements under a contact. Below it the law, and mostly the mesh, are not valid: under a plate on a soft dome
+the stretch falls to 0; on bars and arms it is at least 0.91."""
 MARKERS_OFF, MARKERS_FAR = 5.0, 0.01
 """Markers and cloud disagree if their distance exceeds this multiple of the calibration residual, and this share of the diagonal."""
 MARKERS_MISFIT = 9.0
