@@ -14,6 +14,8 @@ import numpy as np
 from femsense.calib.other_law import with_other_law
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal
+from femsense.fem.body import BodyModel
+from femsense.fem.compliance import tangent_at
 from femsense.sensing.fit import whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.types import Sensor
@@ -35,28 +37,34 @@ BETWEEN = 1.0 / np.sqrt(3.0)
 def moved_by_law(model: Model, fit: Fit) -> FloatArray:
     """Return the change of the forces under the other law, to first order [N], shape (3m,); zero if the robot declares its law.
 
-    Under the other law the same inputs and forces leave the internal forces δr(x) = r_other(x) − r(x) unbalanced, which move the body by −K⁻¹ δr(x). The
-    part that exists without contacts is in the nuisance parameters that the contact-free frames determine. One Gauss–Newton step from the optimum gives
+    Under the other law the same inputs and forces leave the internal forces δr unbalanced, which moves the body by −K⁻¹ δr. The displacement of the predicted
+    state x₀ is in the nuisance parameters that the contact-free frames determine, so that the rows change by −H (K⁻¹ δr(x) − K₀⁻¹ δr(x₀)), H their
+    derivatives with the nodes. One Gauss–Newton step from the optimum gives
 
-        δp = A⁻¹ Xᵀ W (H K⁻¹) (δr(x) − δr(x₀))
+        δp = A⁻¹ Xᵀ W H (K⁻¹ δr(x) − K₀⁻¹ δr(x₀)) .
 
-    with x₀ the predicted state, H the derivatives of the rows with the nodes, and X those with all whitened parameters p.
+    Raises:
+        FemsenseError: the predicted state is unstable.
     """
     sensor, m = model.sensor, len(fit.contacts)
-    body = sensor.robot.body
+    body, predicted = sensor.robot.body, fit.frame.predicted
     if sensor.declares_law or not m:
         return np.zeros(3 * m)
     law = "corotational" if body.material.law == "neo_hookean" else "neo_hookean"
     other = body.with_material(replace(body.material, law=law))
-    unbalanced = np.zeros_like(fit.state.positions)
-    for sign, positions in ((1.0, fit.state.positions), (-1.0, fit.frame.predicted.positions)):
-        there, here = internal(other, positions, tangent=False), internal(body, positions, tangent=False)
-        if not np.isfinite(there.energy):  # an inverted element, of which the status tells
-            return np.zeros(3 * m)
-        unbalanced += sign * (there.forces - here.forces)
-    moved = fit.rows.of(fit.linearised.tangent.respond(unbalanced[None]))[:, 0]
+    unbalanced = [_unbalanced(body, other, x) for x in (fit.state.positions, predicted.positions)]
+    if not np.isfinite(unbalanced).all():  # an element is inverted; the status tells
+        return np.zeros(3 * m)
+    displacement = fit.linearised.tangent.respond(unbalanced[0][None]) - tangent_at(body, predicted).respond(unbalanced[1][None])
+    moved = fit.rows.of(displacement)[:, 0]
     scale = whitened(model, fit, trust=False)[0]
     X = np.hstack([fit.D * scale, fit.N])
     WX = X * fit.weight[:, None]
     change = scale * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ moved)[: 5 * m]
     return np.concatenate([axes.T @ change[5 * i : 5 * i + 3] for i, axes in enumerate(fit.axes)])
+
+
+def _unbalanced(body: BodyModel, other: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return the internal forces of another body of the same mesh minus those of a body [N], shape (n, 3); not finite if an element is inverted."""
+    there = internal(other, positions, tangent=False)
+    return there.forces - internal(body, positions, tangent=False).forces + (0.0 if np.isfinite(there.energy) else np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +38,8 @@ def touched(
     nudge: np.ndarray | None = None,
     wall: bool = False,
     noise: float = NOISE,
+    inputs: np.ndarray = INPUTS,
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
 ) -> Recording:
     """Return three free frames and one with forces, on an arm of another mesh and law; red balls push where they are shown.
 
@@ -46,9 +49,11 @@ def touched(
         nudge: how the camera has moved in that frame: (rotation about the robot's origin [rad], shift [m]), shape (6,).
         wall: whether two walls stand around the arm.
         noise: of the points along their rays [m].
+        inputs: tensions of the four frames [N], shape (4, 4).
+        gravity: [m/s²].
     """
-    recording, states = record(INPUTS, noise=1e-4, forces={3: (place, force)})
-    true, rng, files = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(11), []
+    true, rng, files = arm((8, 3, 3), law="neo_hookean", gravity=gravity), np.random.default_rng(11), []
+    recording, states = record(inputs, noise=1e-4, forces={3: (place, force)}, truth=true)
     triangles = surface_triangles(true.body.mesh)
     nodes = [int(np.argmin(np.linalg.norm(true.body.mesh.nodes - one, axis=1))) for one in np.atleast_2d(place)]
     for k, x in enumerate(states):

@@ -1,0 +1,67 @@
+"""The constitutive law of the fitted states, and the deviation of forces that it causes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import arm
+from touched_arm import touched
+
+from femsense import calibrate
+from femsense.sensing.contact_free import learn
+from femsense.sensing.estimate_frame import covariances_of, estimate_frame
+from femsense.sensing.fit import fit
+from femsense.sensing.law import moved_by_law
+from femsense.sensing.model import Fit, Model
+from femsense.sensing.prepare import make_sensor
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory) -> tuple[Model, Fit]:
+    """Without gravity and tensions the law changes nothing in the frames without contact."""
+    none, force = np.zeros((4, 4)), np.array([0.0, 0.0, -0.6])
+    recording, robot = (
+        touched(tmp_path_factory.mktemp("pushed"), force, ball=True, inputs=none, gravity=np.zeros(3)),
+        arm(gravity=np.zeros(3)),
+    )
+    model = learn(make_sensor(robot, recording, calibrate(robot, recording)))
+    return model, estimate_frame(model, 3, None).best
+
+
+def with_law(model: Model, law: str) -> Model:
+    robot = model.sensor.robot
+    robot = replace(robot, body=robot.body.with_material(replace(robot.body.material, law=law)))
+    return replace(model, sensor=replace(model.sensor, robot=robot, driven=replace(model.sensor.driven, robot=robot)))
+
+
+def test_states_with_clouds_are_neo_hookean_where_no_law_is_declared(pushed):
+    model, _ = pushed
+    assert model.sensor.robot.body.material.law == "neo_hookean" and not model.sensor.declares_law
+
+
+def test_the_change_under_the_other_law_is_that_of_a_fit_with_the_other_law(pushed):
+    model, best = pushed
+    there = with_law(model, "corotational")
+    other = fit(there, best.frame, best.contacts, best.forces, best.state, tau=best.tau)
+    change, first_order = (other.forces - best.forces).ravel(), moved_by_law(model, best)
+    size, apart = (one @ np.linalg.solve(best.covariance, one) for one in (change, change - first_order))
+    assert size > 1.0 and apart < 0.3 * size
+
+
+def test_the_difference_of_the_laws_is_part_of_the_covariance(pushed):
+    model, best = pushed
+    change = moved_by_law(model, best)
+    compliance = model.compliance_std**2 * np.outer(best.forces, best.forces)
+    np.testing.assert_allclose(
+        covariances_of(model, best)[0], best.covariance + compliance + np.outer(change, change) / 3.0, rtol=1e-9
+    )
+
+
+def test_a_robot_that_declares_its_law_keeps_it(tmp_path):
+    recording = touched(tmp_path, np.array([0.0, 0.0, -0.3]), ball=True)
+    robot = arm(law="gent")
+    model = learn(make_sensor(robot, recording, calibrate(robot, recording)))
+    assert model.sensor.robot.body.material.law == "gent" and model.sensor.declares_law
+    assert not moved_by_law(model, estimate_frame(model, 3, None).best).any()
