@@ -66,6 +66,18 @@ class Tangent:
 def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = factorize) -> Tangent:
     """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`.
     Raises FemsenseError where it is unstable there."""
+    return _with_held_drives(body, equilibrium, _factor_at(body, equilibrium, solver))
+
+
+def tangent_near(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
+    """Return the linearisation of a body at an equilibrium with the last stiffness that its solution has factorised, of a state close to it; the exact one
+    where none was kept. Raises FemsenseError where it is unstable there."""
+    factor = equilibrium.factor
+    return tangent_at(body, equilibrium) if factor is None else _with_held_drives(body, equilibrium, factor)
+
+
+def _factor_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver) -> Factorization:
+    """Return the factor of the exact stiffness at an equilibrium. Raises FemsenseError where it is unstable there."""
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
@@ -73,6 +85,11 @@ def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = facto
     factor = with_turning_plate(body, equilibrium.positions, solver(body.free_map.pattern, reduced_values(body, blocks)))
     if factor is None or (factor.negative > 0 and not body.is_held()):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
+    return factor
+
+
+def _with_held_drives(body: BodyModel, equilibrium: Equilibrium, factor: Factorization) -> Tangent:
+    """Return the linearisation with a factored stiffness, in which taut held cables keep their length and held chambers their volume."""
     dofs = body.free_map.dofs
     held = np.flatnonzero(equilibrium.held)
     rows = drive_rows(body, equilibrium.positions)[held][:, dofs]

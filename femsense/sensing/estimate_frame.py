@@ -110,7 +110,7 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
         start = _carried_over(model, frame, previous)
         best = _without_contacts(model, frame) if start is None else start
         clock.lap("fit")
-        best = _with_objects_in_touch(model, _searched(model, best))
+        best = _with_objects_in_touch(model, *_searched(model, best))
     clock.lap("search")
     before = rms_of(_without_forces(best), inliers(best))
     clock.lap("rms")
@@ -153,24 +153,26 @@ def measurements(rows: Rows) -> int:
 # --- search ---------------------------------------------------------------------------------------------------------------
 
 
-def _searched(model: Model, best: Fit) -> Fit:
-    """Return the fit at which no proposal lowers J any more, after ROUNDS at most. The first proposal that lowers J is taken."""
+def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
+    """Return the fit at which no proposal lowers J any more, after ROUNDS at most, and where visible objects touch there. The first proposal that lowers J
+    is taken."""
     for _ in range(ROUNDS):
         best = _with_objects(model, best)
-        lower = next((fitted for fitted in _fits(model, best) if fitted.criterion < best.criterion - TOLERANCE), None)
+        touching = _touching(model, best)
+        lower = next((fitted for fitted in _fits(model, best, touching) if fitted.criterion < best.criterion - TOLERANCE), None)
         if lower is None:
-            break
+            return best, touching
         best = lower
-    return best
+    return best, _touching(model, best)
 
 
-def _fits(model: Model, best: Fit) -> Iterator[Fit]:
-    """Yield fits of the most promising proposals, one after the other.
+def _fits(model: Model, best: Fit, touching: Sequence[Touch]) -> Iterator[Fit]:
+    """Yield fits of the most promising proposals, one after the other; touching: where visible objects touch.
 
     Where contacts squeeze the body beyond its law, more of them would only stand in for what law and mesh lack.
     """
     most = len(best.contacts) if stretch_under_contacts(model, best) < SQUEEZED else np.inf
-    promising = [proposal for proposal in proposals(model, best, _touching(model, best)) if len(proposal.contacts) <= most]
+    promising = [proposal for proposal in proposals(model, best, touching) if len(proposal.contacts) <= most]
     for proposal in promising[:FITTED]:
         start = best.state if best.contacts and proposal.contacts else best.frame.predicted
         fitted = fit(model, best.frame, proposal.contacts, proposal.forces, start, eta=best.eta, tau=proposal.tau)
@@ -231,14 +233,14 @@ def _is_alike(model: Model, first: Shape, second: Shape) -> bool:
 # --- objects in touch whose force the data do not determine -----------------------------------------------------------------
 
 
-def _with_objects_in_touch(model: Model, best: Fit) -> Fit:
+def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
     """Return a hypothesis fitted again with the objects in touch that are no contacts of it, whatever J says.
 
     These objects have no significant force. Left out, they would bias the forces of their neighbours and make the neighbours' intervals too narrow. An object
     whose surface lies at the body's becomes a contact with a wide prior, another object a latent force. Visible contacts without a significant force get the
     wide prior, too: of two tips that squeeze a body the pixels determine the difference only, and the τ of highest evidence would make both forces zero.
     """
-    others = [t for t in _touching(model, best) if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
+    others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
     at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
     latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
     if at_surface or latent:

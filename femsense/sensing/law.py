@@ -15,7 +15,7 @@ from femsense.calib.other_law import with_other_law
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
-from femsense.fem.compliance import tangent_at
+from femsense.fem.compliance import tangent_near
 from femsense.sensing.fit import whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.types import Sensor
@@ -55,7 +55,9 @@ def moved_by_law(model: Model, fit: Fit) -> FloatArray:
     unbalanced = [_unbalanced(body, other, x) for x in (fit.state.positions, predicted.positions)]
     if not np.isfinite(unbalanced).all():  # an element is inverted; the status tells
         return np.zeros(3 * m)
-    displacement = fit.linearised.tangent.respond(unbalanced[0][None]) - tangent_at(body, predicted).respond(unbalanced[1][None])
+    displacement = fit.linearised.tangent.respond(unbalanced[0][None]) - tangent_near(body, predicted).respond(
+        unbalanced[1][None]
+    )
     moved = fit.rows.of(displacement)[:, 0]
     scale = whitened(model, fit, trust=False)[0]
     X = np.hstack([fit.D * scale, fit.N])
