@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, transform_points
 from femsense.core.units import PER_METRE
@@ -152,11 +152,6 @@ def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> li
     return [np.array([point - slack, point + slack]) for point in nodes[held]]
 
 
-def mesh_diagonal(nodes: FloatArray) -> float:
-    """Return the diagonal of the bounding box [m]."""
-    return float(np.linalg.norm(np.ptp(nodes, axis=0)))
-
-
 def likely_unit(size: float) -> str | None:
     """Return the unit that makes a body of this size, in the unit of its file, most like a robot; None where none does."""
     fits = [name for name, count in PER_METRE.items() if SMALLEST_BODY <= size / count <= LARGEST_BODY]
@@ -166,11 +161,11 @@ def likely_unit(size: float) -> str | None:
 def _empty_box(mesh: TetMesh, low: FloatArray, high: FloatArray, where: str) -> InputError:
     distance = np.linalg.norm(mesh.nodes - np.clip(mesh.nodes, low, high), axis=1)
     nearest = int(distance.argmin())
-    diagonal, size = mesh_diagonal(mesh.nodes), float(np.abs([low, high]).max())
+    whole, size = diagonal(mesh.nodes), float(np.abs([low, high]).max())
     hint = "does the box lie on another side of the body, or in the frame before T_robot_mesh?"
-    if size > 20 * diagonal:
+    if size > 20 * whole:
         hint = "box_m looks like millimetres: it is in metres"
-    elif size < 0.02 * diagonal:
+    elif size < 0.02 * whole:
         hint = "box_m is much smaller than the mesh: is mesh.unit right?"
     return InputError(
         "no node of the mesh is inside the box",
@@ -209,9 +204,9 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
         min_tension=table.min_tension_n,
         max_tension=table.max_tension_n,
     )
-    diagonal = mesh_diagonal(mesh.nodes)
+    size = diagonal(mesh.nodes)
     worst = int(cable.path.outside.argmax())
-    if cable.path.outside[worst] > FAR_CABLE * diagonal:
+    if cable.path.outside[worst] > FAR_CABLE * size:
         raise _far(
             f"point {worst} of cable {table.name!r} is far outside the body",
             at_key(path, "cables", i, "path_m"),
@@ -221,7 +216,7 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
             mesh,
         )
     away = float(np.linalg.norm(mesh.nodes - np.asarray(table.pull_point_m), axis=1).min())
-    if away > FAR_PULL_POINT * diagonal:
+    if away > FAR_PULL_POINT * size:
         raise _far(
             f"the pull point of cable {table.name!r} is far from the body",
             at_key(path, "cables", i, "pull_point_m"),
@@ -254,7 +249,7 @@ def _make_chambers(mesh: TetMesh, tables: Sequence[ChamberTable], path: Path) ->
 def _marker_points(mesh: TetMesh, markers: Sequence[MarkerTable], path: Path) -> FloatArray:
     points = freeze(np.array([marker.position_m for marker in markers], dtype=np.float64).reshape(-1, 3))
     outside = embed_points(mesh, points).outside
-    far = np.flatnonzero(outside > FAR_MARKER * mesh_diagonal(mesh.nodes))
+    far = np.flatnonzero(outside > FAR_MARKER * diagonal(mesh.nodes))
     if len(far):
         i = int(far[0])
         raise _far(
@@ -276,7 +271,6 @@ def _marker_looks(markers: Sequence[MarkerTable]) -> tuple[MarkerLook, ...]:
 
 
 def _far(what: str, where: str, point: Sequence[float], distance: float, limit: float, mesh: TetMesh) -> InputError:
-    diagonal = mesh_diagonal(mesh.nodes)
     millimetres = float(np.abs(point).max()) > 20 * float(np.abs(mesh.nodes).max())
     hint = (
         "this looks like millimetres: positions are in metres"
@@ -288,7 +282,7 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
         where=where,
         found=f"{_metres(point)}, {1e3 * distance:.4g} mm outside",
         expected=(
-            f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal:.4g} mm outside; the mesh reaches from "
+            f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal(mesh.nodes):.4g} mm outside; the mesh reaches from "
             f"{_metres(mesh.nodes.min(axis=0))} to {_metres(mesh.nodes.max(axis=0))}"
         ),
         hint=hint,

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import DataError
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, tangent_at
@@ -153,7 +153,7 @@ def force_bound(
     tangent, std = tangent_at(robot.body, state), measured.std
     N = _nuisance(robot, measured, tangent, state, unknowns) / std[:, None]
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]))
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     normal_std, tangent_std = [], []
     for start in range(0, len(nodes), BATCH):
         here = nodes[start : start + BATCH]
@@ -224,7 +224,7 @@ def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equ
     if not sum(len(p) for p in points):
         raise DataError("no camera sees the robot: check eye_m and target_m")
     scan = Scan(np.vstack(points), np.concatenate(view_of), np.zeros((0, 3)), np.zeros(0, np.int64))
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     surface = Surface(state.positions, body_surface(robot.body.mesh).triangles)
     rows = ray_rows(scan, surface, [view.T_robot_camera for view in views], noises, reach=REACH * size)
     together = np.array([neighbours(view.table.noise) for view in views])[rows.view]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
 from femsense.io.mesh_files import read_surface
@@ -72,7 +72,7 @@ def pressing(item: ObjectTable, surface: Surface, place: FloatArray, normal: Flo
         size = 0.5 * np.asarray(item.size_m)[:2]
         flat = Pressing(place, normal, x, float(np.linalg.norm(size)), 0.5 * float(size.min()), lambda xy: _face(xy, size))
         return flat
-    reach = 0.5 * float(np.linalg.norm(np.ptp(surface[0][:, :2], axis=0)))
+    reach = 0.5 * diagonal(surface[0][:, :2])
     return Pressing(place, normal, x, reach, 0.1 * reach, _lower_side(surface))
 
 

@@ -19,7 +19,7 @@ from femsense.calib.from_clouds import measured_noises
 from femsense.calib.inputs import calibrated_inputs
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, ray_rows, read_scan
-from femsense.core.arrays import BoolArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, IntArray, diagonal, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
@@ -109,7 +109,7 @@ def _cloud_rows(
     """Return the rows of the clouds of a frame, and the median standard deviation of a depth [m]."""
     scan = read_scan(robot, recording, k, calibration.poses, state.positions)
     surface = Surface(state.positions, body_surface(robot.body.mesh).triangles)
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     rows = None if scan is None else ray_rows(scan, surface, calibration.poses, noises, reach=REACH * size)
     if rows is None or not len(rows.residual):
         raise DataError(f"no point of frame {recording.frame_numbers[k]} lies on the robot at its calibrated pose")
@@ -166,7 +166,7 @@ def _places(robot: Robot, calibration: Calibration, state: Equilibrium) -> tuple
 def _seen(calibration: Calibration, state: Equilibrium, triangles: IntArray, nodes: IntArray) -> BoolArray:
     """Return which nodes a camera sees: facing it and not occluded by the body, shape (p,)."""
     normals = vertex_normals(state.positions, triangles)[nodes]
-    size = float(np.linalg.norm(np.ptp(state.positions, axis=0)))
+    size = diagonal(state.positions)
     places = state.positions[nodes] + CLEAR * normals
     surface, seen = Surface(state.positions, triangles), np.zeros(len(nodes), dtype=bool)
     for T in calibration.poses:

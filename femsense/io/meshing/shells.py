@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal
 from femsense.core.errors import InputError
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to, neighbours, place_text, winding_number
 
@@ -76,7 +76,7 @@ def _meeting(
     crossing = crossing_triangles(points, triangles)
     meets = np.zeros((len(corners),) * 2, dtype=bool)
     meets[of[crossing[:, 0]], of[crossing[:, 1]]] = True
-    near = TOUCHING * float(np.linalg.norm(np.ptp(points, axis=0)))
+    near = TOUCHING * diagonal(points)
     close = (low[:, None] <= high[None] + near).all(axis=2) & (high[:, None] >= low[None] - near).all(axis=2) & ~meets
     np.fill_diagonal(close, False)
     for j in np.flatnonzero(close.any(axis=0)):
@@ -103,7 +103,7 @@ def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list
     """Return the triangles without pieces of next to no volume. Raises InputError."""
     of = pieces(triangles)
     size = np.abs(shell_volumes(points, triangles, of))
-    if size.max() <= 1e-9 * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3:
+    if size.max() <= 1e-9 * diagonal(points) ** 3:
         raise InputError(
             "the surface encloses nothing",
             where=where,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.fem.mesh import element_volumes
 from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, Parameter, number, vector
@@ -50,7 +50,7 @@ def _region_places(robot: Robot) -> tuple[Entry, ...]:
     """Spheres around places that are spread over the surface, and around the middles of the body's parts;
     those that hold the centroid of an element."""
     mesh = robot.body.mesh
-    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    size = diagonal(mesh.nodes)
     centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
     places = [*mesh.nodes[spread_features(robot.body, 8)], *_middles(centroids, np.abs(element_volumes(mesh)), 3)]
     spheres = [(p, r * size) for p in places for r in RADII]

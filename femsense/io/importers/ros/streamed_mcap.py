@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import need
+from femsense.core.packages import needed
 
 PACKINGS = ("cdr", "ros1")
 """Encodings of messages that are read: those of ROS 2 and of ROS 1."""
@@ -72,8 +72,8 @@ class StreamedMcap:
         """Do nothing: the file is open only while its records are read."""
 
     def _records(self) -> Iterator[tuple[Connection, int, bytes]]:
-        reader = need("mcap.stream_reader", "ros", "reading MCAP files without an index")
-        exceptions = need("mcap.exceptions", "ros", "reading MCAP files without an index")
+        reader = needed("mcap.stream_reader", "ros", "reading MCAP files without an index")
+        exceptions = needed("mcap.exceptions", "ros", "reading MCAP files without an index")
         channels: dict[int, Connection] = {}
         schemas: dict[int, Any] = {}
         broken = (exceptions.McapError, struct.error, ValueError, EOFError, OSError, OverflowError, MemoryError)
@@ -94,7 +94,7 @@ class StreamedMcap:
                     raise
 
     def _types(self) -> Any:
-        typesys = need("rosbags.typesys", "ros", "reading ROS bags")
+        typesys = needed("rosbags.typesys", "ros", "reading ROS bags")
         store = typesys.get_typestore(typesys.Stores.EMPTY)
         types: dict[str, Any] = {}
         try:
