@@ -49,7 +49,7 @@ def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
         path: the .mcap file.
 
     Raises:
-        InputError: no run, another file at that place, or the package mcap-ros2-support is missing.
+        InputError: no run, or another file at that place. MissingDependency: without the extra mcap.
     """
     check_target(path, folder=False, kind=MCAP)
     run = read_run(folder)

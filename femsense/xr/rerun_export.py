@@ -40,7 +40,7 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
         path: the .rrd file.
 
     Raises:
-        InputError: no run, another file at that place, or the package rerun-sdk is missing.
+        InputError: no run, or another file at that place. MissingDependency: without the extra rerun.
     """
     check_target(path, folder=False, kind=RERUN)
     rr, run = needed("rerun", "rerun", "writing .rrd"), read_run(folder)

@@ -35,7 +35,7 @@ def write_usdz(glb: bytes, path: str | Path) -> Path:
         the path.
 
     Raises:
-        InputError: not a mesh of femsense, or the package usd-core is missing.
+        InputError: not a mesh of femsense. MissingDependency: without the extra usd.
     """
     usd = {
         name: needed(f"pxr.{name}", "usd", "writing .usdz")

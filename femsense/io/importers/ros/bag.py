@@ -134,7 +134,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a .bag, a .db3, a .mcap or a folder of ROS 2; of a file the content counts, not the ending.
 
     Raises:
-        InputError: the package rosbags is missing, or the file is none of these, is empty, cut off or not indexed.
+        InputError: the file is none of these, is empty, cut off or not indexed. MissingDependency: without rosbags.
     """
     if path.is_file() and not path.stat().st_size:
         raise InputError("an empty file", where=path, found="0 bytes", expected="a ROS bag")
@@ -164,7 +164,7 @@ def _reader(path: Path, named: Path) -> Any:
 
 
 def _opened(files: Sequence[Path]) -> Any:
-    """Return a reader of rosbags. Raises any exception of it, and InputError without the package."""
+    """Return a reader of rosbags. Raises any exception of it, and MissingDependency without the package."""
     highlevel = needed("rosbags.highlevel", "ros", "reading ROS bags")
     typesys = needed("rosbags.typesys", "ros", "reading ROS bags")
     reader = highlevel.AnyReader(files, default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
