@@ -93,12 +93,6 @@ def shell_volumes(points: FloatArray, triangles: IntArray, of: IntArray) -> Floa
     return np.asarray(np.bincount(of, np.einsum("tc,tc->t", a, np.cross(b, c)) / 6.0), dtype=np.float64)
 
 
-def area_vectors(points: FloatArray, triangles: IntArray) -> FloatArray:
-    """Return the outward area vector of each triangle [unit²], shape (t, 3)."""
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    return np.cross(b - a, c - a) / 2.0
-
-
 def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
     """Return the triangles without pieces of next to no volume. Raises InputError."""
     of = pieces(triangles)
@@ -172,6 +166,3 @@ def _bodies_text(points: FloatArray, triangles: IntArray, shells: Shells, unit: 
         parts.append(f"{body + 1}: {' × '.join(f'{v:.3g}' for v in size)} {unit} around {place_text(points, middle)}")
     more = int(shells.body.max()) + 1 - len(parts)
     return "; ".join(parts) + (f"; and {more} more" if more > 0 else "")
-
-
-# Geometry

@@ -16,7 +16,8 @@ import scipy.sparse as sp
 
 from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
-from femsense.io.meshing.shells import MOST_SHELLS, area_vectors, chosen, faced, find_shells, pieces, shell_volumes, without_dust
+from femsense.fem.mesh import triangle_normals
+from femsense.io.meshing.shells import MOST_SHELLS, chosen, faced, find_shells, pieces, shell_volumes, without_dust
 from femsense.io.meshing.surface_queries import directed_edges, neighbours, open_edges, place_text
 
 WELD = 1e-5
@@ -50,7 +51,7 @@ class ClosedSurface:
 
     @property
     def area(self) -> float:
-        return float(np.linalg.norm(area_vectors(self.points, self.triangles), axis=1).sum())
+        return float(np.linalg.norm(triangle_normals(self.points, self.triangles), axis=1).sum())
 
 
 def repaired(
@@ -239,7 +240,7 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
     edges, labels = np.sort(directed_edges(triangles), axis=1), pieces(triangles)
     bounds = (edges[:, None] == np.sort(loose, axis=1)[None]).all(axis=2).any(axis=1)
     hangs = np.isin(labels, labels[np.flatnonzero(bounds) // 3])
-    area = np.linalg.norm(area_vectors(points, triangles), axis=1)
+    area = np.linalg.norm(triangle_normals(points, triangles), axis=1)
     if area[hangs].sum() > 0.5 * area.sum():
         raise InputError(
             "the surface is open",
