@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, transform_points
 from femsense.core.units import PER_METRE
@@ -34,6 +34,7 @@ from femsense.io.robot_tables import (
 from femsense.io.tables import at_key, beside
 from femsense.model.body_doubts import doubts_of_body
 from femsense.model.plausibility import gravity_doubt, warn_of
+from femsense.model.remeshing import within
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
@@ -44,8 +45,6 @@ FAR_MARKER = 1.0
 """The same for a marker, which may be on a stalk."""
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
-INSIDE = 2
-"""A node counts as inside a box up to this number of units in the last place of the bound, the rounding error of a change of units."""
 
 
 def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robot:
@@ -117,7 +116,7 @@ def clamped_nodes(mesh: TetMesh, boxes: Sequence[FixedTable], path: Path) -> Int
     inside = np.zeros(len(mesh.nodes), dtype=bool)
     for i, box in enumerate(boxes):
         low, high = np.asarray(box.box_m)
-        hits = nodes_within(mesh.nodes, low, high)
+        hits = within(mesh.nodes, np.array([[low, high]]))
         if not hits.any():
             raise _empty_box(mesh, low, high, at_key(path, "fixed", i, "box_m"))
         inside |= hits
@@ -132,12 +131,6 @@ def clamped_nodes(mesh: TetMesh, boxes: Sequence[FixedTable], path: Path) -> Int
     return np.flatnonzero(inside)
 
 
-def nodes_within(nodes: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return which nodes (n, 3) are inside a box, its boundary included, shape (n,)."""
-    slack_low, slack_high = INSIDE * np.spacing(np.abs(low)), INSIDE * np.spacing(np.abs(high))
-    return np.asarray(((nodes >= low - slack_low) & (nodes <= high + slack_high)).all(axis=1))
-
-
 def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> list[FloatArray]:
     """Return boxes [m], each of shape (2, 3), that hold the nodes `held` and no other: one where that works, else one a node.
 
@@ -147,7 +140,7 @@ def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> li
         slack: the boxes reach this far beyond them [m].
     """
     low, high = nodes[held].min(axis=0) - slack, nodes[held].max(axis=0) + slack
-    if nodes_within(nodes, low, high).sum() == len(held):
+    if within(nodes, np.array([[low, high]])).sum() == len(held):
         return [np.array([low, high])]
     return [np.array([point - slack, point + slack]) for point in nodes[held]]
 

@@ -157,7 +157,7 @@ def _contact(row: _Row) -> dict[str, Any]:
 
 
 def _vector(row: _Row, *names: str) -> list[float] | None:
-    values = [row.get(name) for name in names]
+    values: list[Any] = [row.get(name) for name in names]
     return None if None in values else values
 
 

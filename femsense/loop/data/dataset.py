@@ -19,13 +19,13 @@ from femsense.loop.data.surface_rows import (
     cloud_frames,
     make_rows,
     read_clouds,
-    states_of,
     surface_normals,
     with_surface,
 )
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
 from femsense.loop.options import Measured
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, state_key
@@ -222,7 +222,7 @@ def _trials(
     if not len(np.intersect1d(cloudy, fitted)):
         return result
     empty = _bare_scene(robot, recording, np.intersect1d(cloudy, every), with_rest=not result)
-    states = states_of(robot, empty, poses, initial)
+    states = evaluate_robot(robot, empty, poses, initial).states
     seen = read_clouds(robot, recording, states, poses)
     pair: list[Trial | None] = []
     for frames in (fitted, kept):

@@ -11,7 +11,6 @@ recomputes it as the fit proceeds). Without this the true model would leave a re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.meshing.surface_queries import nearest_on
-from femsense.model.as_it_is import evaluate_robot
 from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.observation import Scene
@@ -153,17 +151,6 @@ def _robot_points(
         normals = vertex_normals(state.positions, triangles)[nodes]
         own, _ = segment_by_model(placed, state.positions[nodes], normals, REACH * size, plane_m=PLANE * voxel)
     return as_measured(own.points, np.zeros(len(own), dtype=np.int64), [pose], robot.observation)
-
-
-def states_of(
-    robot: Robot,
-    scene: Scene,
-    poses: Sequence[FloatArray],
-    initial: FloatArray | None,
-    starts: dict[int, Equilibrium] | None = None,
-) -> dict[int, Equilibrium]:
-    """Return the equilibrium of each frame of a scene. Raises DataError if there is none."""
-    return evaluate_robot(robot, scene, poses, initial, starts).states
 
 
 # Rows

@@ -218,16 +218,7 @@ HYPERELASTIC: Effect = Effect(
     told_by=Experiment.MORE_MARKERS,
     planned=lambda robot: (("", GENT if robot.body.material.law == "neo_hookean" else HYPERELASTIC),),
 )
-GENT: Effect = Effect(
-    "hyperelastic",
-    "stiffening or softening with stretch",
-    _gent_parameters,
-    _apply_law,
-    _gent_seeds,
-    keys=("law", "jm"),
-    discrete=True,
-    told_by=Experiment.MORE_MARKERS,
-)
+GENT: Effect = replace(HYPERELASTIC, parameters=_gent_parameters, seeds=_gent_seeds, planned=None)
 CREEP = Effect(
     "creep",
     "slow flow under load",
@@ -239,14 +230,4 @@ CREEP = Effect(
     told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
     drives=True,
 )
-CREEP_TWICE = Effect(
-    "creep",
-    "slow flow under load",
-    _creep_twice_parameters,
-    _apply_creep,
-    _creep_twice_seeds,
-    keys=("fraction", "time_s"),
-    polish=_creep_twice_polish,
-    told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
-    drives=True,
-)
+CREEP_TWICE = replace(CREEP, parameters=_creep_twice_parameters, seeds=_creep_twice_seeds, polish=_creep_twice_polish)
