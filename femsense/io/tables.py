@@ -35,6 +35,10 @@ LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
 """A unit of lengths in files, in any spelling."""
 
 
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Color = Annotated[list[Share], Field(min_length=3, max_length=3)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 

@@ -15,6 +15,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
+from femsense.core.units import PER_METRE
 from femsense.io.mesh_files import read_surface
 from femsense.model.recording_parts import Tool
 from femsense.rig.camera import Shape
@@ -25,7 +26,6 @@ STICK_M = 0.002
 """Radius of a stick [m]."""
 BRASS = 8500.0
 """Density of a weight [kg/m³]."""
-PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 FAR = 1.0
 """Distance below a mesh at which the rays that sample its lower side start [m]."""
 Surface = tuple[FloatArray, IntArray]

@@ -32,7 +32,7 @@ from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.rig.camera_tables import NoiseTable
-from femsense.rig.force_map import CLEAR, ForceMap, Measured, Unknowns, force_bound, neighbours
+from femsense.rig.force_map import CLEAR, ForceMap, Measured, Unknowns, force_bound, measured_rows, neighbours
 
 SEEN, HIDDEN = 4, 2
 """Number of places for which a recording's resolution is stated: visible ones, and hidden ones."""
@@ -113,9 +113,7 @@ def _cloud_rows(
     rows = None if scan is None else ray_rows(scan, surface, calibration.poses, noises, reach=REACH * size)
     if rows is None or not len(rows.residual):
         raise DataError(f"no point of frame {recording.frame_numbers[k]} lies on the robot at its calibrated pose")
-    together = np.array([_together(noise, recording, view) for view, noise in enumerate(noises)])[rows.view]
-    by_pose = rows.by_pose(robot.body.mesh.nodes.mean(axis=0), len(noises))
-    measured = Measured(rows.operator(len(state.positions)), by_pose, np.asarray(rows.std * np.sqrt(together)))
+    measured = measured_rows(robot, rows, [_together(noise, recording, view) for view, noise in enumerate(noises)])
     return measured, float(np.median(rows.std / np.maximum(rows.hits.cosine, 1e-3)))
 
 
