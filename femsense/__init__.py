@@ -1,6 +1,7 @@
 """femsense: an ordinary depth camera as a force sensor for soft robots.
 
-The public names stand here; each is imported from its module when it is first used, so that `import femsense` costs nothing.
+The public names stand here, once, as type checkers read them; each is imported from its module when it is first used, so that `import femsense`
+costs next to nothing.
 
     >>> import femsense as fs
     >>> robot = fs.load_robot("four-leg")
@@ -10,7 +11,9 @@ The public names stand here; each is imported from its module when it is first u
 
 from __future__ import annotations
 
+import ast
 from importlib import import_module
+from pkgutil import get_data
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -154,109 +157,14 @@ __all__ = [
     "write_run",
 ]
 
-_HOMES = {
-    "calib.calibrate": ("calibrate",),
-    "calib.calibration": ("Calibration",),
-    "calib.files": (
-        "read_calibration",
-        "write_calibration",
-    ),
-    "control.motion": (
-        "Motion",
-        "WallContact",
-    ),
-    "control.follow": ("Follower",),
-    "control.reach": ("reach",),
-    "control.search": ("ReachOptions",),
-    "core.errors": (
-        "DataError",
-        "FemsenseError",
-        "InputError",
-        "MissingDependency",
-    ),
-    "fem.body": (
-        "BodyModel",
-        "make_body",
-        "tie_cable",
-    ),
-    "fem.blocks": ("block_mesh",),
-    "fem.compliance": ("compliance",),
-    "fem.equilibrium": (
-        "Equilibrium",
-        "solve_equilibrium",
-    ),
-    "fem.mesh": (
-        "TetMesh",
-        "embed_points",
-    ),
-    "fem.realtime.tracker": ("Tracker",),
-    "io.mesh_files": ("write_mesh",),
-    "io.recording_folder": (
-        "load_recording",
-        "save_recording",
-    ),
-    "io.robot_toml": (
-        "load_robot",
-        "robot_names",
-        "save_robot",
-    ),
-    "loop.files": (
-        "read_loop",
-        "write_loop",
-    ),
-    "loop.improve": (
-        "ImproveOptions",
-        "improve",
-    ),
-    "loop.result.loop_result": ("LoopResult",),
-    "model.effects": (
-        "EFFECTS",
-        "Effect",
-        "apply_effects",
-        "find_effect",
-    ),
-    "model.camera": ("Camera",),
-    "model.recording": (
-        "Recording",
-        "make_recording",
-        "select_frames",
-    ),
-    "model.recording_arrays": ("recording_from_arrays",),
-    "model.recording_parts": (
-        "About",
-        "Drives",
-        "LoadRows",
-        "MarkerRows",
-        "RestMarkers",
-        "Timeline",
-        "Tool",
-        "UnnamedRows",
-        "Views",
-    ),
-    "model.robot": ("Robot",),
-    "report.plot_run": ("plot_run",),
-    "report.write": ("write_report",),
-    "rig.simulate": ("simulate",),
-    "sensing.comparison": ("Comparison", "compare"),
-    "sensing.pipeline": ("estimate",),
-    "sensing.run_files": (
-        "read_run",
-        "run_inputs",
-        "write_run",
-    ),
-    "sensing.options": ("SensingOptions",),
-    "sensing.types": ("ContactForce", "Run"),
-    "xr.armature": ("Armature", "ArmatureOptions", "local_poses", "make_armature"),
-    "xr.export": ("export_glb",),
-    "xr.notebook": ("show_run",),
-    "xr.proprioception.drift": ("adapt", "drift"),
-    "xr.proprioception.labelled": ("labelled",),
-    "xr.proprioception.learn": ("LearnOptions", "learn"),
-    "xr.proprioception.model": ("ProprioceptiveModel",),
-    "xr.proprioception.model_file": ("load_model", "save_model"),
-    "xr.user_skin": ("read_skin",),
-}
-_MODULE_OF = {name: f"femsense.{module}" for module, names in _HOMES.items() for name in names}
+
+def _modules() -> dict[str, str]:
+    """Return the module of each public name, as the imports for type checkers above declare it."""
+    imports = (node for node in ast.walk(ast.parse(get_data(__name__, "__init__.py") or b"")) if isinstance(node, ast.ImportFrom))
+    return {name.name: node.module for node in imports if node.module for name in node.names if name.name in __all__}
+
+
+_MODULE_OF = _modules()
 
 
 def __getattr__(name: str) -> Any:

@@ -79,3 +79,16 @@ def as_indices(values: npt.ArrayLike, count: int, name: str = "indices") -> IntA
             f"{name} out of range", where=name, found=(int(indices.min()), int(indices.max())), expected=f"0 … {count - 1}"
         )
     return indices.astype(np.int64)
+
+
+def rows_alike(*keys: npt.ArrayLike) -> list[IntArray]:
+    """Return the rows of each combination of keys, in order of the first key, then the second, …; keys have shape (k,).
+
+    Example:
+        >>> [rows.tolist() for rows in rows_alike([0, 1, 0, 1], [2, 2, 2, 3])]
+        [[0, 2], [1], [3]]
+    """
+    table = np.array(keys)
+    order = np.lexsort(table[::-1])
+    ends = np.flatnonzero((np.diff(table[:, order], axis=1) != 0).any(axis=0)) + 1
+    return np.split(order, ends) if len(order) else []

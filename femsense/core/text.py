@@ -16,6 +16,8 @@ def plain_name(text: str) -> str:
 
     macOS and some exports write é as two characters; both spellings are one name.
     """
+    if " " not in text and text.isascii() and text.isprintable():
+        return text  # as most cells of tables
     return re.sub(r"[^\S\t\r\n]+", " ", unicodedata.normalize("NFC", text)).strip().strip(_INVISIBLE + " \t\r\n")
 
 

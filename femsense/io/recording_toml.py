@@ -14,7 +14,7 @@ from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
 from femsense.core.units import PER_METRE
 from femsense.io.mesh_files import read_surface
-from femsense.io.tables import LengthUnit, Matrix, Schema, at_key, beside, doubles, pose_problems, schema_problems
+from femsense.io.tables import LengthUnit, Matrix, Positive, Schema, at_key, beside, doubles, pose_problems, schema_problems
 from femsense.model.camera import Camera, CameraNoise
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
@@ -81,8 +81,8 @@ class ToolTable(Schema):
 class CameraTable(Schema):
     width: Pixels | None = Field(None, description="pixels, > 0")
     height: Pixels | None = Field(None, description="pixels, > 0")
-    fx: Annotated[float, Field(gt=0)] | None = Field(None, description="focal length in pixels, > 0")
-    fy: Annotated[float, Field(gt=0)] | None = Field(None, description="focal length in pixels, > 0")
+    fx: Positive | None = Field(None, description="focal length in pixels, > 0")
+    fy: Positive | None = Field(None, description="focal length in pixels, > 0")
     cx: float | None = Field(None, description="principal point in pixels")
     cy: float | None = Field(None, description="principal point in pixels")
     distortion: Annotated[list[float], Field(min_length=4, max_length=8)] = Field(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, transform_points
 from femsense.core.units import PER_METRE
@@ -34,6 +34,7 @@ from femsense.io.robot_tables import (
 from femsense.io.tables import at_key, beside
 from femsense.model.body_doubts import doubts_of_body
 from femsense.model.plausibility import gravity_doubt, warn_of
+from femsense.model.remeshing import within
 from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
@@ -44,8 +45,6 @@ FAR_MARKER = 1.0
 """The same for a marker, which may be on a stalk."""
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
-INSIDE = 2
-"""A node counts as inside a box up to this number of units in the last place of the bound, the rounding error of a change of units."""
 
 
 def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robot:
@@ -117,7 +116,7 @@ def clamped_nodes(mesh: TetMesh, boxes: Sequence[FixedTable], path: Path) -> Int
     inside = np.zeros(len(mesh.nodes), dtype=bool)
     for i, box in enumerate(boxes):
         low, high = np.asarray(box.box_m)
-        hits = nodes_within(mesh.nodes, low, high)
+        hits = within(mesh.nodes, np.array([[low, high]]))
         if not hits.any():
             raise _empty_box(mesh, low, high, at_key(path, "fixed", i, "box_m"))
         inside |= hits
@@ -132,12 +131,6 @@ def clamped_nodes(mesh: TetMesh, boxes: Sequence[FixedTable], path: Path) -> Int
     return np.flatnonzero(inside)
 
 
-def nodes_within(nodes: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return which nodes (n, 3) are inside a box, its boundary included, shape (n,)."""
-    slack_low, slack_high = INSIDE * np.spacing(np.abs(low)), INSIDE * np.spacing(np.abs(high))
-    return np.asarray(((nodes >= low - slack_low) & (nodes <= high + slack_high)).all(axis=1))
-
-
 def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> list[FloatArray]:
     """Return boxes [m], each of shape (2, 3), that hold the nodes `held` and no other: one where that works, else one a node.
 
@@ -147,14 +140,9 @@ def boxes_around(nodes: FloatArray, held: IntArray, *, slack: float = 0.0) -> li
         slack: the boxes reach this far beyond them [m].
     """
     low, high = nodes[held].min(axis=0) - slack, nodes[held].max(axis=0) + slack
-    if nodes_within(nodes, low, high).sum() == len(held):
+    if within(nodes, np.array([[low, high]])).sum() == len(held):
         return [np.array([low, high])]
     return [np.array([point - slack, point + slack]) for point in nodes[held]]
-
-
-def mesh_diagonal(nodes: FloatArray) -> float:
-    """Return the diagonal of the bounding box [m]."""
-    return float(np.linalg.norm(np.ptp(nodes, axis=0)))
 
 
 def likely_unit(size: float) -> str | None:
@@ -166,11 +154,11 @@ def likely_unit(size: float) -> str | None:
 def _empty_box(mesh: TetMesh, low: FloatArray, high: FloatArray, where: str) -> InputError:
     distance = np.linalg.norm(mesh.nodes - np.clip(mesh.nodes, low, high), axis=1)
     nearest = int(distance.argmin())
-    diagonal, size = mesh_diagonal(mesh.nodes), float(np.abs([low, high]).max())
+    whole, size = diagonal(mesh.nodes), float(np.abs([low, high]).max())
     hint = "does the box lie on another side of the body, or in the frame before T_robot_mesh?"
-    if size > 20 * diagonal:
+    if size > 20 * whole:
         hint = "box_m looks like millimetres: it is in metres"
-    elif size < 0.02 * diagonal:
+    elif size < 0.02 * whole:
         hint = "box_m is much smaller than the mesh: is mesh.unit right?"
     return InputError(
         "no node of the mesh is inside the box",
@@ -209,9 +197,9 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
         min_tension=table.min_tension_n,
         max_tension=table.max_tension_n,
     )
-    diagonal = mesh_diagonal(mesh.nodes)
+    size = diagonal(mesh.nodes)
     worst = int(cable.path.outside.argmax())
-    if cable.path.outside[worst] > FAR_CABLE * diagonal:
+    if cable.path.outside[worst] > FAR_CABLE * size:
         raise _far(
             f"point {worst} of cable {table.name!r} is far outside the body",
             at_key(path, "cables", i, "path_m"),
@@ -221,7 +209,7 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
             mesh,
         )
     away = float(np.linalg.norm(mesh.nodes - np.asarray(table.pull_point_m), axis=1).min())
-    if away > FAR_PULL_POINT * diagonal:
+    if away > FAR_PULL_POINT * size:
         raise _far(
             f"the pull point of cable {table.name!r} is far from the body",
             at_key(path, "cables", i, "pull_point_m"),
@@ -254,7 +242,7 @@ def _make_chambers(mesh: TetMesh, tables: Sequence[ChamberTable], path: Path) ->
 def _marker_points(mesh: TetMesh, markers: Sequence[MarkerTable], path: Path) -> FloatArray:
     points = freeze(np.array([marker.position_m for marker in markers], dtype=np.float64).reshape(-1, 3))
     outside = embed_points(mesh, points).outside
-    far = np.flatnonzero(outside > FAR_MARKER * mesh_diagonal(mesh.nodes))
+    far = np.flatnonzero(outside > FAR_MARKER * diagonal(mesh.nodes))
     if len(far):
         i = int(far[0])
         raise _far(
@@ -276,7 +264,6 @@ def _marker_looks(markers: Sequence[MarkerTable]) -> tuple[MarkerLook, ...]:
 
 
 def _far(what: str, where: str, point: Sequence[float], distance: float, limit: float, mesh: TetMesh) -> InputError:
-    diagonal = mesh_diagonal(mesh.nodes)
     millimetres = float(np.abs(point).max()) > 20 * float(np.abs(mesh.nodes).max())
     hint = (
         "this looks like millimetres: positions are in metres"
@@ -288,7 +275,7 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
         where=where,
         found=f"{_metres(point)}, {1e3 * distance:.4g} mm outside",
         expected=(
-            f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal:.4g} mm outside; the mesh reaches from "
+            f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal(mesh.nodes):.4g} mm outside; the mesh reaches from "
             f"{_metres(mesh.nodes.min(axis=0))} to {_metres(mesh.nodes.max(axis=0))}"
         ),
         hint=hint,

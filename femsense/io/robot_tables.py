@@ -13,12 +13,10 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, short
 from femsense.io.materials import POISSON_RATIO, silicone
 from femsense.io.regions import RegionTable
-from femsense.io.tables import LengthUnit, Matrix, Schema, Vector, at_key, doubles, pose_problems, schema_problems
+from femsense.io.tables import Color, LengthUnit, Matrix, Schema, Vector, at_key, doubles, pose_problems, schema_problems
 from femsense.model.effects import EFFECT_NAMES
 
 FORMAT = "femsense-robot-1"
-Share = Annotated[float, Field(ge=0, le=1)]
-Colour = Annotated[list[Share], Field(min_length=3, max_length=3)]
 Name = Annotated[str, StringConstraints(pattern=r'^[^\s,;"]([^,;"\r\n\t]*[^\s,;"])?$')]
 NAME = "a name without commas, semicolons and quotes"
 POINT = "three numbers in metres [x, y, z]"
@@ -90,7 +88,7 @@ class MarkerTable(Schema):
         ge=0,
         description="number of the ArUco tag whose middle the marker is; read from colour images with registered depth",
     )
-    color_rgb: Colour | None = Field(
+    color_rgb: Color | None = Field(
         None,
         description="colour of the dot whose middle the marker is: [red, green, blue] from 0 to 1; several markers may share one",
     )
@@ -101,7 +99,7 @@ class FeaturesTable(Schema):
 
 
 class AppearanceTable(Schema):
-    color_rgb: Colour | None = Field(None, description="three numbers from 0 to 1: [red, green, blue]")
+    color_rgb: Color | None = Field(None, description="three numbers from 0 to 1: [red, green, blue]")
     aruco_dictionary: str = Field("4X4_50", description="dictionary of the ArUco tags, as OpenCV names it without DICT_")
 
 

@@ -35,6 +35,10 @@ LengthUnit = Annotated[Literal["m", "cm", "mm"], BeforeValidator(_usual_unit)]
 """A unit of lengths in files, in any spelling."""
 
 
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Color = Annotated[list[Share], Field(min_length=3, max_length=3)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
 
@@ -306,7 +310,10 @@ class Table:
         return cells
 
     def numbers(self, columns: Sequence[str], *, empty_is_nan: bool = False) -> FloatArray:
-        """Return columns as finite numbers, shape (rows, columns). Raises InputError with line and column."""
+        """Return columns as finite numbers, shape (rows, columns); with `empty_is_nan` a cell may be empty or nan.
+
+        Raises InputError with line and column.
+        """
         result = np.empty((len(self.cells), len(columns)))
         for j, column in enumerate(columns):
             result[:, j] = self._column(column, empty_is_nan)
@@ -324,7 +331,8 @@ class Table:
 
     def _column(self, column: str, empty_is_nan: bool) -> FloatArray:
         cells = self.text(column)
-        numbers = [np.nan if empty_is_nan and not cell else plain_number(cell) for cell in cells]
+        empty = ("", "nan") if empty_is_nan else ()
+        numbers = [np.nan if cell.lower() in empty else plain_number(cell) for cell in cells]
         bad = next((row for row, number in enumerate(numbers) if number is None), None)
         if bad is not None:
             raise InputError(
@@ -335,7 +343,7 @@ class Table:
                 hint="decimal points, not commas" if "," in cells[bad] else None,
             )
         values = np.array(numbers, dtype=np.float64)
-        odd = next((row for row in np.flatnonzero(~np.isfinite(values)).tolist() if cells[row] or not empty_is_nan), None)
+        odd = next((row for row in np.flatnonzero(~np.isfinite(values)).tolist() if cells[row].lower() not in empty), None)
         if odd is not None:
             raise InputError(
                 "not a finite number",

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from femsense.core.errors import DataError, InputError
+from femsense.core.text import with_type
 from femsense.many import limits
 from femsense.many.engines import GONE, Death, Engine
 from femsense.many.jobs import Job
@@ -168,8 +169,7 @@ def _outcome(job: Job, future: Future[Outcome], engine: Engine) -> Outcome | Non
     death = engine.death_in(error)
     if death is None:
         raise DataError(
-            f"the workers cannot run jobs: {type(error).__name__}: {' '.join(str(error).split())[:300]}\n"
-            f"results so far are kept, and the same command continues"
+            f"the workers cannot run jobs: {with_type(error, 300)}\nresults so far are kept, and the same command continues"
         ) from error
     mark = _running(job)
     return None if mark is None else _after_death(job, death, mark)

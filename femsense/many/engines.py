@@ -18,8 +18,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
-from femsense.core.errors import DataError, InputError, MissingDependency
+from femsense.core.errors import DataError, InputError
+from femsense.core.packages import needed
 from femsense.core.parallel import available_cores
+from femsense.core.text import one_line
 from femsense.many import limits
 
 P = ParamSpec("P")
@@ -227,11 +229,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
     Raises:
         InputError: no scheduler answers, or the file cannot be used. MissingDependency: dask is not installed.
     """
-    try:
-        import dask as dask_
-        import distributed
-    except ImportError:
-        raise MissingDependency('--dask needs dask.distributed: pip install "femsense[dask]"') from None
+    dask_, distributed = needed("dask", "dask", "--dask"), needed("distributed", "dask", "--dask")
     known = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed.", "tornado."))]
     for name in ["distributed", "tornado", *known]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # the driver reports an error in one line
@@ -266,7 +264,7 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
             raise InputError(
                 "no dask scheduler answers",
                 where=f"--dask {where}",
-                found=" ".join(str(error).split())[:200] or type(error).__name__,
+                found=one_line(error, 200) or type(error).__name__,
                 expected="tcp://HOST:8786, local, a scheduler file (.json), or a configuration of dask-jobqueue (.yaml)",
             ) from None
         with client:
@@ -275,19 +273,17 @@ def dask(where: str, workers: int | None, memory: int | None) -> Iterator[Dask]:
 
 def _jobqueue(file: Path, workers: int | None) -> Any:
     """Return the cluster that a YAML file of dask-jobqueue declares. Raises InputError."""
+    needed("dask_jobqueue", "dask", "--dask FILE")
     import dask as dask_
     import yaml
+    from dask_jobqueue import JobQueueCluster
+    from dask_jobqueue.local import LocalCluster  # a queue on this machine, to try a file
 
-    try:
-        from dask_jobqueue import JobQueueCluster
-        from dask_jobqueue.local import LocalCluster  # a queue on this machine, to try a file
-    except ImportError:
-        raise MissingDependency('--dask FILE needs dask-jobqueue: pip install "femsense[dask]"') from None
     kinds = {kind.job_cls.default_config_name(): kind for kind in {*JobQueueCluster.__subclasses__(), LocalCluster}}
     try:
         document = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise InputError("cannot be read", where=file, found=" ".join(str(error).split())[:200], expected="YAML") from None
+        raise InputError("cannot be read", where=file, found=one_line(error, 200), expected="YAML") from None
     tables = document.get("jobqueue") if isinstance(document, dict) else None
     names = [name for name in tables if name in kinds] if isinstance(tables, dict) else []
     if len(names) != 1:

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
+from femsense.core.packages import needed
+from femsense.core.text import one_line
 from femsense.io.tables import read_csv
 
 RECORDS = ".many"
@@ -116,15 +118,14 @@ def read_table(file: Path) -> list[Row]:
 
 
 def _parquet_rows(file: Path) -> list[dict[str, Any]]:
-    try:
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_table as read
-    except ImportError:
-        raise MissingDependency('reading Parquet needs pyarrow: pip install "femsense[dask]"; or give the table as CSV') from None
+    needed("pyarrow.parquet", "dask", "reading Parquet (or give the table as CSV)")
+    from pyarrow import ArrowException
+    from pyarrow.parquet import read_table as read
+
     try:
         return list(read(file).to_pylist())
     except (OSError, ArrowException) as error:
-        raise InputError("not a Parquet table", where=file, found=" ".join(str(error).split())[:120]) from None
+        raise InputError("not a Parquet table", where=file, found=one_line(error, 120)) from None
 
 
 def _text(value: object) -> str:

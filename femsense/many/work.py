@@ -17,6 +17,7 @@ from typing import Any, TextIO
 from threadpoolctl import threadpool_limits
 
 from femsense.core.errors import FemsenseError, InputError
+from femsense.core.text import with_type
 from femsense.io.files import json_text, write_text
 from femsense.io.folder_lock import only_writer
 from femsense.many import limits
@@ -92,7 +93,7 @@ def _called(job: Job, call: Call) -> Outcome:
         status, reason, row = Status.NO_RESULT if result.reason else Status.DONE, result.reason, result.row
     except Exception as error:
         status, cause = _kind_of(error)
-        reason = str(cause) if isinstance(cause, FemsenseError) else _line(cause)
+        reason = str(cause) if isinstance(cause, FemsenseError) else with_type(cause, 1000)
     if status is Status.OUT_OF_MEMORY:
         reason += "; a worker may not take more memory: --memory, or fewer --workers"
     return Outcome(
@@ -117,10 +118,6 @@ def _kind_of(error: BaseException) -> tuple[Status, BaseException]:
         cause = cause.__cause__ or cause.__context__
     no_result = isinstance(error, FemsenseError) and error.exit_status == 1
     return Status.NO_RESULT if no_result else Status.FAILED, error
-
-
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
 
 
 # Around a job

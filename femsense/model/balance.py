@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -61,13 +62,9 @@ class Balance:
 
     def left(self) -> FloatArray:
         """Return the sum of all forces in the base state [N], (n, 3): reactions at the clamp, the residual of Newton elsewhere."""
-        x = self.base.positions
-        force = self.dead + self.base.nodal_forces
-        for cable, along in zip(self.body.cables, self.base.segment_tensions):
-            force = force + cable_forces(cable, x, along, len(x))
-        for chamber in self.body.chambers:
-            force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
-        return np.asarray(force - self.inner)
+        base, pressures = self.base, [self.base.pressure[chamber.name] for chamber in self.body.chambers]
+        driven = driving_forces(self.body, base.positions, base.segment_tensions, pressures)
+        return np.asarray(self.dead + base.nodal_forces + driven - self.inner)
 
     def along(self, variant: DrivenRobot) -> Tensions:
         """Return the tensions along a variant's cables where these do not rub."""
@@ -82,12 +79,8 @@ class Balance:
     def whole(self, variant: DrivenRobot, tensions: Tensions, x: FloatArray) -> FloatArray:
         """Return all forces on a variant's body at x near the base state [N], (n, 3), for tensions along its cables."""
         body = self._body(variant)
-        force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
-        for cable, along in zip(body.cables, tensions):
-            force = force + cable_forces(cable, x, along, len(x))
-        for chamber, pressure in zip(body.chambers, variant.drive.pressures[self.frame]):
-            force = force + pressure * volume_gradient(chamber, x)
-        return np.asarray(force)
+        driven = driving_forces(body, x, tensions, variant.drive.pressures[self.frame])
+        return np.asarray(body.dead_load() + self._loads(variant) + driven - internal(body, x, tangent=False).forces)
 
     def change(self, variant: DrivenRobot) -> FloatArray:
         """Return the residual forces of a variant in the base state, without the change of tensions along cables [N], (n, 3)."""
@@ -141,6 +134,16 @@ class Balance:
         if x is not None:
             pulled = pulled - shortening(body, x) + shortening(self.body, self.base.positions)
         return np.asarray(pulled)
+
+
+def driving_forces(body: BodyModel, x: FloatArray, tensions: Tensions, pressures: Iterable[float]) -> FloatArray:
+    """Return the forces of cables and chambers at positions x [N], shape (n, 3), for tensions along the cables and pressures [Pa]."""
+    force = np.zeros_like(x)
+    for cable, along in zip(body.cables, tensions):
+        force += cable_forces(cable, x, along, len(x))
+    for chamber, pressure in zip(body.chambers, pressures):
+        force += pressure * volume_gradient(chamber, x)
+    return force
 
 
 def rubbed(variant: DrivenRobot, frame: int, base: Equilibrium, x: FloatArray) -> Tensions:

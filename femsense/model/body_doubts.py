@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.core.units import Quantity
 from femsense.fem.body import BodyModel
 from femsense.model.plausibility import RANGES, likely_meant
@@ -63,7 +63,7 @@ def _doubts_of_cracks(body: BodyModel) -> list[str]:
     counts = []
     for nodes in (corners, np.arange(len(mesh.nodes))):
         points = mesh.nodes[nodes]
-        near = RANGES.coincident * float(np.linalg.norm(np.ptp(points, axis=0)))
+        near = RANGES.coincident * diagonal(points)
         pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
         counts.append(len(np.unique(pairs[:, 1])) if len(pairs) else 0)
     if not counts[1]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, rows_alike
 from femsense.core.errors import DataError
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -42,9 +42,8 @@ def check_marker_distances(robot: Robot, recording: Recording) -> None:
     r, number = recording, {name: i for i, name in enumerate(robot.marker_names)}
     rest = np.array([robot.marker_points[number[name]] for name in r.marker_names]).reshape(-1, 3)
     ratios = []
-    for k, v in np.unique(np.column_stack([r.marker_frame, r.marker_view]), axis=0):
-        rows = (r.marker_frame == k) & (r.marker_view == v)
-        own = _size(rest[r.marker_index[rows]]) if rows.sum() >= FEWEST else 0.0
+    for rows in rows_alike(r.marker_frame, r.marker_view):
+        own = _size(rest[r.marker_index[rows]]) if len(rows) >= FEWEST else 0.0
         if own > 0.0:
             ratios.append(_size(r.marker_xyz[rows]) / own)
     _check_scale(float(np.median(ratios)) if ratios else 1.0, "the robot", unit_hint)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
 from femsense.model.contact_patch import body_surface, closest_surface_point
@@ -27,7 +27,7 @@ def check_on_body(mesh: TetMesh, places: FloatArray, *, where: str) -> None:
         InputError: a place is farther from the surface than a tenth of the body's diagonal.
     """
     nodes, surface = mesh.nodes, body_surface(mesh)
-    size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    size = diagonal(nodes)
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     for place in places:
         distance = float(np.linalg.norm(closest_surface_point(surface, nodes, place) - place))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.core.pose import invert_pose, transform_points
 from femsense.core.units import ATMOSPHERE_PA, Quantity, likely_units
 from femsense.fem.mesh import embed_points
@@ -245,7 +245,7 @@ def doubts_of_rest(recording: Recording) -> list[str]:
         if len(pairs) < 3:
             continue
         resting, moving = np.array(pairs).transpose(1, 0, 2)
-        size = float(np.linalg.norm(np.ptp(moving, axis=0)))
+        size = diagonal(moving)
         away = float(np.median(np.linalg.norm(resting - moving, axis=1)))
         if away > RANGES.rest_sizes * size:
             found.append(
@@ -363,7 +363,7 @@ def _lens_doubt(width: int, height: int, numbers: Sequence[float]) -> str | None
 def doubts_of_poses(robot: Robot, recording: Recording) -> list[str]:
     """Return given poses of cameras that put the markers away from the robot, with the reading of the pose that puts them onto it."""
     r, number = recording, {name: i for i, name in enumerate(robot.marker_names)}
-    size = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
+    size = diagonal(np.vstack([robot.body.mesh.nodes, robot.marker_points]))
     found = []
     for v, T in enumerate(r.T_robot_camera):
         found += _camera_in_body(robot, recording, T)

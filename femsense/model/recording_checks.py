@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import freeze
+from femsense.core.arrays import diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, look_alike, plain_name
 from femsense.fem.mesh import embed_points
@@ -33,8 +33,8 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
         InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
         DataError: markers in another unit.
     """
-    diagonal = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
-    measured = without_far_markers(without_stale_markers(without_twins(_composed(recording))), diagonal)
+    size = diagonal(np.vstack([robot.body.mesh.nodes, robot.marker_points]))
+    measured = without_far_markers(without_stale_markers(without_twins(_composed(recording))), size)
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, measured)))
     check_marker_distances(robot, fitted)
     _check_loads(robot, fitted)
@@ -150,16 +150,16 @@ def _check_loads(robot: Robot, recording: Recording) -> None:
         return
     places = np.unique(recording.load_points, axis=0)
     outside = embed_points(robot.body.mesh, places).outside
-    diagonal = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     worst = int(outside.argmax())
-    if outside[worst] > FAR_LOAD * diagonal:
+    if outside[worst] > FAR_LOAD * size:
         k = int(recording.load_frame[(recording.load_points == places[worst]).all(axis=1)][0])
         looks = np.abs(places[worst]).max() > 20 * np.abs(robot.body.mesh.nodes).max()
         raise InputError(
             "a known load is far from the body",
             where=f"{place_of(recording, 'loads.csv', 'loads')}, frame {recording.frame_numbers[k]}",
             found=f"{places[worst].tolist()} m, {1e3 * outside[worst]:.4g} mm outside",
-            expected=f"a place on the body at rest, robot frame, at most {250 * diagonal:.4g} mm outside",
+            expected=f"a place on the body at rest, robot frame, at most {250 * size:.4g} mm outside",
             hint="this looks like millimetres: places are in metres"
             if looks
             else "loads are in the robot frame, not the camera's",

@@ -8,12 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.body_parts import Chamber
 from femsense.fem.cavities import find_chamber
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, refined, to_linear, to_quadratic
 from femsense.model.robot import Robot
+
+ROUNDING = 2
+"""A point counts as inside a box up to this number of units in the last place of the bound, the rounding error of a change of units."""
 
 
 @functools.lru_cache(maxsize=4)
@@ -41,7 +44,7 @@ def robot_on_mesh(robot: Robot, mesh: TetMesh) -> Robot:
 
     old = robot.body.mesh
     boxes = declared_boxes(robot)
-    clamped = None if boxes is None else np.flatnonzero(_inside(mesh.nodes, boxes))
+    clamped = None if boxes is None else np.flatnonzero(within(mesh.nodes, boxes))
     features = cKDTree(mesh.nodes).query(old.nodes[robot.features])[1] if len(robot.features) else robot.features
     moved = robot.with_body(body_on_mesh(robot.body, mesh, clamped=clamped))
     return replace(moved.with_marker_points(robot.marker_points), features=freeze(features, np.int64))
@@ -52,12 +55,13 @@ def declared_boxes(robot: Robot) -> FloatArray | None:
     document = robot.document
     tables = document.get("fixed", []) if isinstance(document, Mapping) else []
     boxes = np.array([t["box_m"] for t in tables], dtype=float).reshape(-1, 2, 3)
-    hold = np.array_equal(np.flatnonzero(_inside(robot.body.mesh.nodes, boxes)), robot.body.clamped)
+    hold = np.array_equal(np.flatnonzero(within(robot.body.mesh.nodes, boxes)), robot.body.clamped)
     return boxes if len(boxes) and hold else None
 
 
-def _inside(points: FloatArray, boxes: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    slack = 2 * np.spacing(np.abs(boxes))
+def within(points: FloatArray, boxes: FloatArray) -> BoolArray:
+    """Return which points (n, 3) are inside one of the boxes (b, 2, 3), their boundaries included, shape (n,)."""
+    slack = ROUNDING * np.spacing(np.abs(boxes))
     low, high = boxes[:, 0] - slack[:, 0], boxes[:, 1] + slack[:, 1]
     return np.asarray(((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2).any(axis=1))
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, IntArray
+from femsense.core.arrays import BoolArray, IntArray, rows_alike
 from femsense.model.recording import Recording, with_marker_table
 
 CHANCE = 0.05
@@ -32,8 +32,7 @@ def without_far_markers(recording: Recording, size: float) -> Recording:
     """
     r = recording
     far = np.zeros(len(r.marker_frame), dtype=np.bool_)
-    for k, v in np.unique(np.column_stack([r.marker_frame, r.marker_view]), axis=0):
-        rows = np.flatnonzero((r.marker_frame == k) & (r.marker_view == v))
+    for rows in rows_alike(r.marker_frame, r.marker_view):
         if len(rows) >= 4:
             far[rows] = np.linalg.norm(r.marker_xyz[rows] - np.median(r.marker_xyz[rows], axis=0), axis=1) > FAR * size
     if not far.any() or far.mean() > 0.2:

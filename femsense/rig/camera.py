@@ -136,12 +136,13 @@ def look(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape]) ->
 
 
 def cloud_of(image: DepthImage, camera: Camera, which: npt.ArrayLike | None = None) -> PointCloud:
-    """Return the measured points of an image with their colours, camera frame; `which` is a mask (H, W) of pixels to keep."""
+    """Return the measured points of an image with their colours, camera frame, in single precision as a file keeps them; `which` is a mask (H, W)
+    of pixels to keep."""
     keep = image.depth > 0
     if which is not None:
         keep &= np.asarray(which)
-    points = pixel_rays(camera)[keep] * image.depth[keep][:, None]
-    return PointCloud(points, image.color[keep] / 255.0)
+    points = (pixel_rays(camera)[keep] * image.depth[keep][:, None]).astype(np.float32)
+    return PointCloud(points.astype(np.float64), image.color[keep] / 255.0)
 
 
 def thinned(cloud: PointCloud, size: float) -> PointCloud:
@@ -149,16 +150,6 @@ def thinned(cloud: PointCloud, size: float) -> PointCloud:
     cubes = np.floor(cloud.points / size).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)
     return cloud.select(np.sort(first))
-
-
-def write_ply(path: Path, cloud: PointCloud) -> None:
-    """Write a cloud as binary PLY in single precision with byte colours (15 bytes a point, the same bytes every time)."""
-    colors = np.zeros((len(cloud), 3)) if cloud.colors is None else cloud.colors
-    rows = np.zeros(len(cloud), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = cloud.points, np.rint(255.0 * colors)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    lines += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {name}" for name in ("red", "green", "blue")]
-    path.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes())
 
 
 def write_images(depth_file: Path, color_file: Path, image: DepthImage, camera: Camera) -> None:

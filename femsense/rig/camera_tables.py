@@ -7,11 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from femsense.io.robot_tables import Share
-from femsense.io.tables import Matrix, Schema, Vector
+from femsense.io.tables import Matrix, NotNegative, Positive, Schema, Share, Vector
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 LENSES = {"D415": (1280, 720, 65.0)}
 """Pixels and horizontal field of view [°] of the depth image of a camera (Grunnet-Jepsen, Sweetser and Woodfill, *Tuning depth
 cameras for best performance*, Intel)."""

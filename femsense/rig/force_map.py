@@ -11,6 +11,7 @@ The map shows the standard deviation of a small force along the normal [N].
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import DataError
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, tangent_at
@@ -121,14 +122,14 @@ def force_map(
     """
     how, views = unknowns or Unknowns(), views_of(script, robot)
     state = _state(robot, script, where, frame)
-    rows, std = _rows(robot, script, views, state)
+    measured = _rows(robot, script, views, state)
     nodes = spread_features(robot.body, how.places)
     surface = body_surface(robot.body.mesh)
     normals = vertex_normals(state.positions, surface.triangles)[nodes]
     return force_bound(
         robot,
         state,
-        Measured(rows.operator(len(state.positions)), rows.by_pose(robot.body.mesh.nodes.mean(axis=0), len(views)), std),
+        measured,
         nodes,
         _seen(views, state, surface.triangles, nodes, normals),
         unknowns=how,
@@ -153,7 +154,7 @@ def force_bound(
     tangent, std = tangent_at(robot.body, state), measured.std
     N = _nuisance(robot, measured, tangent, state, unknowns) / std[:, None]
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]))
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     normal_std, tangent_std = [], []
     for start in range(0, len(nodes), BATCH):
         here = nodes[start : start + BATCH]
@@ -207,9 +208,8 @@ def _state(robot: Robot, script: ScriptTable, where: Path, frame: int) -> Equili
     return state
 
 
-def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equilibrium) -> tuple[RayRows, FloatArray]:
-    """Return the rows of the measured points, and the standard deviation of each with the correlation of neighbours [m],
-    shape (r,)."""
+def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equilibrium) -> Measured:
+    """Return the rows of the points that the cameras measure."""
     shapes = [body_shape(robot, state.positions, script.scene)]
     if script.scene.floor_z_m is not None:
         shapes.append(floor_shape(script.scene.floor_z_m, np.array(script.scene.floor_rgb), script.scene.floor_albedo))
@@ -224,11 +224,17 @@ def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equ
     if not sum(len(p) for p in points):
         raise DataError("no camera sees the robot: check eye_m and target_m")
     scan = Scan(np.vstack(points), np.concatenate(view_of), np.zeros((0, 3)), np.zeros(0, np.int64))
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     surface = Surface(state.positions, body_surface(robot.body.mesh).triangles)
     rows = ray_rows(scan, surface, [view.T_robot_camera for view in views], noises, reach=REACH * size)
-    together = np.array([neighbours(view.table.noise) for view in views])[rows.view]
-    return rows, np.asarray(rows.std * np.sqrt(together))
+    return measured_rows(robot, rows, [neighbours(view.table.noise) for view in views])
+
+
+def measured_rows(robot: Robot, rows: RayRows, together: Sequence[float]) -> Measured:
+    """Return rows of points; together: number of points of each camera that count as one (see `neighbours`), shape (v,)."""
+    std = np.asarray(rows.std * np.sqrt(np.asarray(together)[rows.view]))
+    nodes = robot.body.mesh.nodes
+    return Measured(rows.operator(len(nodes)), rows.by_pose(nodes.mean(axis=0), len(together)), std)
 
 
 def _noise_of(view: View, robot: Robot) -> CameraNoise:

@@ -6,14 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from femsense.io.robot_tables import Share
-from femsense.io.tables import Schema, Vector
+from femsense.io.tables import Color, NotNegative, Positive, Schema, Share, Vector
 
 COLOR = "three numbers from 0 to 1: [red, green, blue]"
 PLACE = "three numbers in metres [x, y, z], on the surface at rest, robot frame"
-Color = Annotated[list[Share], Field(min_length=3, max_length=3)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 KEYS: dict[str, set[str]] = {
     "ball": {"radius_m", "stick_m"},
     "rod": {"radius_m", "length_m"},

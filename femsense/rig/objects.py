@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
+from femsense.core.units import PER_METRE
 from femsense.io.mesh_files import read_surface
 from femsense.model.recording_parts import Tool
 from femsense.rig.camera import Shape
@@ -25,7 +26,6 @@ STICK_M = 0.002
 """Radius of a stick [m]."""
 BRASS = 8500.0
 """Density of a weight [kg/m³]."""
-PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 FAR = 1.0
 """Distance below a mesh at which the rays that sample its lower side start [m]."""
 Surface = tuple[FloatArray, IntArray]
@@ -72,7 +72,7 @@ def pressing(item: ObjectTable, surface: Surface, place: FloatArray, normal: Flo
         size = 0.5 * np.asarray(item.size_m)[:2]
         flat = Pressing(place, normal, x, float(np.linalg.norm(size)), 0.5 * float(size.min()), lambda xy: _face(xy, size))
         return flat
-    reach = 0.5 * float(np.linalg.norm(np.ptp(surface[0][:, :2], axis=0)))
+    reach = 0.5 * diagonal(surface[0][:, :2])
     return Pressing(place, normal, x, reach, 0.1 * reach, _lower_side(surface))
 
 

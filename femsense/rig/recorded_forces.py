@@ -19,7 +19,7 @@ from femsense.calib.from_clouds import measured_noises
 from femsense.calib.inputs import calibrated_inputs
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, ray_rows, read_scan
-from femsense.core.arrays import BoolArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, IntArray, diagonal, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
@@ -32,7 +32,7 @@ from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.rig.camera_tables import NoiseTable
-from femsense.rig.force_map import CLEAR, ForceMap, Measured, Unknowns, force_bound, neighbours
+from femsense.rig.force_map import CLEAR, ForceMap, Measured, Unknowns, force_bound, measured_rows, neighbours
 
 SEEN, HIDDEN = 4, 2
 """Number of places for which a recording's resolution is stated: visible ones, and hidden ones."""
@@ -109,13 +109,11 @@ def _cloud_rows(
     """Return the rows of the clouds of a frame, and the median standard deviation of a depth [m]."""
     scan = read_scan(robot, recording, k, calibration.poses, state.positions)
     surface = Surface(state.positions, body_surface(robot.body.mesh).triangles)
-    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    size = diagonal(robot.body.mesh.nodes)
     rows = None if scan is None else ray_rows(scan, surface, calibration.poses, noises, reach=REACH * size)
     if rows is None or not len(rows.residual):
         raise DataError(f"no point of frame {recording.frame_numbers[k]} lies on the robot at its calibrated pose")
-    together = np.array([_together(noise, recording, view) for view, noise in enumerate(noises)])[rows.view]
-    by_pose = rows.by_pose(robot.body.mesh.nodes.mean(axis=0), len(noises))
-    measured = Measured(rows.operator(len(state.positions)), by_pose, np.asarray(rows.std * np.sqrt(together)))
+    measured = measured_rows(robot, rows, [_together(noise, recording, view) for view, noise in enumerate(noises)])
     return measured, float(np.median(rows.std / np.maximum(rows.hits.cosine, 1e-3)))
 
 
@@ -166,7 +164,7 @@ def _places(robot: Robot, calibration: Calibration, state: Equilibrium) -> tuple
 def _seen(calibration: Calibration, state: Equilibrium, triangles: IntArray, nodes: IntArray) -> BoolArray:
     """Return which nodes a camera sees: facing it and not occluded by the body, shape (p,)."""
     normals = vertex_normals(state.positions, triangles)[nodes]
-    size = float(np.linalg.norm(np.ptp(state.positions, axis=0)))
+    size = diagonal(state.positions)
     places = state.positions[nodes] + CLEAR * normals
     surface, seen = Surface(state.positions, triangles), np.zeros(len(nodes), dtype=bool)
     for T in calibration.poses:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, diagonal
 from femsense.core.text import key_path
 from femsense.fem.mesh import surface_triangles
 from femsense.model.robot import Robot
@@ -41,7 +41,7 @@ def warn_of_script(script: ScriptTable, robot: Robot, where: Path) -> None:
     for location, point in _places(script):
         near, _ = nearest_place(mesh, np.asarray(point, dtype=float))
         off = float(np.linalg.norm(near - point))
-        if off > max(CUT, OFF_SURFACE * float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))):
+        if off > max(CUT, OFF_SURFACE * diagonal(mesh.nodes)):
             warnings.warn(
                 f"{where}: {key_path(location)} is {1e3 * off:.1f} mm from the surface of {robot.name} at rest; "
                 f"the force acts at the nearest place, [{_metres(near)}]",

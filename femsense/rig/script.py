@@ -10,10 +10,9 @@ from pydantic import Field, model_validator
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, key_path
-from femsense.io.robot_tables import Share
-from femsense.io.tables import Schema, Vector, read_toml, validated
+from femsense.io.tables import Color, NotNegative, Positive, Schema, Share, Vector, read_toml, validated
 from femsense.rig.camera_tables import NoiseTable, ViewTable
-from femsense.rig.object_tables import COLOR, PLACE, Color, ContactTable, NotNegative, ObjectTable, Positive
+from femsense.rig.object_tables import COLOR, PLACE, ContactTable, ObjectTable
 from femsense.rig.sensors import SensorTable
 
 __all__ = ["ContactTable", "NoiseTable", "ObjectTable", "ViewTable"]

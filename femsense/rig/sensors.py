@@ -20,7 +20,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, embed_points
 from femsense.io.files import write_csv
-from femsense.io.tables import Schema, Vector
+from femsense.io.tables import NotNegative, Positive, Schema, Vector
 
 COLOURS = ("red", "green", "blue")
 DIGITS = 9
@@ -41,11 +41,11 @@ class SensorTable(Schema):
         None,
         description="of a colour sensor: direction of the measured displacement; default: the most vertical transverse direction",
     )
-    period_m: Annotated[float, Field(gt=0)] = Field(0.01, description="of a colour sensor: period of the colour pattern [m], > 0")
+    period_m: Positive = Field(0.01, description="of a colour sensor: period of the colour pattern [m], > 0")
     gain: float = Field(1.0, description="reading per unit of strain, or difference between dark and bright")
     zero: float = Field(0.0, description="reading at zero strain, or in the dark")
-    lag_s: Annotated[float, Field(ge=0)] = Field(0.0, description="time constant of the sensor [s], ≥ 0")
-    noise_std: Annotated[float, Field(ge=0)] = Field(0.0, description="noise of a reading, standard deviation in its unit, ≥ 0")
+    lag_s: NotNegative = Field(0.0, description="time constant of the sensor [s], ≥ 0")
+    noise_std: NotNegative = Field(0.0, description="noise of a reading, standard deviation in its unit, ≥ 0")
     drift_per_s: float = Field(0.0, description="drift of the zero reading, in its unit per second")
 
     @property

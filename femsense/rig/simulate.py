@@ -13,9 +13,10 @@ from femsense.core.arrays import freeze
 from femsense.core.errors import DataError, InputError
 from femsense.core.pose import transform_points
 from femsense.io.checkpoint import Checkpoint
+from femsense.io.clouds.ply import write_ply
 from femsense.io.recording_folder import save_recording
 from femsense.model.robot import Robot
-from femsense.rig.camera import DepthImage, Shape, cloud_of, render, thinned, visible_points, write_images, write_ply
+from femsense.rig.camera import DepthImage, Shape, cloud_of, render, thinned, visible_points, write_images
 from femsense.rig.experiment import Experiment, View, cloud_frames, rng_of, views_of
 from femsense.rig.plan import Plan, plan_script
 from femsense.rig.recorded import chosen_markers, recording_of, with_placement

@@ -10,6 +10,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
+from femsense.core.text import one_line
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
 from femsense.fem.energy import energy_density
@@ -135,7 +136,7 @@ def true_course(
             course = replace(course, frames=(*course.frames, (k, frame)))
         except DataError as error:
             path.remember(memory)
-            course = replace(course, skipped=(*course.skipped, (k, " ".join(str(error).split()))))
+            course = replace(course, skipped=(*course.skipped, (k, one_line(error))))
         course = replace(course, memory=path.memory())
         yield course
 

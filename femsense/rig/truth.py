@@ -10,9 +10,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem.mesh import TetMesh, refined, to_linear, to_quadratic
 from femsense.model.effects import apply_effects
-from femsense.model.remeshing import body_on_mesh
+from femsense.model.remeshing import body_on_mesh, finer_mesh
 from femsense.model.robot import Robot
 from femsense.rig.plan import Plan
 from femsense.rig.script import TruthTable
@@ -29,7 +28,7 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
     Raises:
         InputError: an effect does not fit.
     """
-    mesh = true_mesh(robot.body.mesh, table)
+    mesh = finer_mesh(robot.body.mesh, table.element, table.refinements)
     body = robot.body if mesh is robot.body.mesh else body_on_mesh(robot.body, mesh)
     limit = np.inf if table.stretch_limit is None else table.stretch_limit
     body = body.with_material(replace(body.material, law=table.law, stretch_limit=limit))
@@ -42,16 +41,6 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
                 error.what, where=f"effects[{i}]: {error.where}", found=error.found, expected=error.expected, hint=error.hint
             ) from None
     return moved
-
-
-def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
-    """Return the true mesh; the robot's own without refinement and with the same element order."""
-    if not table.refinements and mesh.is_quadratic == (table.element == "tet10"):
-        return mesh
-    fine = to_linear(mesh)
-    for _ in range(table.refinements):
-        fine = refined(fine)
-    return to_quadratic(fine) if table.element == "tet10" else fine
 
 
 # The inputs

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
+from femsense.core.packages import needed
 from femsense.io.files import check_target, write_beside
 from femsense.io.own_files import MCAP
 from femsense.model.recording import Recording
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, Run
-from femsense.xr.extras import needed
 from femsense.xr.ros_definitions import MESSAGES, definition
 from femsense.xr.run_scene import BODY, FORCE, arrow_of, body_surface, camera_pose, cloud_of, recording_of
 
@@ -49,11 +49,11 @@ def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
         path: the .mcap file.
 
     Raises:
-        InputError: no run, another file at that place, or the package mcap-ros2-support is missing.
+        InputError: no run, or another file at that place. MissingDependency: without the extra mcap.
     """
     check_target(path, folder=False, kind=MCAP)
     run = read_run(folder)
-    writer_module = needed("mcap_ros2.writer", package="mcap-ros2-support", extra="mcap", doing="writing MCAP")
+    writer_module = needed("mcap_ros2.writer", "mcap", "writing MCAP")
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part, part.open("wb") as stream:
         writer = writer_module.Writer(stream)

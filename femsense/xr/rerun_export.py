@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
+from femsense.core.packages import needed
 from femsense.io.files import check_target, write_beside
 from femsense.io.own_files import RERUN
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, FrameReport, Run
-from femsense.xr.extras import needed
 from femsense.xr.run_scene import BODY, FORCE, arrow_of, body_surface, camera_pose, cloud_of, recording_of
 
 UNCERTAIN = (0.9, 0.25, 0.15, 0.25)
@@ -40,10 +40,10 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
         path: the .rrd file.
 
     Raises:
-        InputError: no run, another file at that place, or the package rerun-sdk is missing.
+        InputError: no run, or another file at that place. MissingDependency: without the extra rerun.
     """
     check_target(path, folder=False, kind=RERUN)
-    rr, run = needed("rerun", package="rerun-sdk", extra="rerun", doing="writing .rrd"), read_run(folder)
+    rr, run = needed("rerun", "rerun", "writing .rrd"), read_run(folder)
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part:
         stream = rr.RecordingStream("femsense", recording_id=str(Path(folder).resolve()))

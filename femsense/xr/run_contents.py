@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles
+from femsense.io.tables import read_csv
 from femsense.xr.glb_reader import read_glb
 from femsense.xr.gltf import ExportReport
 from femsense.xr.landmarks import landmarks_of_run, robot_table, run_document
@@ -21,7 +20,17 @@ from femsense.xr.surface_stress import SurfaceStress, nodal_strain, surface_stre
 from femsense.xr.user_skin import BUDGET, GLTF, UserSkin, export_surface, read_skin
 
 FORMAT = "femsense-contacts-1"
-CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "force_n", "std_n", "source")
+KEYS = ("frame", "time_s", "contact")
+"""Columns of numbers of the tables of a run without an empty cell …"""
+NUMBERS = (
+    *("x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "force_n", "std_n"),
+    *("x_std_m", "y_std_m", "z_std_m", "fx_std_n", "fy_std_n", "fz_std_n", "radius_m", "track", "rms_after_m"),
+)
+"""… and with some."""
+TEXTS = ("status", "source")
+CONTACT_COLUMNS = (*KEYS, *NUMBERS[:8], "source")
+_Row = dict[str, Any]
+"""A row of a table: column → number (None: not known) or text."""
 
 
 def export_run(
@@ -67,14 +76,14 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
         for t in times
     ]
     told = _rows(run / "frames.csv", ("frame", "time_s"))
-    columns = _input_columns(told)
+    columns = [name for name in (told[0] if told else ()) if _is_input(name)]
     for row in told:
-        state = frames[_nearest(times, row.number("time_s"))]
-        state.update(frame=row.integer("frame"), status=row.values.get("status") or None, rms_after_m=row.optional("rms_after_m"))
-        state["inputs"] = [row.optional(column) for column in columns] or None
+        state = frames[_nearest(times, row["time_s"])]
+        state.update(frame=int(row["frame"]), status=row.get("status") or None, rms_after_m=row.get("rms_after_m"))
+        state["inputs"] = [row[column] for column in columns] or None
     for row in _rows(run / "contacts.csv", CONTACT_COLUMNS):
-        state = frames[_nearest(times, row.number("time_s"))]
-        state["frame"] = row.integer("frame") if state["frame"] is None else state["frame"]
+        state = frames[_nearest(times, row["time_s"])]
+        state["frame"] = int(row["frame"]) if state["frame"] is None else state["frame"]
         state["contacts"].append(_contact(row))
     robot = robot_table(run)
     inputs = [_input(column, told, robot) for column in columns]
@@ -132,68 +141,39 @@ def current_glb(run: Path, scratch: Path) -> Path:
     return target
 
 
-class _Row:
-    """One row of a table, with its location for messages."""
-
-    def __init__(self, values: dict[str, str], where: str) -> None:
-        self.values, self.where = values, where
-
-    def number(self, key: str) -> float:
-        value = self.optional(key)
-        if value is None:
-            raise InputError(
-                "a number is missing", where=f"{self.where}, {key}", found=self.values.get(key), expected="a finite number"
-            )
-        return value
-
-    def optional(self, key: str) -> float | None:
-        """Return the number, or None if the cell is empty or nan."""
-        text = (self.values.get(key) or "").strip()
-        if not text:
-            return None
-        try:
-            value = float(text)
-        except ValueError:
-            raise InputError("not a number", where=f"{self.where}, {key}", found=text, expected="a number") from None
-        return value if math.isfinite(value) else None
-
-    def integer(self, key: str) -> int:
-        return int(self.number(key))
-
-    def vector(self, *keys: str) -> list[float] | None:
-        values = [self.optional(k) for k in keys]
-        return None if any(v is None for v in values) else [float(v) for v in values if v is not None]
-
-
 def _contact(row: _Row) -> dict[str, Any]:
     return {
-        "contact": row.integer("contact"),
-        "point_m": row.vector("x_m", "y_m", "z_m"),
-        "force_vector_n": row.vector("fx_n", "fy_n", "fz_n"),
-        "force_n": row.optional("force_n"),
-        "std_n": row.optional("std_n"),
-        "source": row.values.get("source") or "",
-        "track": int(row.optional("track") or 0),
-        "point_std_m": row.vector("x_std_m", "y_std_m", "z_std_m"),
-        "force_std_n": row.vector("fx_std_n", "fy_std_n", "fz_std_n"),
-        "radius_m": row.optional("radius_m"),
+        "contact": int(row["contact"]),
+        "point_m": _vector(row, "x_m", "y_m", "z_m"),
+        "force_vector_n": _vector(row, "fx_n", "fy_n", "fz_n"),
+        "force_n": row["force_n"],
+        "std_n": row["std_n"],
+        "source": row["source"],
+        "track": int(row.get("track") or 0),
+        "point_std_m": _vector(row, "x_std_m", "y_std_m", "z_std_m"),
+        "force_std_n": _vector(row, "fx_std_n", "fy_std_n", "fz_std_n"),
+        "radius_m": row.get("radius_m"),
     }
+
+
+def _vector(row: _Row, *names: str) -> list[float] | None:
+    values: list[Any] = [row.get(name) for name in names]
+    return None if None in values else values
 
 
 INPUT_COLUMNS = (("tension_", "_n", "N", "cables", "tension_n"), ("pressure_", "_pa", "Pa", "chambers", "pressure_pa"))
 """Inputs in frames.csv: prefix and suffix of the column, unit; and key and suffix of the limits in robot.toml."""
 
 
-def _input_columns(rows: list[_Row]) -> list[str]:
-    names = rows[0].values if rows else {}
-    return [name for before, after, *_ in INPUT_COLUMNS for name in names if name.startswith(before) and name.endswith(after)]
+def _is_input(column: str) -> bool:
+    return any(column.startswith(before) and column.endswith(after) for before, after, *_ in INPUT_COLUMNS)
 
 
 def _input(column: str, rows: list[_Row], robot: dict[str, Any]) -> dict[str, Any]:
     """Return name, unit and range of an input: declared by robot.toml, or from 0 to the largest value of the run if nothing is declared or
     the run exceeds it."""
     before, after, unit, table, limit = next(kind for kind in INPUT_COLUMNS if column.startswith(kind[0]))
-    values = [value for value in (row.optional(column) for row in rows) if value is not None]
+    values = [row[column] for row in rows if row[column] is not None]
     name = column[len(before) : -len(after)]
     low, high = min(0.0, *values, 0.0), max(0.0, *values, 0.0)
     declared: dict[str, Any] = next((row for row in robot.get(table, ()) if row.get("name") == name), {})
@@ -209,18 +189,19 @@ def _input(column: str, rows: list[_Row], robot: dict[str, Any]) -> dict[str, An
     return {"name": name, "unit": unit, "low": low, "high": high, "range": "reached"}
 
 
-def _rows(path: Path, columns: Iterable[str]) -> list[_Row]:
-    """Return the rows of a CSV file; empty if there is no file."""
+def _rows(path: Path, columns: Sequence[str]) -> list[_Row]:
+    """Return the rows of a CSV file, without columns that nothing here shows; none if there is no file. Raises InputError."""
     if not path.is_file():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        missing = [c for c in columns if c not in (reader.fieldnames or [])]
-        if missing:
-            raise InputError(
-                "columns are missing", where=path, found=", ".join(reader.fieldnames or []), expected=", ".join(missing)
-            )
-        return [_Row(row, f"{path}:{i}") for i, row in enumerate(reader, start=2)]
+    table = read_csv(path, required=columns, prefixes=("",))
+    found: dict[str, Sequence[Any]] = {name: table.text(name) for name in table.columns if name in TEXTS}
+    for name in table.columns:
+        if name in KEYS:
+            found[name] = table.numbers((name,))[:, 0].tolist()
+        elif name in NUMBERS or _is_input(name):
+            values = table.numbers((name,), empty_is_nan=True)[:, 0]
+            found[name] = [None if np.isnan(value) else value for value in values.tolist()]
+    return [dict(zip(found, row)) for row in zip(*found.values())]
 
 
 def _nearest(times: FloatArray, time: float) -> int:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.core.packages import needed
 from femsense.io.files import write_beside
-from femsense.xr.extras import needed
 from femsense.xr.glb_reader import AnimatedSkin, Surface, read_glb, read_surface
 from femsense.xr.gltf import T_GLTF_ROBOT, quaternions
 
@@ -35,10 +35,10 @@ def write_usdz(glb: bytes, path: str | Path) -> Path:
         the path.
 
     Raises:
-        InputError: not a mesh of femsense, or the package usd-core is missing.
+        InputError: not a mesh of femsense. MissingDependency: without the extra usd.
     """
     usd = {
-        name: needed(f"pxr.{name}", package="usd-core", extra="usd", doing="writing .usdz")
+        name: needed(f"pxr.{name}", "usd", "writing .usdz")
         for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "Vt")
     }
     animated, surface = read_glb(glb), read_surface(glb)

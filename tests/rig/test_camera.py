@@ -11,6 +11,7 @@ from femsense.core.errors import InputError
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.clouds.cloud_files import read_cloud
 from femsense.io.clouds.images import read_png
+from femsense.io.clouds.ply import write_ply
 from femsense.model.camera import Camera
 from femsense.model.robot import Observation
 from femsense.pointcloud.cloud import cloud_from_depth
@@ -25,7 +26,6 @@ from femsense.rig.camera import (
     thinned,
     visible_points,
     write_images,
-    write_ply,
 )
 from femsense.rig.camera_tables import NoiseTable, ViewTable
 from femsense.rig.depth_noise import depth_std

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_run import write_run_with_a_cloud
 
-from femsense.core.errors import InputError
+from femsense.core.errors import MissingDependency
 from femsense.fem.mesh import surface_triangles
 from femsense.sensing.types import Run
 from femsense.xr.rerun_export import export_rerun
@@ -61,6 +61,6 @@ def test_a_missing_package_gives_the_line_that_installs_it(
     made: tuple[Path, Run, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"femsense\[rerun\]"):
+    with pytest.raises(MissingDependency, match=r"femsense\[rerun\]"):
         export_rerun(made[0], tmp_path / "run.rrd")
     assert not (tmp_path / "run.rrd").exists()

@@ -161,7 +161,7 @@ def test_refusals_name_the_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"contacts\.csv.*columns are missing[\s\S]*force_n"):
         view.contacts_of_run(run)
     (run / "contacts.csv").write_text(re.sub("cloud", "cloud", table).replace(",0.1,", ",much,", 1), encoding="utf-8")
-    with pytest.raises(InputError, match=r"contacts\.csv:2, std_n.*not a number[\s\S]*much"):
+    with pytest.raises(InputError, match=r"contacts\.csv, line 2, column std_n.*not a number[\s\S]*much"):
         view.contacts_of_run(run)
     (run / "states.npz").write_bytes(b"not an archive")
     with pytest.raises(InputError, match="not readable"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import transform_points
 from femsense.io.clouds.cloud_files import viewpoint_doubt
@@ -28,7 +28,7 @@ def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[
     """Return frame, view and cloud of some frames that have one and whose file can be read."""
     r = recording
     having = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
-    chosen = [having[i] for i in np.unique(np.linspace(0, len(having) - 1, most).astype(int))] if having else []
+    chosen = [having[i] for i in spread_evenly(len(having), most)]
     found = []
     for k, v in chosen:
         try:

@@ -209,19 +209,3 @@ def upright(points: npt.ArrayLike, up: str | None) -> FloatArray:
     if up == "x":
         return np.stack([-xyz[:, 2], xyz[:, 1], xyz[:, 0]], axis=1)
     return xyz
-
-
-def need(module: str, extra: str, what: str) -> Any:
-    """Return an optional package. Raises InputError with the line that installs it."""
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"{what} needs a package that is not there",
-            where=module.split(".")[0],
-            found=" ".join(str(error).split()),
-            expected=f"the extra [{extra}]",
-            hint=f"pip install 'femsense[{extra}]'",
-        ) from None

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import FemsenseError, InputError
+from femsense.core.text import one_line
 from femsense.io.clouds.cloud_checks import cloud_doubts, cloud_problems
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.files import PART_PREFIX, file_hash, followed, other_files, write_json
@@ -133,7 +134,7 @@ def _accepted(path: Path, part: Path, final: Path, found: Mapping[str, Any]) -> 
             raise type(problem)(
                 problem.what, where=where, found=problem.found, expected=problem.expected, hint=problem.hint
             ) from None
-        return {"not_ready": " ".join(str(problem).split())}
+        return {"not_ready": one_line(problem)}
     for item in caught:
         warnings.warn(str(item.message).replace(str(part), str(final)), stacklevel=4)
     return {}
@@ -251,7 +252,7 @@ def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int
         except InputError as problem:
             if number == 0:
                 raise
-            warnings.warn(f"a frame keeps no picture: {' '.join(str(problem).split())}", stacklevel=2)
+            warnings.warn(f"a frame keeps no picture: {one_line(problem)}", stacklevel=2)
             kind = Picture.BROKEN
     markers = {name: np.asarray(place, dtype=float).tolist() for name, place in frame.markers.items()}
     strangers = np.asarray(frame.unlabelled, dtype=float).reshape(-1, 3)

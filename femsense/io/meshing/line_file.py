@@ -14,23 +14,22 @@ from femsense.io.meshing.channels import Channel
 from femsense.io.meshing.line_body import Cavity, Fold, LineBody
 from femsense.io.meshing.line_sections import Section, equal_section
 from femsense.io.robot_tables import GravityTable, MaterialTable, Name
-from femsense.io.tables import Schema, Vector, at_key, read_toml, validated
+from femsense.io.tables import NotNegative, Positive, Schema, Vector, at_key, read_toml, validated
 
 FORMAT = "femsense-line-1"
 PER_METRE = 1000.0
-Length = Annotated[float, Field(gt=0)]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Sections = Annotated[list["SectionTable"], Field(min_length=2)]
 
 
 class SectionTable(Schema):
     at_mm: Vector = Field(description="a point of the centre line in millimetres: [x, y, z]")
-    radius_mm: Length | None = Field(None, description="outer radius in millimetres, > 0")
-    bore_mm: Annotated[float, Field(ge=0)] = Field(0.0, description="radius of a hole around the axis in millimetres")
-    width_mm: Length | None = Field(None, description="of a rectangle, along angle 0, in millimetres, with height_mm")
-    height_mm: Length | None = Field(None, description="of a rectangle, along 90°, in millimetres, with width_mm")
-    area_mm2: Length | None = Field(None, description="area of the true section, with second_moment_mm4")
-    second_moment_mm4: Length | Annotated[list[Length], Field(min_length=2, max_length=2)] | None = Field(
+    radius_mm: Positive | None = Field(None, description="outer radius in millimetres, > 0")
+    bore_mm: NotNegative = Field(0.0, description="radius of a hole around the axis in millimetres")
+    width_mm: Positive | None = Field(None, description="of a rectangle, along angle 0, in millimetres, with height_mm")
+    height_mm: Positive | None = Field(None, description="of a rectangle, along 90°, in millimetres, with width_mm")
+    area_mm2: Positive | None = Field(None, description="area of the true section, with second_moment_mm4")
+    second_moment_mm4: Positive | Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = Field(
         None, description="∫x² dA of the true section in mm⁴, or [∫x² dA, ∫y² dA] with x along angle 0"
     )
 
@@ -54,24 +53,22 @@ class TendonTable(Schema):
     distance_mm: float | Pair = Field(description="distance from the axis in millimetres, or [at start_mm, at end_mm]")
     angle_deg: float | Pair = Field(0.0, description="angle about the axis in degrees, or [at start_mm, at end_mm]")
     start_mm: float = Field(0.0, description="length along the line where the channel begins, in millimetres")
-    end_mm: Length | None = Field(None, description="length along the line where the tendon is fixed; by default the end")
+    end_mm: Positive | None = Field(None, description="length along the line where the tendon is fixed; by default the end")
     pull_mm: Vector | None = Field(None, description="where it leaves to its motor, fixed in space: [x, y, z] in millimetres")
     points: Annotated[int, Field(ge=1)] | None = Field(None, description="points of the path; by default as many as it needs")
-    max_tension_n: Length | None = Field(None, description="largest tension in newton")
+    max_tension_n: Positive | None = Field(None, description="largest tension in newton")
 
 
 class ChamberTable(Schema):
     name: Name = Field(description="a name without commas, semicolons and quotes")
     from_mm: float = Field(ge=0, description="length along the line where it begins, in millimetres")
-    to_mm: Length = Field(description="length along the line where it ends, in millimetres")
-    radius_mm: Length | None = Field(None, description="radius of a round chamber in millimetres")
-    wall_mm: Length | None = Field(None, description="around the axis: thickness of the wall outside, in millimetres")
-    distance_mm: Annotated[float, Field(ge=0)] = Field(
-        0.0, description="of its middle from the axis in millimetres; 0: around it"
-    )
+    to_mm: Positive = Field(description="length along the line where it ends, in millimetres")
+    radius_mm: Positive | None = Field(None, description="radius of a round chamber in millimetres")
+    wall_mm: Positive | None = Field(None, description="around the axis: thickness of the wall outside, in millimetres")
+    distance_mm: NotNegative = Field(0.0, description="of its middle from the axis in millimetres; 0: around it")
     angle_deg: float = Field(0.0, description="angle of its middle about the axis in degrees")
-    inner_mm: Length | None = Field(None, description="a sector of a ring: its least distance from the axis, in millimetres")
-    outer_mm: Length | None = Field(None, description="a sector of a ring: its largest distance from the axis")
+    inner_mm: Positive | None = Field(None, description="a sector of a ring: its least distance from the axis, in millimetres")
+    outer_mm: Positive | None = Field(None, description="a sector of a ring: its largest distance from the axis")
     span_deg: Annotated[float, Field(gt=0, lt=360)] | None = Field(None, description="a sector of a ring: how wide it is")
     max_pressure_pa: float = Field(40e3, gt=0, description="largest pressure in pascal, > 0")
 
@@ -91,9 +88,9 @@ class ChamberTable(Schema):
 
 class BellowsTable(Schema):
     from_mm: float = Field(ge=0, description="length along the line where they begin, in millimetres")
-    to_mm: Length = Field(description="length along the line where they end, in millimetres")
+    to_mm: Positive = Field(description="length along the line where they end, in millimetres")
     count: int = Field(ge=1, le=100, description="number of folds")
-    depth_mm: Length = Field(description="how much smaller the radius is at the bottom of a fold, in millimetres")
+    depth_mm: Positive = Field(description="how much smaller the radius is at the bottom of a fold, in millimetres")
 
 
 class MarkerTable(Schema):
@@ -105,7 +102,7 @@ class MarkerTable(Schema):
 
 class ClampTable(Schema):
     ends: Literal["first", "last", "both"] = Field("first", description='ends = "first", "last" or "both"')
-    length_mm: Annotated[float, Field(ge=0)] = Field(0.0, description="how much of the line is clamped, in millimetres")
+    length_mm: NotNegative = Field(0.0, description="how much of the line is clamped, in millimetres")
 
 
 class LineTable(Schema):

@@ -22,11 +22,11 @@ from femsense.io.meshing.channels import Channel, Subdivision, channel_path, pul
 from femsense.io.meshing.line_body import Cavity, LineBody, mesh_line, place
 from femsense.io.meshing.line_file import LineTable, channels_of, line_of, read_line
 from femsense.io.meshing.quality import quality_report, quality_text
+from femsense.io.meshing.robot_from_surface import MESH_FILE, REPORT_FILE, finished, report_in
 from femsense.io.robot_body import boxes_around
 from femsense.io.robot_toml import load_robot
 from femsense.io.tables import read_toml
 
-MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 ROUND = 1e-6
 """Boxes of clamped nodes reach so far beyond them [m]."""
 
@@ -56,8 +56,8 @@ def line_into(
     """
     path, target = Path(source).expanduser(), Path(folder).expanduser()
     inputs = {"line": path.name, "sha256": file_hash(path), "most_tets": most_tets, "along_mm": along_mm}
-    known = _known(target)
-    if known and not again and known["inputs"] == inputs and known["femsense"] == femsense.__version__:
+    _check_target(target)
+    if not again and (known := finished(target, inputs)):
         say(f"{target} contains this robot already (--again repeats it)")
         return known
     table = read_line(path)
@@ -83,33 +83,22 @@ def line_into(
         "tendons": [plain({name: getattr(p, name) for name in Subdivision.__slots__}, nonfinite=True) for p in paths],
         "chambers": [c.name for c in line.cavities],
         "robot": {"folder": str(target), "mesh_file": MESH_FILE, "unit": "m", "robot_toml": "written"},
+        "mesh_sha256": file_hash(target / MESH_FILE),
     }
     write_json(target / REPORT_FILE, report)
     return report
 
 
-def _known(target: Path) -> dict[str, Any] | None:
-    """Return the report of a folder that was made from a line; None where it is new.
-
-    Raises InputError if the folder has other content.
-    """
-    import json
-
+def _check_target(target: Path) -> None:
     check_target(target, folder=True)
-    if not target.is_dir() or not any(target.iterdir()):
-        return None
-    try:
-        report: dict[str, Any] = json.loads((target / REPORT_FILE).read_text(encoding="utf-8"))
-        if "line" in report["inputs"]:
-            return report
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
-    raise InputError(
-        "the folder contains something else than a robot from such a description",
-        where=target,
-        expected="a new folder",
-        hint="another -o: robot.toml would be replaced",
-    )
+    made_of = report_in(target).get("inputs")
+    if target.is_dir() and any(target.iterdir()) and not (isinstance(made_of, dict) and "line" in made_of):
+        raise InputError(
+            "the folder contains something else than a robot from such a description",
+            where=target,
+            expected="a new folder",
+            hint="another -o: robot.toml would be replaced",
+        )
 
 
 def clamp_boxes(table: LineTable, line: LineBody, mesh: TetMesh, along: FloatArray) -> list[FloatArray]:

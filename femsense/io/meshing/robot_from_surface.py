@@ -74,7 +74,7 @@ def mesh_into(
     points, triangles = read_any_surface(source, unit=options.unit or "mm")
     check_unit(points, options.unit, source)
     inputs = {"surface": source.name, "sha256": file_hash(source), "options": asdict(options)}
-    if not again and (known := _finished(target, inputs)):
+    if not again and (known := finished(target, inputs)):
         say(f"{target} contains this mesh already (--again repeats the meshing)")
         return known
     filled = fill_cad(source, points, triangles, options, progress=progress) if source.suffix.lower() in CAD_READ else None
@@ -221,15 +221,26 @@ def _check_target(target: Path) -> None:
     check_target(target, folder=True)
 
 
-def _finished(target: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the report of a folder that holds the mesh of these inputs already."""
+def report_in(target: Path) -> dict[str, Any]:
+    """Return the report of a robot's folder; empty where there is none."""
     import json
 
     try:
-        known: dict[str, Any] = json.loads((target / REPORT_FILE).read_text(encoding="utf-8"))
+        known = json.loads((target / REPORT_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def finished(target: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the report of a folder that holds the mesh of these inputs already; None where it has to be made."""
+    import json
+
+    known = report_in(target)
+    try:
         same = known["inputs"] == json.loads(json.dumps(inputs)) and known["femsense"] == femsense.__version__
         whole = file_hash(target / known["robot"]["mesh_file"]) == known["mesh_sha256"] and (target / "robot.toml").is_file()
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, KeyError, TypeError):
         return None
     return known if same and whole else None
 

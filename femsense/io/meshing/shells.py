@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, diagonal
 from femsense.core.errors import InputError
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to, neighbours, place_text, winding_number
 
@@ -76,7 +76,7 @@ def _meeting(
     crossing = crossing_triangles(points, triangles)
     meets = np.zeros((len(corners),) * 2, dtype=bool)
     meets[of[crossing[:, 0]], of[crossing[:, 1]]] = True
-    near = TOUCHING * float(np.linalg.norm(np.ptp(points, axis=0)))
+    near = TOUCHING * diagonal(points)
     close = (low[:, None] <= high[None] + near).all(axis=2) & (high[:, None] >= low[None] - near).all(axis=2) & ~meets
     np.fill_diagonal(close, False)
     for j in np.flatnonzero(close.any(axis=0)):
@@ -93,17 +93,11 @@ def shell_volumes(points: FloatArray, triangles: IntArray, of: IntArray) -> Floa
     return np.asarray(np.bincount(of, np.einsum("tc,tc->t", a, np.cross(b, c)) / 6.0), dtype=np.float64)
 
 
-def area_vectors(points: FloatArray, triangles: IntArray) -> FloatArray:
-    """Return the outward area vector of each triangle [unit²], shape (t, 3)."""
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    return np.cross(b - a, c - a) / 2.0
-
-
 def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
     """Return the triangles without pieces of next to no volume. Raises InputError."""
     of = pieces(triangles)
     size = np.abs(shell_volumes(points, triangles, of))
-    if size.max() <= 1e-9 * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3:
+    if size.max() <= 1e-9 * diagonal(points) ** 3:
         raise InputError(
             "the surface encloses nothing",
             where=where,
@@ -172,6 +166,3 @@ def _bodies_text(points: FloatArray, triangles: IntArray, shells: Shells, unit: 
         parts.append(f"{body + 1}: {' × '.join(f'{v:.3g}' for v in size)} {unit} around {place_text(points, middle)}")
     more = int(shells.body.max()) + 1 - len(parts)
     return "; ".join(parts) + (f"; and {more} more" if more > 0 else "")
-
-
-# Geometry

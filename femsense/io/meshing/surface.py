@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, diagonal, freeze
 from femsense.core.errors import InputError
-from femsense.io.meshing.shells import MOST_SHELLS, area_vectors, chosen, faced, find_shells, pieces, shell_volumes, without_dust
+from femsense.fem.mesh import triangle_normals
+from femsense.io.meshing.shells import MOST_SHELLS, chosen, faced, find_shells, pieces, shell_volumes, without_dust
 from femsense.io.meshing.surface_queries import directed_edges, neighbours, open_edges, place_text
 
 WELD = 1e-5
@@ -41,7 +42,7 @@ class ClosedSurface:
 
     @property
     def diagonal(self) -> float:
-        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        return diagonal(self.points)
 
     @property
     def volume(self) -> float:
@@ -50,7 +51,7 @@ class ClosedSurface:
 
     @property
     def area(self) -> float:
-        return float(np.linalg.norm(area_vectors(self.points, self.triangles), axis=1).sum())
+        return float(np.linalg.norm(triangle_normals(self.points, self.triangles), axis=1).sum())
 
 
 def repaired(
@@ -97,9 +98,9 @@ def _tidied(points: FloatArray, triangles: IntArray, where: str, done: list[str]
     """Weld points, drop triangles that repeat a point or another triangle."""
     check_finite(points, where)
     points, triangles = merged(points, triangles)
-    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    size = diagonal(points)
     if len(open_edges(triangles)):
-        welded = _weld(points, triangles, WELD * diagonal)
+        welded = _weld(points, triangles, WELD * size)
         if len(open_edges(welded)) < len(open_edges(triangles)):
             done.append(f"seams up to {WELD:g} of the diagonal wide were welded")
             triangles = welded
@@ -111,7 +112,7 @@ def _tidied(points: FloatArray, triangles: IntArray, where: str, done: list[str]
     if len(first) < len(triangles):
         done.append(f"{len(triangles) - len(first)} triangles that stood twice were dropped")
         triangles = triangles[first]
-    if len(triangles) < 4 or np.ptp(points, axis=0).min() <= 1e-9 * diagonal:
+    if len(triangles) < 4 or np.ptp(points, axis=0).min() <= 1e-9 * size:
         raise InputError(
             "the surface encloses nothing",
             where=where,
@@ -203,7 +204,7 @@ def _closed(
     if not holes:
         return points, triangles
     length = [float(np.linalg.norm(points[hole] - points[np.roll(hole, 1)], axis=1).sum()) for hole in holes]
-    limit = np.inf if everything else SMALL_HOLE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    limit = np.inf if everything else SMALL_HOLE * diagonal(points)
     large = [(size, hole) for size, hole in zip(length, holes) if size > limit]
     if large:
         size, hole = max(large, key=lambda item: item[0])
@@ -239,7 +240,7 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
     edges, labels = np.sort(directed_edges(triangles), axis=1), pieces(triangles)
     bounds = (edges[:, None] == np.sort(loose, axis=1)[None]).all(axis=2).any(axis=1)
     hangs = np.isin(labels, labels[np.flatnonzero(bounds) // 3])
-    area = np.linalg.norm(area_vectors(points, triangles), axis=1)
+    area = np.linalg.norm(triangle_normals(points, triangles), axis=1)
     if area[hangs].sum() > 0.5 * area.sum():
         raise InputError(
             "the surface is open",

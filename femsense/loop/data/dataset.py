@@ -10,24 +10,22 @@ import numpy as np
 from femsense.calib.calibrate import calibrated_start, usable_frames
 from femsense.calib.first_poses import first_poses
 from femsense.calib.inputs import first_inputs, input_bounds
-from femsense.core.arrays import FloatArray, IntArray, spread_evenly
+from femsense.core.arrays import FloatArray, IntArray, diagonal, spread_evenly
 from femsense.core.errors import DataError, InputError
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.surface_rows import (
     SMOOTH,
     SURFACE_POINTS,
     cloud_frames,
-    diagonal_of,
-    has_clouds,
     make_rows,
     read_clouds,
-    states_of,
     surface_normals,
     with_surface,
 )
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
 from femsense.loop.options import Measured
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
+from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, state_key
@@ -174,7 +172,7 @@ def _frames_of(recording: Recording, measured: Measured) -> tuple[IntArray, IntA
 
 def _nothing(recording: Recording, measured: Measured) -> str:
     wanted = measured if measured in (Measured.markers, Measured.clouds) else "markers or clouds"
-    has = {"markers": bool(len(recording.marker_frame)), "clouds": has_clouds(recording)}
+    has = {"markers": bool(len(recording.marker_frame)), "clouds": recording.has_clouds}
     if not any(has[kind] for kind in has if kind in wanted):
         return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in contact-free frames (or frames with declared loads)"
     return f"no contact-free frame has {wanted}: the loop needs {wanted} in contact-free frames (or frames with declared loads)"
@@ -224,7 +222,7 @@ def _trials(
     if not len(np.intersect1d(cloudy, fitted)):
         return result
     empty = _bare_scene(robot, recording, np.intersect1d(cloudy, every), with_rest=not result)
-    states = states_of(robot, empty, poses, initial)
+    states = evaluate_robot(robot, empty, poses, initial).states
     seen = read_clouds(robot, recording, states, poses)
     pair: list[Trial | None] = []
     for frames in (fitted, kept):
@@ -275,7 +273,9 @@ def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surfa
     keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
     states = np.unique([keys[f] for f in scene.frame], return_inverse=True)[1]
     at_rest = surface_normals(robot, robot.body.mesh.nodes)[scene.marker - len(robot.glued_names)]
-    return SurfaceRows(robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal_of(robot))
+    return SurfaceRows(
+        robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal(robot.body.mesh.nodes)
+    )
 
 
 def groups_of(scene: Scene, frames: IntArray | None = None, surface: SurfaceRows | None = None) -> Groups:

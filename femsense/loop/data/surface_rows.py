@@ -11,7 +11,6 @@ recomputes it as the fit proceeds). Without this the true model would leave a re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.meshing.surface_queries import nearest_on
-from femsense.model.as_it_is import evaluate_robot
 from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.observation import Scene
@@ -81,11 +79,6 @@ class MeasuredSurface:
         return list(self.points.values())[sheet]
 
 
-def has_clouds(recording: Recording) -> bool:
-    """Return whether any frame of a recording has a cloud or a depth image."""
-    return any(file is not None for files in recording.cloud_files for file in files)
-
-
 def cloud_frames(recording: Recording) -> IntArray:
     """Return the frames that have a cloud or a depth image."""
     return np.array([k for k, files in enumerate(recording.cloud_files) if any(f is not None for f in files)], dtype=np.int64)
@@ -98,11 +91,6 @@ def with_surface(robot: Robot) -> Robot:
     flat = spread_features(robot.body, SURFACE_POINTS, among=flat_nodes(surface, nodes))
     chosen = flat if len(flat) >= FEWEST_ROWS else spread_features(robot.body, SURFACE_POINTS)
     return robot.with_surface_points(nodes[chosen])
-
-
-def diagonal_of(robot: Robot) -> float:
-    """Return the diagonal of the body at rest [m]."""
-    return diagonal(robot.body.mesh.nodes)
 
 
 # Measured surface
@@ -122,7 +110,7 @@ def read_clouds(
     Raises:
         InputError: a malformed file; DataError: no camera sees the robot in any of the frames.
     """
-    size = diagonal_of(robot)
+    size = diagonal(robot.body.mesh.nodes)
     voxel = VOXEL * size
     triangles = surface_triangles(robot.body.mesh)
     points: dict[tuple[int, int], FloatArray] = {}
@@ -165,17 +153,6 @@ def _robot_points(
     return as_measured(own.points, np.zeros(len(own), dtype=np.int64), [pose], robot.observation)
 
 
-def states_of(
-    robot: Robot,
-    scene: Scene,
-    poses: Sequence[FloatArray],
-    initial: FloatArray | None,
-    starts: dict[int, Equilibrium] | None = None,
-) -> dict[int, Equilibrium]:
-    """Return the equilibrium of each frame of a scene. Raises DataError if there is none."""
-    return evaluate_robot(robot, scene, poses, initial, starts).states
-
-
 # Rows
 
 
@@ -203,7 +180,8 @@ def make_rows(
             every.append((np.full(len(numbers), k), len(robot.glued_names) + numbers, np.full(len(numbers), v), heights, own))
     if not every:
         raise DataError(
-            f"no part of the measured surface lies within {1e3 * REACH * diagonal_of(robot):.0f} mm of the model's: check T_robot_camera and the inputs"
+            f"no part of the measured surface lies within {1e3 * REACH * diagonal(robot.body.mesh.nodes):.0f} mm of the model: "
+            "check T_robot_camera and the inputs"
         )
     frame, marker, view = (np.concatenate([e[i] for e in every]) for i in range(3))
     heights = np.concatenate([e[3] for e in every])
@@ -224,7 +202,11 @@ def crossings_of(
     distance, normals = seen.sheets.distance(at, np.full(len(at), sheet), sides)
     steep = np.einsum("kc,kc->k", normals, sides)
     feet = at - (distance / np.maximum(steep, STEEPEST))[:, None] * sides
-    good = (np.einsum("kc,kc->k", rays, sides) >= FACING) & (np.abs(distance) <= REACH * diagonal_of(robot)) & (steep >= STEEPEST)
+    good = (
+        (np.einsum("kc,kc->k", rays, sides) >= FACING)
+        & (np.abs(distance) <= REACH * diagonal(robot.body.mesh.nodes))
+        & (steep >= STEEPEST)
+    )
     good[good] = _amid(feet[good], normals[good], seen.cloud(sheet), RADIUS * seen.voxel)
     rounded = np.full(len(at), np.nan)
     rounded[good] = _rounded(robot, seen, sheet, state, pose, at[good], sides[good])

@@ -10,7 +10,7 @@ import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
-from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
+from femsense.loop.data.surface_rows import make_rows, renewed_rows
 from femsense.loop.data.trial import Trial, rms_of, spans_of
 from femsense.loop.fit.joint_fit import FitOptions, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
@@ -255,7 +255,7 @@ def rematched(data: Data, fitted: FittedModel, noise: Noise, *, reselect: bool =
 def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, reselect: bool) -> Trial:
     if trial.seen is None:
         return trial
-    states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
+    states = evaluate_robot(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh)).states
     if not reselect:
         return replace(trial, scene=renewed_rows(robot, trial.scene, trial.seen, states, poses))
     scene = make_rows(robot, trial.scene, trial.seen, states, poses)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.fem.mesh import element_volumes
 from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, Parameter, number, vector
@@ -50,7 +50,7 @@ def _region_places(robot: Robot) -> tuple[Entry, ...]:
     """Spheres around places that are spread over the surface, and around the middles of the body's parts;
     those that hold the centroid of an element."""
     mesh = robot.body.mesh
-    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    size = diagonal(mesh.nodes)
     centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
     places = [*mesh.nodes[spread_features(robot.body, 8)], *_middles(centroids, np.abs(element_volumes(mesh)), 3)]
     spheres = [(p, r * size) for p in places for r in RADII]
@@ -218,16 +218,7 @@ HYPERELASTIC: Effect = Effect(
     told_by=Experiment.MORE_MARKERS,
     planned=lambda robot: (("", GENT if robot.body.material.law == "neo_hookean" else HYPERELASTIC),),
 )
-GENT: Effect = Effect(
-    "hyperelastic",
-    "stiffening or softening with stretch",
-    _gent_parameters,
-    _apply_law,
-    _gent_seeds,
-    keys=("law", "jm"),
-    discrete=True,
-    told_by=Experiment.MORE_MARKERS,
-)
+GENT: Effect = replace(HYPERELASTIC, parameters=_gent_parameters, seeds=_gent_seeds, planned=None)
 CREEP = Effect(
     "creep",
     "slow flow under load",
@@ -239,14 +230,4 @@ CREEP = Effect(
     told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
     drives=True,
 )
-CREEP_TWICE = Effect(
-    "creep",
-    "slow flow under load",
-    _creep_twice_parameters,
-    _apply_creep,
-    _creep_twice_seeds,
-    keys=("fraction", "time_s"),
-    polish=_creep_twice_polish,
-    told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
-    drives=True,
-)
+CREEP_TWICE = replace(CREEP, parameters=_creep_twice_parameters, seeds=_creep_twice_seeds, polish=_creep_twice_polish)

@@ -19,12 +19,12 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
 from femsense.core.text import did_you_mean
+from femsense.io.recording_tables import PLACE_COLUMNS
 from femsense.io.recording_toml import RecordingTable, views_of
 from femsense.io.tables import Table, read_csv, read_text, read_toml, validated
 from femsense.xr.proprioception.labelled import AS_MEASURED, ROBOT, Labelled, labelled
 
 NOT_CHANNELS = ("frame", "time_s")
-AXES = ("x_m", "y_m", "z_m")
 TURN = ("qw", "qx", "qy", "qz")
 UNIT = 0.01
 """Tolerance of the length of a quaternion."""
@@ -141,7 +141,7 @@ def _read_markers(
     Positions are transformed by the poses of their cameras, if known; with several cameras the mean position is used, and the rotation of
     the last one.
     """
-    table = read_csv(path, required=("frame", "marker", *AXES), optional=("camera", *TURN))
+    table = read_csv(path, required=("frame", "marker", *PLACE_COLUMNS), optional=("camera", *TURN))
     labels, numbers = table.text("marker"), table.integers("frame")
     names = tuple(dict.fromkeys(labels))
     if not names or "" in names:
@@ -195,7 +195,7 @@ def _turned(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArra
 
 def _moved(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray:
     """Return the places of markers, shape (k, 3), each through the pose of its camera."""
-    places = table.numbers(AXES)
+    places = table.numbers(PLACE_COLUMNS)
     cameras = np.array(table.text("camera") if "camera" in table.columns else [""] * len(table))
     found = set(cameras.tolist())
     if not poses and len(found) > 1:

@@ -12,17 +12,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Event, Lock
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
+from femsense.core.packages import needed
 from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.packet_limit import PacketLimit
 from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, STOP, split_topic, status_bytes, topic
-from femsense.xr.stream.quiet import keep_quiet
+from femsense.xr.stream.server_thread import ServerThread
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -236,11 +237,10 @@ def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | No
 
 def make_client(address: BrokerAddress) -> Client:
     """Return a client that is not connected yet. Raises MissingDependency, InputError."""
-    try:
-        from paho.mqtt.client import Client
-        from paho.mqtt.enums import CallbackAPIVersion
-    except ImportError:
-        raise MissingDependency("MQTT needs the package paho-mqtt\n  try:      pip install 'femsense[xr]'") from None
+    needed("paho.mqtt.client", "xr", "MQTT")
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
     client = Client(CallbackAPIVersion.VERSION2)
     client.reconnect_delay_set(0.2, 5.0)  # type: ignore[arg-type]
     client.on_socket_open = _without_delay
@@ -260,7 +260,7 @@ def _without_delay(_client: Any, _data: Any, endpoint: Any) -> None:
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-class EmbeddedBroker:
+class EmbeddedBroker(ServerThread):
     """A broker in this program, for clients on this machine unless a password is set; a sink of a hub:
     messages reach clients in one step."""
 
@@ -272,56 +272,33 @@ class EmbeddedBroker:
             port: 0 selects a free one.
             access: address, password and TLS certificate; by default 127.0.0.1 without a password.
         """
-        try:
-            import amqtt.broker  # noqa: F401
-        except ImportError:
-            raise MissingDependency("a broker needs the package amqtt\n  try:      pip install 'femsense[xr]'") from None
+        needed("amqtt.broker", "xr", "a broker")
+        super().__init__("femsense-broker")
         self.port = port or _free_port()
         self._access, self._hub = access or Access(), hub
         self._access.tls()  # raises early if the certificate is invalid
-        self._loop = asyncio.new_event_loop()
-        keep_quiet(self._loop)
         self._broker: Any = None
         self._deliveries: set[asyncio.Task[None]] = set()
         self._arrived: set[str] = set()
-        self._failed: BaseException | None = None
-        self._finish = asyncio.Event()
-        ready = Event()
-        self._thread = Thread(target=self._run, args=(ready,), daemon=True, name="femsense-broker")
-        self._thread.start()
-        ready.wait()
-        if self._failed is not None:
+        failed = self._start()
+        if failed is not None:
             raise InputError(
-                "the broker cannot be served", where=f"port {port}", found=self._failed, hint="--mqtt HOST, if one runs there"
+                "the broker cannot be served", where=f"port {port}", found=failed, hint="--mqtt HOST, if one runs there"
             ) from None
         hub.attach(self)
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to clients; returns at once."""
-        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-            self._loop.call_soon_threadsafe(self._take, messages)
+        self._call(self._take, messages)
 
     @property
     def clients(self) -> int:
         """Number of different clients that were accepted."""
         return len(self._arrived)
 
-    def close(self) -> None:
-        """Let clients go and free the port."""
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._finish.set)
-        self._thread.join(5.0)
-
     # ---- in the thread of the broker
 
-    def _run(self, ready: Event) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve(ready))
-        finally:
-            self._loop.close()
-
-    async def _serve(self, ready: Event) -> None:
+    async def _open(self) -> None:
         from femsense.xr.stream.broker_guests import NewestToEach
 
         for name in ("amqtt", "transitions"):
@@ -332,19 +309,11 @@ class EmbeddedBroker:
             key = self._access.key or self._access.certificate
             listener |= {"ssl": True, "certfile": str(self._access.certificate), "keyfile": str(key)}
         settings = {"listeners": {"default": listener}, "plugins": {"femsense.xr.stream.broker_guests.Guests": guests}}
-        try:
-            self._broker = NewestToEach(settings)
-            await self._broker.start()
-        except Exception as error:  # amqtt wraps system errors in its own classes
-            self._failed = error.__cause__ or error
-            ready.set()
-            return
-        ready.set()
-        await self._finish.wait()
-        with contextlib.suppress(Exception):
-            await asyncio.wait_for(self._broker.shutdown(), 3.0)
-        for task in asyncio.all_tasks() - {asyncio.current_task()}:
-            task.cancel()
+        self._broker = NewestToEach(settings)
+        await self._broker.start()
+
+    async def _shut(self) -> None:
+        await self._broker.shutdown()
 
     def _hear(self, message: Message, who: str) -> None:
         known = split_topic(message.topic)

@@ -93,6 +93,11 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
             expected=f"at most half of the chain's length, {500.0 * length:.3g} mm",
             hint="--skin-unit, or a surface in the frame in which the markers were measured",
         )
+    return _between_bones(vertices, bones, owner, share)
+
+
+def _between_bones(vertices: FloatArray, bones: FloatArray, owner: IntArray, share: FloatArray) -> Skin:
+    """Return a skin whose vertices follow a bone, shape (v,), and the next one by a share, shape (v,)."""
     weights, joints = np.zeros((len(vertices), INFLUENCES)), np.zeros((len(vertices), INFLUENCES), dtype=np.int64)
     weights[:, 0], weights[:, 1] = 1.0 - share, share
     joints[:, 0], joints[:, 1] = owner, np.minimum(owner + 1, len(bones) - 1)
@@ -157,13 +162,8 @@ def tube_around(places: FloatArray, across: FloatArray) -> tuple[Skin, IntArray]
     ring = middle[:, None] + THICKNESS * length * np.einsum("rij,ja->rai", across[nearest], circle)
     points = np.vstack([ring.reshape(-1, 3), middle[:1], middle[-1:]])
     blend = np.clip(share[:, 0], 0.0, 1.0)
-    weights = np.zeros((len(points), INFLUENCES))
-    joints = np.zeros((len(points), INFLUENCES), dtype=np.int64)
-    owner = np.concatenate([np.repeat(np.arange(len(at)), AROUND), [0, len(at) - 1]])
-    weights[:, 0], weights[:, 1] = 1 - blend[owner], blend[owner]
-    joints[:, 0], joints[:, 1] = k[owner], np.minimum(k + 1, b - 1)[owner]
-    joints[weights == 0.0] = 0
-    return Skin(skeleton_at(places), points, joints, weights), _tube_triangles(len(at))
+    of = np.concatenate([np.repeat(np.arange(len(at)), AROUND), [0, len(at) - 1]])  # the ring of each vertex
+    return _between_bones(points, places, k[of], blend[of]), _tube_triangles(len(at))
 
 
 def _tube_triangles(rings: int) -> IntArray:

@@ -8,7 +8,8 @@ from contextlib import closing
 from threading import Event
 from urllib.parse import parse_qs
 
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
+from femsense.core.packages import needed
 
 LONGEST_LINE = 65_536
 WAIT_S = 0.1
@@ -24,10 +25,7 @@ class SerialLine:
             InputError: no such kind of port, or no such speed.
             MissingDependency: pyserial is not installed.
         """
-        try:
-            import serial
-        except ImportError:
-            raise MissingDependency("a serial line needs the package pyserial\n  try:      pip install 'femsense[xr]'") from None
+        serial = needed("serial", "xr", "reading a serial line")
         port, _, more = source.removeprefix("serial:").partition("?")
         baud = parse_qs(more).get("baud", ["115200"])[0]
         try:

@@ -19,17 +19,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Lock
 from typing import TYPE_CHECKING
 
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
+from femsense.core.packages import needed
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import GLB, RECEIVED, split_topic, topic
-from femsense.xr.stream.quiet import keep_quiet, stream_log
+from femsense.xr.stream.quiet import stream_log
+from femsense.xr.stream.server_thread import ServerThread
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 ENTRY = struct.Struct("<HI")
@@ -128,7 +130,7 @@ class _Viewer:
         return taken
 
 
-class WebSocketServer:
+class WebSocketServer(ServerThread):
     """Serves the page, the meshes and `/ws` from a thread of its own; a sink of a hub."""
 
     def __init__(
@@ -147,6 +149,7 @@ class WebSocketServer:
             MissingDependency: the package websockets is not installed.
         """
         require_websockets()
+        super().__init__("femsense-websocket")
         self.hub, self.page = hub, page
         self.access, self.options = access or Access(), options or ServerOptions()
         self.port = 0
@@ -157,19 +160,13 @@ class WebSocketServer:
         self._viewers: set[_Viewer] = set()
         self._fresh: dict[str, Message] = {}
         self._lock = Lock()
-        self._loop = asyncio.new_event_loop()
-        keep_quiet(self._loop)
-        self._finish: asyncio.Event | None = None
-        self._failed: BaseException | None = None
-        ready = Event()
-        self._thread = Thread(target=self._run, args=(self.access.tls(), ready), daemon=True, name="femsense-websocket")
-        self._thread.start()
-        ready.wait()
-        if self._failed is not None:
+        self._tls = self.access.tls()
+        failed = self._start()
+        if failed is not None:
             raise InputError(
                 "the stream cannot be served",
                 where=f"{self.access.host}, port {self.options.port}",
-                found=self._failed,
+                found=failed,
                 hint="port 0 takes a free one",
             ) from None
         hub.attach(self)
@@ -192,55 +189,34 @@ class WebSocketServer:
             self._fresh.update((message.topic, message) for message in messages if not message.topic.endswith(f"/{GLB}"))
             first = first and bool(self._fresh)
         if first:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._hand_out)
-
-    def close(self) -> None:
-        """Let all viewers go and free the port."""
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(lambda: self._finish.set() if self._finish is not None else None)
-        self._thread.join(5.0)
+            self._call(self._hand_out)
 
     # ---- in the thread of the server
 
-    def _run(self, tls: object, ready: Event) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve(tls, ready))
-        finally:
-            self._loop.close()
-
-    async def _serve(self, tls: object, ready: Event) -> None:
+    async def _open(self) -> None:
         from websockets.asyncio.server import serve
 
-        self._finish = asyncio.Event()
-        try:
-            server: Server = await serve(
-                self._attend,
-                self.access.host,
-                self.options.port,
-                ssl=tls,
-                process_request=self._answer,
-                compression=None,
-                max_size=LARGEST_FRAME,
-                max_queue=8,
-                write_limit=SMALLEST_BUFFER,
-                ping_interval=self.options.ping_s,
-                ping_timeout=self.options.ping_s,
-                close_timeout=1.0,
-                server_header=None,
-                logger=stream_log(),
-            )
-        except OSError as error:
-            self._failed = error
-            ready.set()
-            return
-        self.port = next(iter(server.sockets)).getsockname()[1]
-        ready.set()
-        await self._finish.wait()
-        server.close()
-        with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(server.wait_closed(), 3.0)
+        self._server = await serve(
+            self._attend,
+            self.access.host,
+            self.options.port,
+            ssl=self._tls,
+            process_request=self._answer,
+            compression=None,
+            max_size=LARGEST_FRAME,
+            max_queue=8,
+            write_limit=SMALLEST_BUFFER,
+            ping_interval=self.options.ping_s,
+            ping_timeout=self.options.ping_s,
+            close_timeout=1.0,
+            server_header=None,
+            logger=stream_log(),
+        )
+        self.port = next(iter(self._server.sockets)).getsockname()[1]
+
+    async def _shut(self) -> None:
+        self._server.close()
+        await self._server.wait_closed()
 
     def _hand_out(self) -> None:
         with self._lock:
@@ -363,7 +339,4 @@ def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = 
 
 def require_websockets() -> None:
     """Raise MissingDependency if the package is not installed."""
-    try:
-        import websockets  # noqa: F401
-    except ImportError:
-        raise MissingDependency("streams need the package websockets\n  try:      pip install 'femsense[xr]'") from None
+    needed("websockets", "xr", "streaming")

@@ -195,6 +195,9 @@ def test_the_command_makes_a_robot_and_inspect_warns_of_few_points(tmp_path: Pat
     assert robot.body.material.density == SILICONE["density_kg_m3"]
     assert run(["mesh", str(source), "-o", str(tmp_path / "robot"), "--max-tets", "700"]) == 0
     assert "contains this robot already" in capsys.readouterr().err
+    (tmp_path / "robot" / "mesh.vtu").unlink()
+    assert run(["mesh", str(source), "-o", str(tmp_path / "robot"), "--max-tets", "700"]) == 0
+    assert load_robot(tmp_path / "robot").body.mesh.nodes.shape == robot.body.mesh.nodes.shape
     assert run(["inspect", str(tmp_path / "robot")]) == 0
     assert "between points 0 and 1 of its path" in capsys.readouterr().out
     (tmp_path / "robot" / "mesh.json").unlink()

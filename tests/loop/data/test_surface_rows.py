@@ -14,6 +14,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals
+from femsense.io.clouds.ply import write_ply
 from femsense.io.recording_folder import load_recording, save_recording
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.surface_rows import (
@@ -40,7 +41,7 @@ from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.sheets import Sheets, fit_sheet, joined
-from femsense.rig.camera import Shape, cloud_of, render, write_ply
+from femsense.rig.camera import Shape, cloud_of, render
 from femsense.rig.script import NoiseTable
 
 LENS = Camera("", 240, 180, 600.0, 600.0, 119.5, 89.5, np.zeros(5), 1e-4)

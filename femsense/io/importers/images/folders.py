@@ -113,7 +113,7 @@ def open_clouds(folder: Path, options: Options) -> Source:
     doubt = viewpoint_doubt(files[0])
     if doubt is not None:
         warnings.warn(doubt, stacklevel=3)
-    scale = unit_of(options, _declared_unit(files[0]), files[0], _extent(files[0]))
+    scale = _unit_of_clouds(files[0], options)
     frames = [Frame(t, picture=partial(_scaled_cloud, file, scale)) for t, file in zip(times, files)]
     endings = sorted({file.suffix.lower() for file in files})
     return Source(
@@ -333,19 +333,14 @@ def _scaled_cloud(file: Path, scale: float) -> PointCloud:
     return cloud if scale == 1.0 else PointCloud(scale * cloud.points, cloud.colors)
 
 
-def _extent(file: Path) -> float:
-    points = read_points(file).points
-    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-
-
-def _declared_unit(file: Path) -> str | None:
-    """Return "m" for formats whose writers use metres where size and distance agree with it (PLY and PCD of cameras)."""
-    if file.suffix.lower() not in (".ply", ".pcd"):
-        return None
+def _unit_of_clouds(file: Path, options: Options) -> float:
+    """Return metres in one unit of clouds: of the option, else 1 for formats whose writers use metres where size and distance of the first cloud
+    agree with it (PLY and PCD of cameras). Raises InputError."""
     points = read_points(file).points
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     away = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-    return "m" if extent < WIDEST and away <= FARTHEST else None
+    in_metres = file.suffix.lower() in (".ply", ".pcd") and extent < WIDEST and away <= FARTHEST
+    return unit_of(options, "m" if in_metres else None, file, extent)
 
 
 TUM = Format("tum", open_tum, is_tum, ("--clock", "--rate", "--up", "--unit", "--topic"), whole_depths=True)

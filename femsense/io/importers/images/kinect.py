@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.packages import needed
 from femsense.io.clouds.images import decoded_image
-from femsense.io.importers.frames import ColorImage, DepthImage, Format, Frame, Images, Source, camera_of_numbers, need
+from femsense.io.importers.frames import ColorImage, DepthImage, Format, Frame, Images, Source, camera_of_numbers
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import pixel_rays, registered_color
 from femsense.io.importers.options import Options
@@ -148,7 +149,7 @@ def _tracks(path: Path) -> Tracks:
 
 
 def _opened(path: Path) -> Any:
-    av = need("av", "kinect", "a recording of an Azure Kinect")
+    av = needed("av", "kinect", "reading a recording of an Azure Kinect")
     try:
         return av.open(str(path))
     except (av.FFmpegError, OSError) as error:

@@ -12,8 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from femsense.core.errors import InputError
-from femsense.io.importers.frames import need
+from femsense.core.errors import FemsenseError, InputError
+from femsense.core.packages import needed
+from femsense.core.text import with_type
 from femsense.io.importers.ros.streamed_mcap import NotRos, StreamedMcap
 
 ENDINGS = (".bag", ".db3", ".mcap")
@@ -71,7 +72,7 @@ class Bag:
                 yield Message(connection.topic, connection.msgtype, 1e-9 * nanoseconds, bytes(raw))
         except broken as error:
             warnings.warn(
-                f"{self.path}: the file is broken after {count} messages ({_line(error)}); those before are read",
+                f"{self.path}: the file is broken after {count} messages ({with_type(error, 200)}); those before are read",
                 stacklevel=2,
             )
 
@@ -94,7 +95,7 @@ class Bag:
             raise InputError(
                 "a message that its type does not describe",
                 where=f"{self.path}, topic {message.topic}",
-                found=f"{len(message.raw)} bytes of {message.type}: {_line(error)}",
+                found=f"{len(message.raw)} bytes of {message.type}: {with_type(error, 200)}",
                 expected="the type store that the bag was written with",
             ) from None
 
@@ -133,7 +134,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a .bag, a .db3, a .mcap or a folder of ROS 2; of a file the content counts, not the ending.
 
     Raises:
-        InputError: the package rosbags is missing, or the file is none of these, is empty, cut off or not indexed.
+        InputError: the file is none of these, is empty, cut off or not indexed. MissingDependency: without rosbags.
     """
     if path.is_file() and not path.stat().st_size:
         raise InputError("an empty file", where=path, found="0 bytes", expected="a ROS bag")
@@ -151,21 +152,21 @@ def _reader(path: Path, named: Path) -> Any:
         if path.is_dir() and not (path / "metadata.yaml").is_file():
             return _reader_of_files(path, "is missing")
         return _opened([named])
-    except InputError:
+    except FemsenseError:
         raise
     except Exception as error:  # rosbags raises the errors of zlib, sqlite, YAML and struct in addition to its own
         with contextlib.suppress(Exception):
             if path.is_dir():
-                return _reader_of_files(path, f"is broken ({_line(error)})")
+                return _reader_of_files(path, f"is broken ({with_type(error, 200)})")
         if path.is_dir() or content_ending(path) != ".mcap":
             raise _unreadable(path, error) from None
         return _streamed(path, error)
 
 
 def _opened(files: Sequence[Path]) -> Any:
-    """Return a reader of rosbags. Raises any exception of it, and InputError without the package."""
-    highlevel = need("rosbags.highlevel", "ros", "reading ROS bags")
-    typesys = need("rosbags.typesys", "ros", "reading ROS bags")
+    """Return a reader of rosbags. Raises any exception of it, and MissingDependency without the package."""
+    highlevel = needed("rosbags.highlevel", "ros", "reading ROS bags")
+    typesys = needed("rosbags.typesys", "ros", "reading ROS bags")
     reader = highlevel.AnyReader(files, default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
     reader.open()
     return reader
@@ -191,7 +192,7 @@ def _streamed(path: Path, error: Exception) -> StreamedMcap:
         raise _unreadable(path, error) from None
     if "Profile is not" not in str(error):  # a complete file that is of ROS 1, or not declared as ROS 2
         warnings.warn(
-            f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages of whole chunks before the "
+            f"{path}: the file is broken or was not closed ({with_type(error, 200)}); {reader.count} messages of whole chunks before the "
             f"break are read; {MENDED['.mcap']}",
             stacklevel=4,
         )
@@ -212,23 +213,19 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     return InputError(
         "not readable as a ROS bag" + (": it is none" if none else ""),
         where=path,
-        found=_head(path) if none else _line(error),
+        found=_head(path) if none else with_type(error, 200),
         expected="a whole .bag, .db3, .mcap or ROS 2 folder",
         hint=None if none else MENDED.get(kind or "folder"),
     )
 
 
 def _library_errors() -> tuple[type[Exception], ...]:
-    rosbags1 = need("rosbags.rosbag1", "ros", "reading ROS bags")
-    rosbags2 = need("rosbags.rosbag2", "ros", "reading ROS bags")
-    apsw = need("apsw", "ros", "reading ROS bags")
+    rosbags1 = needed("rosbags.rosbag1", "ros", "reading ROS bags")
+    rosbags2 = needed("rosbags.rosbag2", "ros", "reading ROS bags")
+    apsw = needed("apsw", "ros", "reading ROS bags")
     return rosbags1.ReaderError, rosbags2.ReaderError, apsw.Error
 
 
 def _head(path: Path) -> str:
     with path.open("rb") as stream:
         return f"a file that begins {stream.read(12)!r}"
-
-
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -15,6 +15,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.core.text import one_line
 from femsense.io.importers.frames import DepthImage, Format, Frame, Images, Source, check_reach, is_kept_as_image, upright
 from femsense.io.importers.images.intrinsics import lens_line
 from femsense.io.importers.images.lens import depth_points, pixel_rays, registered_color
@@ -171,7 +172,7 @@ def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
             try:
                 _take(bag, plan, message, primary, tracks, waiting)
             except InputError as problem:
-                warnings.warn(" ".join(str(problem).split()), stacklevel=2)
+                warnings.warn(one_line(problem), stacklevel=2)
                 continue
             while waiting and message.record - waiting[0][1].record > LAG_S:
                 yield _frame(bag, plan, *waiting.popleft(), tracks, samples, rays)
@@ -188,7 +189,7 @@ def _samples(bag: Bag, plan: Plan, topic: str) -> Samples:
             try:
                 decoded = bag.decode(message)
             except InputError as problem:
-                broken.append(" ".join(str(problem).split()))
+                broken.append(one_line(problem))
                 continue
             rows.extend([time_of(bag, plan, message, decoded), *_values(plan, message, decoded)])
     if broken:

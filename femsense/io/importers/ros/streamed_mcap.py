@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import need
+from femsense.core.packages import needed
 
 PACKINGS = ("cdr", "ros1")
 """Encodings of messages that are read: those of ROS 2 and of ROS 1."""
@@ -72,21 +72,17 @@ class StreamedMcap:
         """Do nothing: the file is open only while its records are read."""
 
     def _records(self) -> Iterator[tuple[Connection, int, bytes]]:
-        reader = need("mcap.stream_reader", "ros", "reading MCAP files without an index")
-        exceptions = need("mcap.exceptions", "ros", "reading MCAP files without an index")
+        reader = needed("mcap.reader", "ros", "reading MCAP files without an index")
+        exceptions = needed("mcap.exceptions", "ros", "reading MCAP files without an index")
         channels: dict[int, Connection] = {}
-        schemas: dict[int, Any] = {}
         broken = (exceptions.McapError, struct.error, ValueError, EOFError, OSError, OverflowError, MemoryError)
         with self.path.open("rb") as stream:
             try:
-                for record in reader.StreamReader(stream).records:
-                    match type(record).__name__:
-                        case "Schema":
-                            schemas[record.id] = record
-                        case "Channel" if record.schema_id in schemas:
-                            channels[record.id] = _connection(record, schemas[record.schema_id])
-                        case "Message" if record.channel_id in channels:
-                            yield channels[record.channel_id], record.log_time, record.data
+                for schema, channel, message in reader.NonSeekingReader(stream).iter_messages(log_time_order=False):
+                    if schema is not None:
+                        if channel.id not in channels:
+                            channels[channel.id] = _connection(channel, schema)
+                        yield channels[channel.id], message.log_time, message.data
             except broken:
                 return
             except Exception as error:  # the decompressors' own errors have no common base
@@ -94,7 +90,7 @@ class StreamedMcap:
                     raise
 
     def _types(self) -> Any:
-        typesys = need("rosbags.typesys", "ros", "reading ROS bags")
+        typesys = needed("rosbags.typesys", "ros", "reading ROS bags")
         store = typesys.get_typestore(typesys.Stores.EMPTY)
         types: dict[str, Any] = {}
         try:
