@@ -125,7 +125,8 @@ class Tracker:
         """Return the state under new tensions [N] (cables that are not named are slack) and nodal forces [N], shape (n, 3).
 
         Raises:
-            InputError: wrong names or shapes; FemsenseError: no equilibrium.
+            InputError: wrong names or shapes.
+            FemsenseError: no equilibrium.
         """
         names = self.body.cable_names
         given = dict(tension or {})
