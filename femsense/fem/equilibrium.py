@@ -80,6 +80,7 @@ class Equilibrium:
     status: str
     """"converged", or the reason of the failure (a key of ADVICE)."""
     iterations: int
+    """Number of Newton steps."""
     reached: float
     """Share of the load that `positions` balance [1]: 1, or the last successful load step."""
     indefinite_steps: int

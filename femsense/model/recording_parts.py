@@ -34,6 +34,7 @@ class Drives:
     """Inputs of the robot in each frame: cables and chambers."""
 
     cable_names: Sequence[str] = ()
+    """Name of each cable, in the order of the columns of `inputs`."""
     inputs: npt.ArrayLike | None = None
     """Cable inputs, shape (F, a): tensions [N], or displacements [m], > 0 shortens."""
     actuation: str = "tension"
@@ -41,6 +42,7 @@ class Drives:
     actuation_zero: str = "absolute"
     """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
     chamber_names: Sequence[str] = ()
+    """Name of each chamber, in the order of the columns of `pressures`."""
     pressures: npt.ArrayLike | None = None
     """Chamber pressures above the surroundings [Pa], shape (F, c)."""
 
@@ -50,6 +52,7 @@ class MarkerRows:
     """Observations of named markers, K rows."""
 
     names: Sequence[str]
+    """Names of the markers."""
     frame: npt.ArrayLike
     """An index 0 … F − 1, shape (K,)."""
     index: npt.ArrayLike
@@ -91,6 +94,7 @@ class Views:
     """V cameras and the files of their images or clouds."""
 
     names: Sequence[str] = ("",)
+    """Name of each camera; ("",) for a single one."""
     cameras: Sequence[Camera | None] | None = None
     """One a view; None where the lens is not known."""
     T_robot_camera: Sequence[npt.ArrayLike | None] | None = None
@@ -113,6 +117,7 @@ class Tool:
     """
 
     name: str
+    """Name of the object."""
     kind: str
     """"ball", "cylinder" or "mesh"."""
     radius: float = 0.0
@@ -134,6 +139,7 @@ class RestMarkers:
     """Markers measured with the body unloaded, camera frame."""
 
     names: tuple[str, ...]
+    """Names of the markers."""
     positions: FloatArray
     """[m], shape (r, 3)."""
     std: FloatArray
