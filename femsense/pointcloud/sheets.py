@@ -38,8 +38,8 @@ ALONG = 0.5
 SAME_SIDE = 0.3
 """Minimum cosine between the normal of a field and that of the side in question; below it the field belongs to another side of the body."""
 FARTHEST = 9.0
-"""Ratio of the exponents of the weights of the farthest and of the nearest field. The weight of the farthest is subtracted from all, so
-that weights are continuous."""
+"""Maximum difference between the exponent of a field's weight and that of the nearest field. The weight at that difference is subtracted from
+all, so that weights are continuous."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
