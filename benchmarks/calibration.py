@@ -4,7 +4,7 @@ wrong labels, a real tentacle.
     python benchmarks/calibration.py [PART …] [--seeds N] [--first SEED]
 
 Parts: bound, nowhere, clouds, labels, single, tentacle, rate, table1; all where none is named.
-Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/guides/calibration.md.
+Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/results/calibration.md.
 """
 
 from __future__ import annotations

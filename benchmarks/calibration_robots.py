@@ -6,7 +6,7 @@ Each seed puts two cameras anywhere above, 2 to 3.5 sizes of the robot away, and
 the recording does not tell. The truth has a finer mesh and another law; markers have noise of 0.2 mm, clouds that of a stereo camera.
 *Over stated* is the root mean square of error over standard deviation: 1 is the bound by Cramér and Rao where the model is right. A pose is
 *wrong* where it is more than 10 mm or 10° off and nothing is said; *said* counts what is refused, or has not settled.
-Recordings are kept below OUT. Prints the table "On the robots that come along" of docs/guides/calibration.md, and for each way which share of all
+Recordings are kept below OUT. Prints the table "On the robots that come along" of docs/results/calibration.md, and for each way which share of all
 coordinates of poses and of all inputs lies within one, two and three of its standard deviations.
 """
 

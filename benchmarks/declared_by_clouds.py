@@ -5,7 +5,7 @@
 Recordings are those of calibration_robots.py: a finer mesh with another law, one camera drawn anywhere above, cables with initial inputs that are
 told (known) or not (unknown). The true pose is declared to robots with the right modulus and a wrong one, and poses that are off in a
 direction that is drawn. Cells: what `calibrate` says. *Modulus* is a warning that names both, pose and modulus. Prints the
-tables "Declared poses" of docs/guides/calibration.md: by clouds, and with `--way "named markers"`.
+tables "Declared poses" of docs/results/calibration.md: by clouds, and with `--way "named markers"`.
 """
 
 from __future__ import annotations

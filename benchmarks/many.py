@@ -1,6 +1,6 @@
 """Many short recordings over processes and over dask: efficiency, overhead of a task, memory, and what happens when things die.
 
-    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|joint|paper] [--page docs/guides/many.md]
+    python benchmarks/many.py OUT [--count 200] [--only overhead|efficiency|trouble|joint|paper] [--page docs/results/many.md]
 
 `overhead`: ten times COUNT jobs that write one line, on two processes: time of a worker beside each, and memory of the driver.
 

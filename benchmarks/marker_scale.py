@@ -4,7 +4,7 @@
 
 Robots that come along: recordings of `calibration_robots.py` (one camera, named markers, a finer mesh with another law), right, with
 a robot whose modulus is off, and with markers scaled about the camera. `--real`: robots that others built and recorded (`shared/data`), as
-they are and scaled. Recordings are kept below OUT. Prints the tables "A scale of the markers" of docs/guides/calibration.md.
+they are and scaled. Recordings are kept below OUT. Prints the tables "A scale of the markers" of docs/results/calibration.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Run the lines of docs/guides/notebooks.md on the recording of the demo, and print what they answer.
+"""Run the lines of docs/guides/notebooks.md and print their values.
 
     python benchmarks/notebook.py
 
-A block that needs arrays of the reader's own is left out. About forty seconds of one core.
+A block that needs arrays of the reader's own is left out. About twenty seconds of one core.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> None:
     for block in BLOCK.findall(PAGE.read_text(encoding="utf-8")):
         if READERS_OWN in block:
             continue
-        for statement in ast.parse(block.replace('"meshes/', f'"{ROOT}/meshes/')).body:
+        for statement in ast.parse(block).body:
             if not isinstance(statement, ast.Expr):
                 exec(compile(ast.Module([statement], []), PAGE.name, "exec"), known)
                 continue

@@ -14,6 +14,7 @@ from typing import Any
 import latex2mathml.converter
 import typer.main
 from docutils import nodes
+from sphinx.addnodes import desc_annotation
 from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
@@ -32,6 +33,8 @@ Python 3.11 and 3.12; SI units; command line and Python. Each link leads to a pa
 """
 
 
+ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]", re.DOTALL)
+"""What Sphinx makes of npt.ArrayLike."""
 ALIGNED = re.compile(r"\\begin\{(aligned|align\*?|split)\}(.*?)\\end\{\1\}", re.DOTALL)
 
 
@@ -128,10 +131,20 @@ def plain_signature(*event: Any) -> tuple[str | None, str | None]:
 def _plain(text: str | None) -> str | None:
     if text is None:
         return None
+    text = ARRAY_LIKE.sub("ArrayLike", text)
     text = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
     text = re.sub(r", ~?[\w.]*(?:Before|After|Plain|Wrap)Validator\((?:[^()]|\([^()]*\))*\)", "", text)
     text = re.sub(r"~?[\w.]*Annotated\[([^\[\],]+(?:\[[^\[\]]*\])?)\]", r"\1", text)
     return re.sub(r"= <(?:[^<>]|<[^<>]*>)*>", "= ...", text)
+
+
+def plain_annotations(_: Sphinx, page: nodes.document) -> None:
+    """Write the types of fields as the source has them."""
+    for node in page.findall(desc_annotation):
+        if ARRAY_LIKE.search(node.astext()):
+            text = ARRAY_LIKE.sub("ArrayLike", node.astext())
+            node.clear()
+            node += nodes.Text(text)
 
 
 def write_llms(sphinx: Sphinx, failure: Exception | None) -> None:
@@ -170,5 +183,6 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
     sphinx.connect("autodoc-process-docstring", plain_docstring, priority=400)
     sphinx.connect("autodoc-process-docstring", plain_field, priority=600)
     sphinx.connect("autodoc-process-signature", plain_signature)
+    sphinx.connect("doctree-read", plain_annotations)
     sphinx.connect("build-finished", write_llms)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

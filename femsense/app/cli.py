@@ -65,7 +65,7 @@ def _common(
 
 COMMANDS: dict[str, tuple[Command, str]] = {
     "demo": (start.demo, "femsense demo -o femsense-demo"),
-    "inspect": (start.inspect, "femsense inspect my-recording --robot my-robot"),
+    "inspect": (start.inspect, "femsense inspect finger"),
     "import": (data.import_, "femsense import take.db3 -o my-recording --free 0:20"),
     "mesh": (data.mesh, "femsense mesh finger.stl --unit mm -o my-robot"),
     "simulate": (data.simulate, "femsense simulate my-robot script.toml -o my-recording"),
@@ -73,12 +73,12 @@ COMMANDS: dict[str, tuple[Command, str]] = {
     "estimate": (sensing.estimate, "femsense estimate my-robot my-recording -c calibration.json -o run"),
     "live": (sensing.live, "femsense live my-robot --camera realsense --actuation fixed:top=2"),
     "improve": (loop.improve, "femsense improve my-robot monday --validation tuesday -o improved"),
-    "export": (results.export, "femsense export run -o robot.glb --arrows"),
+    "export": (results.export, "femsense export femsense-demo/run -o robot.glb --arrows"),
     "reach": (sensing.reach, "femsense reach four-leg --target tip=0.01,0,0.12 -o motion.json"),
     "learn": (learning.learn, "femsense learn sensors.csv markers.csv -o finger.onnx"),
-    "view": (results.view, "femsense view run"),
+    "view": (results.view, "femsense view femsense-demo/run"),
     "stream": (results.stream, "femsense stream --sensors sensors.csv --model finger.onnx --browser"),
-    "report": (results.report, "femsense report run"),
+    "report": (results.report, "femsense report femsense-demo"),
     "docs": (start.docs, "femsense docs is-this-force-real"),
     "doctor": (start.doctor, "femsense doctor"),
 }

@@ -79,7 +79,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         the calibration, with standard deviations. Read its `status`: data that do not determine an input are named there.
 
     Raises:
-        InputError: `correct` for a robot without a correction. DataError: no contact-free frame, too few markers, or no equilibrium.
+        InputError: `correct` for a robot without a correction.
+        DataError: no contact-free frame, too few markers, or no equilibrium.
 
     Example:
         >>> robot = fs.load_robot("finger")

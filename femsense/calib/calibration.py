@@ -11,55 +11,58 @@ from femsense.core.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Calibration:
-    """Poses of the cameras and initial inputs of the cables, with their uncertainty."""
+    """The result of `calibrate`: camera poses and initial inputs of cables and chambers, with their covariance."""
 
     T_robot_camera: FloatArray
     """Pose of the first camera, shape (4, 4)."""
     poses: tuple[FloatArray, ...]
     """Poses of all cameras, each (4, 4)."""
     camera_names: tuple[str, ...]
+    """Name of each camera."""
     cable_tension_n: dict[str, float]
     """Initial tension of each cable [N]."""
     cable_displacement_m: dict[str, float]
     """Initial shortening of each cable [m]."""
     rms_m: float
-    """Root mean square distance between measured and modelled markers [m]; nan where there are none."""
+    """Root mean square distance between measured and modelled markers [m]; nan without markers."""
     marker_rms_m: dict[str, float]
+    """Root mean square distance of each marker [m]."""
     history: tuple[float, ...]
     """rms_m of each iteration [m]."""
     pose_std: FloatArray
-    """One standard deviation of the entries of T_robot_camera, shape (4, 4)."""
+    """Standard deviation of the entries of T_robot_camera, shape (4, 4)."""
     pose_covariance: FloatArray
-    """Of (rotation about the markers' mean [rad], shift [m]) of the first camera, shape (6, 6)."""
+    """Covariance of the pose of the first camera: (rotation about the mean of the markers [rad], shift [m]), shape (6, 6)."""
     tension_std_n: dict[str, float | None]
-    """[N]; None where the data say nothing."""
+    """Standard deviation of each initial tension [N]; None: not determined by the data."""
     displacement_std_m: dict[str, float | None]
+    """Standard deviation of each initial shortening [m]; None: not determined by the data."""
     status: str
-    """"converged", or what the data leave open, in words."""
+    """"converged", or a text that states what the data do not determine."""
     placements_m: dict[str, list[float]] = field(default_factory=dict)
-    """Where rest.csv shows the markers to sit [m], robot frame."""
+    """Marker positions measured in rest.csv, robot frame [m]."""
     frames: tuple[int, ...] = ()
     """Numbers of the frames that were used."""
     normal_rms_m: float = float("nan")
-    """Root mean square distance of the points of free frames' clouds from the surface [m]; nan where none were used."""
+    """Root mean square distance of cloud points of contact-free frames from the surface, along its normal [m]; nan without clouds."""
     noise_m: float = float("nan")
-    """What markers repeat to [m], root mean square in space; nan where nothing tells it."""
+    """Repeatability of the markers, root mean square in space [m]; nan if it cannot be estimated."""
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given:
-    that of the first camera alone is known."""
+    """Joint covariance of the poses of all cameras, (rotation [rad], shift [m]) each, shape (6 v, 6 v); empty: only that of the first
+    camera is known."""
     marker_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """What markers alone say of undeclared poses (as joint_covariance) and of initial inputs ([N] or [m]) together; empty where
-    nothing was fitted to them, without what another law changes. It is not kept in a file."""
+    """Joint covariance of undeclared poses (as joint_covariance) and initial inputs [N or m] from markers alone, without the term of the
+    constitutive law; empty if nothing was fitted to markers. Not written to the file."""
     law_step: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """By how much another law moves all poses (as joint_covariance, which holds its square) and what markers say of initial inputs, shape (6 v + a,);
-    empty where nobody knows."""
+    """Change of all poses (as joint_covariance, which contains its square) and of the initial inputs under another constitutive law, shape
+    (6 v + a,); empty if unknown."""
     is_corrected: bool = False
     """Whether the robot's empirical correction was used."""
 
     chamber_pressure_pa: dict[str, float] = field(default_factory=dict)
-    """Initial pressure of each chamber, added to the recorded ones [Pa]; empty where their zero is known."""
+    """Initial pressure of each chamber, added to the recorded ones [Pa]; empty if their zero is known."""
     pressure_std_pa: dict[str, float | None] = field(default_factory=dict)
-    """[Pa]; None where the data say nothing."""
+    """Standard deviation of each initial pressure [Pa]; None: not determined by the data."""
 
     @property
     def settled(self) -> bool:

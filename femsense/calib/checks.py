@@ -22,16 +22,22 @@ named for it, which may be the model's error."""
 
 
 def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, noise: float) -> IntArray:
-    """Return which marker each measured point is: as named, or swapped where the names cannot be right.
+    """Correct swapped marker labels in one frame of one camera.
 
-    The assignment with the least sum of squared distances (Kuhn 1955) counts where it takes EXPLAINED of the distance away of
-    those that it renames, and that distance was far above the noise.
+    Measured points are assigned to modelled markers by the smallest sum of squared distances (Hungarian algorithm, Kuhn 1955). The assignment
+    replaces the labels if, for the markers with a new label,
+
+    1. the root mean square distance falls by more than the factor EXPLAINED, and
+    2. with the recorded labels it exceeds ten times the noise.
 
     Arguments:
-        places: where the model has all markers [m], shape (m, 3).
-        measured: one frame of one camera [m], same frame, shape (k, 3).
-        marker: as named, shape (k,).
-        noise: one standard deviation of a marker along an axis [m].
+        places: modelled positions of all markers [m], shape (m, 3).
+        measured: measured points, in the same coordinate system [m], shape (k, 3).
+        marker: recorded label of each point, an index into `places`, shape (k,).
+        noise: standard deviation of a marker along each axis [m].
+
+    Returns:
+        the corrected labels, shape (k,).
     """
     if len(marker) < 2:
         return marker

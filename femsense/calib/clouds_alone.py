@@ -1,4 +1,4 @@
-"""Cameras that no marker places: their poses from the clouds of free frames, from nowhere."""
+"""Poses of cameras without markers from the clouds of contact-free frames, without an initial guess."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.segmentation import color_mask
 
 FRAMES = 3
-"""Free frames in which a pose is sought, those under the most different inputs."""
+"""Number of contact-free frames for the pose search, those with the most different inputs."""
 UNDETERMINED = 0.5
-"""A direction is not determined where the clouds leave this share of START_STD."""
+"""A direction is undetermined if its standard deviation exceeds this share of START_STD."""
 
 
 def views_without_markers(recording: Recording, frames: IntArray) -> list[int]:
-    """Return cameras whose pose is not declared and that see clouds, but no markers that tell a pose in the frames that can be used:
-    three in one frame, and not all in a line."""
+    """Return the cameras with clouds and an undeclared pose that markers do not determine: fewer than three in each usable frame, or
+    collinear ones."""
     seen = set(recording.unnamed_view.tolist())
     if recording.rest is not None:
         seen |= set(recording.rest.view.tolist())
@@ -50,22 +50,22 @@ def views_without_markers(recording: Recording, frames: IntArray) -> list[int]:
 
 
 def _markers_tell_pose(recording: Recording, frames: IntArray, view: int) -> bool:
-    """Return whether the named markers that a camera sees can tell its pose."""
+    """Return whether the named markers of a camera determine its pose."""
     mine = (recording.marker_view == view) & np.isin(recording.marker_frame, frames)
     most = np.bincount(recording.marker_frame[mine]).max(initial=0)
     return bool(most >= 3 and not in_line(recording.marker_xyz[mine]))
 
 
 def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> Calibration:
-    """Return the calibration with poses for cameras that no marker places.
+    """Return the calibration with poses of cameras without markers.
 
     Arguments:
         robot, recording: as loaded.
-        calibration: what the other cameras say; the poses of `views` are replaced.
-        views: the cameras to place.
+        calibration: calibration of the other cameras; the poses of `views` are replaced.
+        views: the cameras.
 
     Raises:
-        DataError: no free frame with a cloud, nothing that fits, a body with a symmetry, or clouds that do not determine a pose.
+        DataError: no contact-free frame with a cloud, no pose that fits, a symmetric body, or clouds that do not determine a pose.
     """
     states = free_states(robot, recording, calibration, views)
     start = started_at(
@@ -78,7 +78,7 @@ def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibratio
 
 
 def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatArray]) -> Calibration:
-    """Return the calibration with poses of some cameras from which a fit begins, each as far off as a search may be."""
+    """Return the calibration with initial poses of some cameras, with the uncertainty of a search."""
     poses, covariance = list(calibration.poses), np.zeros((6 * len(calibration.poses),) * 2)
     if calibration.joint_covariance.size:
         covariance[:] = calibration.joint_covariance
@@ -100,7 +100,7 @@ def started_at(robot: Robot, calibration: Calibration, starts: dict[int, FloatAr
 
 
 def free_states(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> dict[int, Equilibrium]:
-    """Return the equilibria of free frames in which a pose is sought."""
+    """Return the equilibria of the contact-free frames for the pose search."""
     free = np.zeros(recording.frame_count, dtype=bool) if recording.free is None else recording.free
     frames = [int(k) for k in np.flatnonzero(free) if all(recording.cloud_files[k][v] is not None for v in views)]
     if not frames:
@@ -120,7 +120,7 @@ def free_states(robot: Robot, recording: Recording, calibration: Calibration, vi
 
 
 def seen_by(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:
-    """Return what one camera sees of the body in the frames of given equilibria."""
+    """Return the views of the body by one camera in the frames of given equilibria."""
     triangles, seen = body_surface(robot.body.mesh).triangles, []
     for k, state in states.items():
         cloud = read_frame_cloud(recording, k, view=view)
@@ -136,10 +136,10 @@ def seen_by(robot: Robot, recording: Recording, states: dict[int, Equilibrium], 
 
 
 def _check_determined(recording: Recording, start: Calibration, fitted: Calibration, views: Sequence[int]) -> None:
-    """Refuse a pose that the fit left about as uncertain as the search: its standard deviation is then that of the start, not of an error.
+    """Refuse a pose that is about as uncertain after the fit as after the search.
 
     Raises:
-        DataError: with the camera and the direction.
+        DataError: a direction of a camera is undetermined.
     """
     for v in views:
         own = slice(6 * v, 6 * v + 6)
@@ -154,7 +154,7 @@ def _check_determined(recording: Recording, start: Calibration, fitted: Calibrat
 
 
 def _direction(vector: FloatArray) -> str:
-    """Return in words what a direction of (rotation, shift) is."""
+    """Return the text for a direction of (rotation, shift)."""
     turn, shift = np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])
     axis = vector[:3] / turn if turn > shift else vector[3:] / shift
     about = ", ".join(format(a, "g") for a in np.round(axis, 1).tolist())

@@ -1,4 +1,4 @@
-"""Whether a pose that is declared can be that of a camera that sees no marker: the clouds of free frames, from a pose fitted to them."""
+"""Check of the declared pose of a camera without markers, by a pose fitted to the clouds of contact-free frames."""
 
 from __future__ import annotations
 
@@ -29,41 +29,44 @@ from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 
 KNOWN = 4.48
-"""The clouds know that a declared pose is off where it is so many deviations from the fitted one: six coordinates that err by chance
-stay below that in 99.7 of 100 cases (chi-squared)."""
+"""A declared pose is wrong if its Mahalanobis distance from the fitted one exceeds this: the 99.7 % quantile of χ with six degrees of
+freedom."""
 ALLOWED = 2.0
-"""… and it is said where turn or shift are so many of `DECLARED_STD`: what is less, free frames tell `estimate`."""
+"""It is reported if rotation or translation also exceed this multiple of `DECLARED_STD`; `estimate` corrects smaller errors with
+contact-free frames."""
 CELL = 0.1
-"""Parts of the body at rest, as a share of its diagonal."""
+"""Size of the cells of the body at rest, relative to its diagonal."""
 FRAMES = 4
-"""Free frames that tell."""
+"""Number of contact-free frames used."""
 MODULUS = 3.0
-"""Moduli up to so many times the declared one, or a part of it, are tried instead of another pose."""
+"""Range of moduli, as a factor and its inverse, that are tried as an alternative to another pose."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Body:
-    """The points of the body in one free frame, as a fitted pose has them."""
+    """The points of the body in one contact-free frame, selected with the fitted pose."""
 
     frame: int
     points: FloatArray
-    """Camera frame [m], shape (k, 3)."""
+    """Points in the camera frame [m], shape (k, 3)."""
     cell: IntArray
-    """Of the body at rest, 0 … c − 1, shape (k,)."""
+    """Cell of the body at rest of each point, 0 … c − 1, shape (k,)."""
 
 
 def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibration, views: Sequence[int]) -> None:
-    """Warn where the clouds know that a declared pose is off: where it is beyond the deviations of one that is fitted to them, which hold
-    what the model lacks, and farther than `estimate` allows it. Refuse it where the fitted one leaves a quarter of what it leaves, in the
-    mean of parts of the body. Where another modulus does as much, nobody knows which of both it is: a warning names both.
+    """Compare declared poses with poses fitted to the clouds of contact-free frames.
+
+    A warning is given if a declared pose lies outside the uncertainty of the fitted one, which includes the model error, and farther away than
+    `estimate` can correct. The pose is refused if the fitted one has a quarter of its misfit, averaged over cells of the body. If another modulus
+    reduces the misfit as much, the warning names both causes.
 
     Arguments:
         robot, recording: as loaded.
         found: the calibration with the declared poses.
-        views: cameras with a declared pose, that see clouds of free frames and no marker.
+        views: cameras with a declared pose, contact-free clouds and no markers.
 
     Raises:
-        DataError: says by how much it is off.
+        DataError: a declared pose is wrong; the error states by how much.
     """
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     spread = float(np.sqrt(((robot.body.mesh.nodes - robot.body.mesh.nodes.mean(axis=0)) ** 2).sum(axis=1).mean()))
@@ -92,15 +95,15 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
 
 
 def views_to_check(recording: Recording, seen: IntArray) -> list[int]:
-    """Return cameras with a declared pose that see clouds of free frames, and are none of those that see markers."""
+    """Return the cameras with a declared pose and contact-free clouds that see no markers."""
     free = free_clouds(recording)
     told = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and v not in seen]
     return [v for v in told if any(recording.cloud_files[k][v] is not None for k in free)]
 
 
 def _deviations(fitted: Calibration, view: int, declared: FloatArray, pivot: FloatArray) -> tuple[float, float]:
-    """Return how far a declared pose lies from the fitted one [1]: its turn or shift in those that `estimate` allows it, and all in
-    deviations of the fitted one (Mahalanobis)."""
+    """Return two distances of a declared pose from the fitted one [1]: rotation or translation relative to those that `estimate` can
+    correct, and the Mahalanobis distance."""
     apart = declared @ invert_pose(fitted.poses[view])
     step = np.append(Rotation.from_matrix(apart[:3, :3]).as_rotvec(), transform_points(apart, pivot[None])[0] - pivot)
     own, whole = slice(6 * view, 6 * view + 6), (step / DECLARED_STD).reshape(2, 3)
@@ -110,7 +113,7 @@ def _deviations(fitted: Calibration, view: int, declared: FloatArray, pivot: Flo
 
 
 def _fitted(robot: Robot, recording: Recording, found: Calibration, view: int) -> Calibration | None:
-    """Return the calibration with the pose of one camera fitted to its clouds; None where they do not show the body."""
+    """Return the calibration with the pose of one camera fitted to its clouds; None if they do not show the body."""
     opened = replace(recording, T_robot_camera=tuple(None if v == view else T for v, T in enumerate(found.poses)))
     views = seen_by(robot, recording, free_states(robot, recording, found, [view]), view)
     near = settle_cloud_pose(views, found.poses[view])
@@ -131,7 +134,7 @@ def _paths(robot: Robot, recording: Recording, found: Calibration, frames: Seque
 
 
 def _body(robot: Robot, recording: Recording, fitted: Calibration, view: int, size: float) -> list[_Body]:
-    """Return the points of the body that one camera sees, where a fitted pose has them."""
+    """Return the points of the body in one camera, selected with the fitted pose."""
     mesh, triangles, result = robot.body.mesh, body_surface(robot.body.mesh).triangles, list[_Body]()
     free = [k for k in free_clouds(recording) if recording.cloud_files[k][view] is not None]
     chosen = [free[i] for i in np.unique(np.linspace(0, len(free) - 1, FRAMES).round().astype(int))]
@@ -155,7 +158,7 @@ def _body(robot: Robot, recording: Recording, fitted: Calibration, view: int, si
 
 
 def _left(robot: Robot, recording: Recording, found: Calibration, view: int, body: Sequence[_Body]) -> float:
-    """Return how far the points lie from the surface under a calibration, root mean square of the means of cells [m]."""
+    """Return the root mean square, over cells, of the mean distance of points from the surface under a calibration [m]."""
     states, triangles = _paths(robot, recording, found, [one.frame for one in body]), body_surface(robot.body.mesh).triangles
     T, squares, count = found.poses[view], 0.0, 0
     for one in body:
@@ -171,7 +174,7 @@ def _left(robot: Robot, recording: Recording, found: Calibration, view: int, bod
 def _with_modulus(
     robot: Robot, recording: Recording, found: Calibration, view: int, body: Sequence[_Body]
 ) -> tuple[float, float]:
-    """Return the modulus, as a factor, with which a pose leaves least, and what it leaves [m]."""
+    """Return the modulus, as a factor, with the smallest misfit at a pose, and that misfit [m]."""
 
     def left(log: float) -> float:
         softer = replace(robot, body=robot.body.with_stiffness_scale(float(np.exp(log))))

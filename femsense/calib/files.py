@@ -71,7 +71,7 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Read calibration.json.
+    """Read calibration.json: camera poses and initial inputs, as `femsense calibrate` or `write_calibration` wrote them.
 
     Arguments:
         path: the file, or the folder that contains it.

@@ -1,9 +1,9 @@
-"""Poses of the cameras and initial inputs of the cables from the clouds of contact-free frames, together with what markers say.
+"""Camera poses and initial inputs from the clouds of contact-free frames, combined with the estimate from markers.
 
-Parameters: a step of each pose and the initial inputs, with the Gaussian prior that markers, or a start, leave. The residual of each point lies along
-the normal of the surface that its ray meets. Gauss–Newton: the posterior mean of the linearised problem is the next point, with new states, rays and
-weights. Neighbouring residuals err together (mesh, law), so clouds know what points know under a smooth field along the surface (`residual_field`).
-A cable moves the whole body: a change of input looks like a change of pose in one frame alone.
+Parameters are a step of each pose and the initial inputs, with a Gaussian prior from the markers or from an initial guess. The residual of a point is its
+distance from the face that its ray hits, along the normal. Gauss–Newton: the posterior mean of the linearised problem is the next point, with new
+states, rays and weights. Residuals of neighbouring points are correlated (errors of mesh and law); their covariance is that of a smooth random field
+along the surface (`residual_field`). In a single frame a change of an input resembles a change of the pose, so several frames are needed.
 """
 
 from __future__ import annotations
@@ -33,34 +33,35 @@ from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 
 FRAMES, FRAMES_WITH_INPUTS = 12, 6
-"""More free frames than this are thinned out evenly; fewer where each needs a state for every input."""
+"""Maximum number of contact-free frames, evenly spaced; and if inputs are fitted, which needs one more state per input and frame."""
 STEPS = 12
-"""Gauss–Newton steps at most; rays and weights are new in each."""
+"""Maximum number of Gauss–Newton steps, each with new rays and weights."""
 DERIVATIVES = 3
-"""In so many first steps the derivative by the inputs is new; in the first one where markers tell them nearly."""
+"""Number of initial steps that recompute the derivatives by the inputs; only the first one does if markers determine them."""
 STEP = {"tension": 1e-2, "displacement": 1e-4}
-"""Difference for the derivative by an input [N] or [m]."""
+"""Finite difference of an input [N or m]."""
 START_STD = (0.1, 0.03)
-"""What a pose is off by at most that a search has found: [rad], and as a share of the body's diagonal; three times what benchmarks/calibration.py finds."""
+"""Prior σ of a pose from a global search: [rad], and relative to the body's diagonal; three times the errors of
+benchmarks/calibration.py."""
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1)
-"""Of a step, in units of what the best known direction is held by."""
+"""Damping of a step, relative to the largest eigenvalue of the information."""
 LOST = 0.01
-"""A step may lose this share of the points that lie on the body: rays at a silhouette come and go."""
+"""Maximum share of the points on the body that a step may lose: rays at a silhouette change between hit and miss."""
 FEWEST = 30
-"""Fewer rays that meet the body in all frames say nothing of its pose."""
+"""Minimum number of rays that hit the body in all frames."""
 STILL = 0.02
-"""A fit has converged where no parameter goes farther, in its standard deviations."""
+"""A fit has converged if no parameter changes by more than this share of its standard deviation."""
 USUAL = CameraNoise("stereo", at_1m=0.002)
-"""A camera of which nothing is known: the D415 at its default setting."""
+"""Noise of an unknown camera: that of the D415 at its default setting."""
 
 
 def pose_pivot(robot: Robot) -> FloatArray:
-    """Return the point about which pose steps turn [m], shape (3,): the markers' mean, the body's where there are none."""
+    """Return the point about which pose steps rotate [m], shape (3,): the mean of the markers, or of the body without markers."""
     return np.asarray(robot.marker_points.mean(axis=0) if len(robot.marker_points) else robot.body.mesh.nodes.mean(axis=0))
 
 
 def free_clouds(recording: Recording, most: int = FRAMES) -> list[int]:
-    """Return the frames that are free and have a cloud, evenly thinned out."""
+    """Return at most FRAMES contact-free frames with a cloud, evenly spaced."""
     if recording.free is None or not recording.has_clouds:
         return []
     free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
@@ -68,18 +69,18 @@ def free_clouds(recording: Recording, most: int = FRAMES) -> list[int]:
 
 
 def fit_clouds(robot: Robot, recording: Recording, calibration: Calibration, *, guessed: Sequence[int] = ()) -> Calibration:
-    """Return the calibration with undeclared poses, and initial inputs whose zero is unknown, moved to where the clouds of free frames see the body.
+    """Fit undeclared poses, and initial inputs with an unknown zero, to the clouds of contact-free frames.
 
     Arguments:
         robot, recording: as loaded.
-        calibration: of the markers, or a start; its covariances are the prior (zero: nothing is known but the start).
-        guessed: cameras whose pose is a start that nothing measured: its covariance is a bound, and pulls no answer of the clouds back.
+        calibration: calibration from markers, or an initial guess; its covariances are the prior (zero: flat prior).
+        guessed: cameras whose pose is a guess: its covariance limits the steps and does not enter the posterior.
 
     Returns:
-        the calibration with poses, inputs, their covariance, and `normal_rms_m`; as it was where no free frame shows the body.
+        the calibration with poses, inputs, their covariance, and `normal_rms_m`; unchanged if no contact-free frame shows the body.
 
     Raises:
-        DataError: initial inputs that no marker tells, and no free frame shows the body.
+        DataError: markers do not determine the initial inputs, and no contact-free frame shows the body.
     """
     unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
     alone = unknown and not calibration.marker_covariance.any()
@@ -112,14 +113,15 @@ def fit_clouds(robot: Robot, recording: Recording, calibration: Calibration, *, 
 def _with_inputs(
     robot: Robot, recording: Recording, calibration: Calibration, poses: FloatArray, guessed: Sequence[int]
 ) -> FloatArray:
-    """Return the prior covariance of pose steps and initial inputs: what markers say of both, beside that no input crushes the body."""
+    """Return the prior covariance of pose steps and initial inputs: that of the markers, combined with a bound on the inputs at which they
+    would crush the body."""
     p, a = len(poses), len(robot.body.cables)
     prior = block_diag(poses, largest_input(robot, recording.actuation) ** 2 * np.eye(a))
     known = calibration.marker_covariance
     if not known.any() or not np.isfinite(known).all():
         return np.asarray(prior)
     marked = [c for c in _moving(recording) if c // 6 not in guessed]
-    if len(marked) + a != len(known):  # poses that the markers were fitted with are declared here
+    if len(marked) + a != len(known):  # poses fitted to markers count as declared here
         known, marked = known[-a:, -a:], []
     own = np.append(np.array(marked, dtype=np.int64), np.arange(p, p + a))
     wide = known[-a:, -a:] + prior[p:, p:]
@@ -135,8 +137,8 @@ def _moving(recording: Recording) -> IntArray:
 def _prior_of_poses(
     robot: Robot, recording: Recording, covariance: FloatArray, guessed: Sequence[int]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the prior covariance of pose steps, and which of them only bounds a step, shapes (6 v, 6 v) and (6 v,): of cameras that are guessed,
-    and of those of which nothing is known."""
+    """Return the prior covariance of pose steps, shape (6 v, 6 v), and which of them only limit the steps, shape (6 v,): those of cameras
+    with a guessed or unknown pose."""
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     prior, loose = np.zeros_like(covariance), np.zeros(len(covariance), dtype=bool)
     moving = _moving(recording)
@@ -153,25 +155,25 @@ def _prior_of_poses(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Seen:
-    """A free frame at a point."""
+    """A contact-free frame at one point of the iteration."""
 
     scan: Scan
     surface: Surface
     moves: FloatArray
-    """Change of the nodes with each initial input, shape (a or 0, n, 3)."""
+    """Derivative of the nodes by each initial input, shape (a or 0, n, 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _End:
-    """Where a fit ended."""
+    """The end of a fit."""
 
     poses: tuple[FloatArray, ...]
     inputs: FloatArray | None
     """Initial inputs, shape (a,)."""
     gone: FloatArray
-    """How far poses and inputs went, shape (c,)."""
+    """Change of poses and inputs, shape (c,)."""
     covariance: FloatArray
-    """Of them, shape (c, c)."""
+    """Covariance of poses and inputs, shape (c, c)."""
     scores: FloatArray
     """Rows whose sum of squares is the covariance of the gradient, shape (g, c), see `field_scores`."""
     rms: float
@@ -180,17 +182,17 @@ class _End:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Fit:
-    """Poses and, where the prior speaks of them, initial inputs."""
+    """The fit of poses and, if the prior contains them, initial inputs."""
 
     robot: Robot
     recording: Recording
     noises: tuple[CameraNoise, ...]
     inputs: FloatArray | None
-    """Initial inputs at the start, shape (a,); None where the zero is known."""
+    """Initial inputs at the start, shape (a,); None if their zero is known."""
     prior: FloatArray
-    """Covariance of pose steps, and of steps of the initial inputs where they are fitted, about the start, shape (c, c)."""
+    """Covariance of pose steps, and of steps of fitted initial inputs, about the start, shape (c, c)."""
     loose: BoolArray
-    """Of which coordinates the start is a guess, shape (c,): their prior bounds a step, and pulls nothing back."""
+    """Coordinates with a guessed start, shape (c,): their prior limits the steps and does not enter the posterior."""
     law: FloatArray
     """Change of the prior mean under another law of the material, shape (c,)."""
 
@@ -199,7 +201,7 @@ class _Fit:
         return len(self.prior) > 6 * len(self.recording.T_robot_camera)
 
     def calibrated(self, calibration: Calibration, end: _End, *, alone: bool) -> Calibration:
-        """Return the calibration with what the clouds say; alone: no marker speaks of the initial inputs."""
+        """Return the calibration with the result of the clouds; alone: markers do not determine the initial inputs."""
         p, robot = 6 * len(calibration.poses), self.robot
         moved = self.moved_by_law(end)
         covariance = end.covariance + np.outer(moved, moved)
@@ -237,10 +239,10 @@ class _Fit:
         gone: FloatArray,
         scores: FloatArray | None = None,
     ) -> _End:
-        """Return where Gauss–Newton leads; `scores` where they are known: at first each point errs on its own.
+        """Return the end of the Gauss–Newton iteration; without `scores`, the errors of points are independent.
 
-        A flat side that faces the camera hardly says where it lies in its plane, and a step may leave it. Steps are damped until no
-        more points than a few are lost (Levenberg 1944), those directions first that are known least.
+        A flat face towards the camera hardly determines its position in its own plane, so that a step can leave it. Steps are damped until at most the
+        share LOST of the points is lost (Levenberg 1944); damping acts on the worst determined directions first.
         """
         poses = tuple(poses)
         p = 6 * len(poses)
@@ -263,9 +265,11 @@ class _Fit:
                 if settled:
                     break
                 scores, settled = field_scores(blocks, self.robot.body.mesh.nodes), True
-                if self.loose.any():  # nothing but a start holds the clouds: what they share changes how well they know, not what
+                if self.loose.any():  # with a guessed start only, correlated errors change the covariance and not the estimate
                     break
-                poses, inputs, gone = begun  # a step back to the markers would lose points: the second way leads from there, too
+                poses, inputs, gone = (
+                    begun  # a step back to the markers would lose points: the second iteration starts from there too
+                )
                 frames, blocks = self.at(poses, inputs, frames, step + 1)
         assert scores is not None
         root = self.posterior(blocks, mean, scores, 0.0).root
@@ -275,7 +279,7 @@ class _Fit:
     def at(
         self, poses: Sequence[FloatArray], inputs: FloatArray | None, before: dict[int, _Seen], step: int
     ) -> tuple[dict[int, _Seen], list[tuple[RayRows, FloatArray]]]:
-        """Return the free frames at a point, and their rows. Raises DataError where hardly a ray meets the body at the start."""
+        """Return the contact-free frames at a point, and their rows. Raises DataError if hardly any ray hits the body at the start."""
         frames = self.frames(poses, inputs, before, step)
         blocks = [self.rows(seen, poses) for seen in frames.values()]
         if step == 0 and sum(len(rows.residual) for rows, _ in blocks) < FEWEST:
@@ -283,17 +287,18 @@ class _Fit:
         return frames, blocks
 
     def explained(self, blocks: Sequence[tuple[RayRows, FloatArray]]) -> float:
-        """Return how many points lie on the body: 1 for one on it, 0 for one that is REACH off [1]."""
+        """Return the number of points on the body, each with a weight from 1 on the surface to 0 at REACH."""
         reach = REACH * float(np.linalg.norm(np.ptp(self.robot.body.mesh.nodes, axis=0)))
         return sum(float((1.0 - (rows.residual / reach) ** 2).sum()) for rows, _ in blocks)
 
     def moved_by_law(self, end: _End) -> FloatArray:
-        """Return where a fit under the other law ends that begins where this one ended, shape (c,). What all cables have in common
-        compresses the body, and laws that agree for small strains differ there. 0 where the robot declares a law by an effect."""
+        """Return the change of the estimate under the other constitutive law, shape (c,), by a fit that starts from this one. The common
+        input of all cables compresses the body, where laws that agree for small strains differ. 0 if the robot declares a law by an
+        effect."""
         other = with_other_law(self.robot)
         if other is None:
             return np.zeros(len(self.prior))
-        gone = end.gone - self.law  # from where the other law leads what is known before
+        gone = end.gone - self.law  # start from the prior mean under the other law
         try:
             there = replace(self, robot=other).end(end.poses, end.inputs, gone, end.scores)
         except DataError:
@@ -303,7 +308,7 @@ class _Fit:
     def frames(
         self, poses: Sequence[FloatArray], inputs: FloatArray | None, before: dict[int, _Seen], step: int
     ) -> dict[int, _Seen]:
-        """Return the free frames: states anew where inputs change, and clouds and derivatives in the first steps."""
+        """Return the contact-free frames, with new states if inputs change, and new clouds and derivatives in the first steps."""
         if before and not self.fits_inputs:
             return before
         states = self._states(inputs)
@@ -320,8 +325,9 @@ class _Fit:
         return result
 
     def rows(self, seen: _Seen, poses: Sequence[FloatArray]) -> tuple[RayRows, FloatArray]:
-        """Return the rows of a frame and their change with the parameters, shape (r, c). Rows on clamped nodes alone count only where inputs are
-        fitted too, which nothing else separates from poses: what holds them hides them, and lies where they should be or before."""
+        """Return the rows of a frame and their derivatives by the parameters, shape (r, c). Rows on clamped nodes are used only if inputs
+        are fitted, because only they separate inputs from poses. Otherwise they are left out: the holder hides the clamped part, and its
+        points lie at or in front of it."""
         mesh = self.robot.body.mesh
         size, held = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0))), np.zeros(len(mesh.nodes), dtype=bool)
         held[self.robot.body.clamped] = True
@@ -333,17 +339,17 @@ class _Fit:
     def posterior(
         self, blocks: Sequence[tuple[RayRows, FloatArray]], mean: FloatArray, scores: FloatArray | None, damping: float
     ) -> _Posterior:
-        """Return what prior and points say of the next step.
+        """Return the posterior of the next step from prior and points.
 
         The estimate of the points alone is that of least squares, −N⁻¹ g. Its information is Godambe's, N S⁻¹ N, with the covariance S ≥ N of the gradient
-        under noise and a smooth field (White 1982): nothing but N where `scores` are unknown.
+        under noise and a smooth field (White 1982): N alone without `scores`.
 
         If the estimates of points and of markers differ by more than their covariances allow, both have a further error (lens, model): the covariance of
         the points is then increased until the difference is expected (Mandel & Paule 1970).
 
         Arguments:
             mean: of the prior, shape (c,).
-            damping: of the step, in units of what the best known direction is held by.
+            damping: damping of the step, relative to the largest eigenvalue of the information.
         """
         values, vectors = np.linalg.eigh(self.prior)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -371,7 +377,7 @@ class _Fit:
             return None
 
     def _states(self, inputs: FloatArray | None) -> dict[int, FloatArray]:
-        """Return the nodes of the free frames under initial inputs [m]; a frame without an equilibrium is left out."""
+        """Return the nodes of the contact-free frames under initial inputs [m]; frames without an equilibrium are left out."""
         driven = DrivenRobot(self.robot, drive_of(self.robot, self.recording, initial=inputs))
         frames = free_clouds(self.recording, FRAMES_WITH_INPUTS if self.fits_inputs else FRAMES)
         states = {k: state.positions for k, state in free_path(driven, frames)}
@@ -380,7 +386,7 @@ class _Fit:
         return states
 
     def _moves(self, inputs: FloatArray | None, states: dict[int, FloatArray]) -> dict[int, FloatArray]:
-        """Return the change of the nodes of each frame with each initial input, shape (a, n, 3)."""
+        """Return the derivative of the nodes of each frame by each initial input, shape (a, n, 3)."""
         a, h = len(self.prior) - 6 * len(self.recording.T_robot_camera), STEP[self.recording.actuation]
         near = [self._states(inputs + h * axis) for axis in np.eye(a)] if inputs is not None and a else []
         return {
@@ -389,7 +395,7 @@ class _Fit:
         }
 
     def _within_bounds(self, said: _Posterior, inputs: FloatArray | None) -> FloatArray:
-        """Return the step, shape (c,), with inputs within their bounds: the likeliest one there."""
+        """Return the most likely step with inputs within their bounds, shape (c,)."""
         p, change, root = 6 * len(self.recording.T_robot_camera), said.mean, said.root
         if inputs is None or not self.fits_inputs:
             return change
@@ -407,16 +413,17 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Posterior:
-    """Of parameters."""
+    """The posterior of the parameters."""
 
     mean: FloatArray
     """shape (c,)."""
     root: FloatArray
-    """Of their covariance, shape (c, q)."""
+    """Square root of their covariance, shape (c, q)."""
 
 
 def _worth(values: FloatArray, apart: FloatArray) -> float:
-    """Return the share w by which information with eigenvalues λ counts beside a unit prior: Σ a² wλ/(1 + wλ) is at most its expectation."""
+    """Return the largest weight w ≤ 1 of information with eigenvalues λ relative to a unit prior for which Σ a² wλ/(1 + wλ) is at most its
+    expectation."""
 
     def excess(log: float) -> float:
         known = np.exp(log) * values
@@ -429,11 +436,11 @@ def _worth(values: FloatArray, apart: FloatArray) -> float:
 
 
 def measured_noises(robot: Robot, recording: Recording, calibration: Calibration) -> tuple[CameraNoise, ...]:
-    """Return the noise of each camera: declared, else as the free frames' clouds scatter about their own smooth part.
+    """Return the noise of each camera: as declared, or estimated from the scatter of contact-free clouds about their smooth part.
 
     Arguments:
         robot, recording: as loaded.
-        calibration: with the poses.
+        calibration: calibration with the poses.
     """
     declared = [camera.noise if camera is not None else None for camera in recording.cameras]
     if not recording.has_clouds or all(noise is not None for noise in declared):
@@ -456,7 +463,7 @@ def measured_noises(robot: Robot, recording: Recording, calibration: Calibration
 
 
 def _smooth_rest(rows: RayRows) -> FloatArray:
-    """Return whitened residuals without the mean of those around them."""
+    """Return whitened residuals minus the mean of their neighbours."""
     cell = np.ptp(rows.points, axis=0).max() / 30.0 + 1e-12
     z = rows.residual / rows.std
     _, group = np.unique(np.floor(rows.points / cell).astype(np.int64), axis=0, return_inverse=True)

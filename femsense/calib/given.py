@@ -1,4 +1,4 @@
-"""Whether a calibration that is given belongs to a recording: its free frames are calibrated once more, and compared."""
+"""Check whether a given calibration belongs to a recording: its contact-free frames are calibrated again and compared."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
 
 MOVED = 5.0
-"""A camera has moved that shows the body off by more than so many times what the calibration leaves …"""
+"""A camera has moved if the body appears displaced by more than this multiple of the calibration residual …"""
 SHARE = 0.01
 """… and by this share of the body's diagonal; below, forces change little."""
 FEWEST, MARKERS = 2, 4
-"""Fewer free frames, or fewer markers in them, tell nothing."""
+"""Minimum number of contact-free frames, and of markers in them."""
 
 
 def check_given(robot: Robot, recording: Recording, calibration: Calibration) -> None:
-    """Refuse a recording whose own free frames cannot be calibrated, and warn of a camera that has moved since.
+    """Refuse a recording whose own contact-free frames cannot be calibrated, and warn about a camera that has moved since.
 
-    Recordings without free frames, or without named markers in them, are not checked.
+    Recordings without contact-free frames, or without named markers in them, are not checked.
 
     Arguments:
         robot: the robot.
         recording: as loaded.
-        calibration: of another recording, or of the same.
+        calibration: calibration of this or another recording.
 
     Raises:
-        DataError: as of `calibrate`: markers or inputs that cannot be the robot's as they are written.
+        DataError: as for `calibrate`: markers or inputs that do not belong to the robot.
     """
     frames = _telling(recording)
     if len(frames) < FEWEST or len(calibration.poses) != len(recording.camera_names):
@@ -62,7 +62,7 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
 
 
 def _telling(recording: Recording) -> IntArray:
-    """Return the free frames in which every camera sees enough markers."""
+    """Return the contact-free frames in which every camera sees enough markers."""
     if recording.free is None or recording.unnamed_frame.size:
         return np.zeros(0, dtype=np.int64)
     seen = np.zeros((len(recording.time_s), len(recording.camera_names)), dtype=np.int64)

@@ -1,11 +1,11 @@
-"""A twin as the reference: what a model misses of one recording is taken off another one at the same inputs.
+"""A twin recording as the reference: its residual is subtracted from other recordings at the same inputs.
 
-A model of a real body may be off by more than what is asked for: a weight shifts the tip of the trunk by 10 mm where the model misses it by 20 mm. Where the
-same inputs were recorded without what is asked for, the errors that both recordings share drop out. With markers y and the model's m,
+The model error can exceed the effect in question: a weight shifts the tip of the trunk by 10 mm, and the model is wrong by 20 mm. If the same inputs
+were recorded without the effect, the errors common to both recordings cancel. With measured markers y and modelled ones m,
 
     y′(u) = y(u) − (y₀(u₀) − m(u₀)),   u₀ the nearest inputs of the reference,
 
-so that y′ − m(u) is what distinguishes the two recordings, but for what does not repeat.
+so that y′ − m(u) is the difference of the two recordings, up to repeatability.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
 
 SAME = 0.15
-"""Inputs are the same that differ by no more than this share of their range in the reference: motors of the trunk repeat to 0.01 of it in the mean, to 0.1
-at most."""
+"""Maximum difference of equal inputs, relative to their range in the reference: motors of the trunk repeat to 0.01 on average and to 0.1 at
+most."""
 
 
 def less_reference(robot: Robot, recordings: Sequence[Recording], references: Sequence[Recording]) -> list[Recording]:
-    """Return recordings whose markers are moved by what a model misses of others at the same inputs; those of other frames are left out.
+    """Subtract the residuals of references from the markers of recordings at the same inputs; markers of frames with other inputs are
+    removed.
 
     Arguments:
         robot: the model.
-        recordings: with named markers and known inputs.
-        references: of the same robot and cameras without what is asked for.
+        recordings: recordings with named markers and known inputs.
+        references: recordings of the same robot and cameras without the effect in question.
 
     Raises:
-        InputError: a recording that is driven otherwise than its reference, without named markers or with unknown inputs.
+        InputError: a recording with other inputs than its reference, without named markers, or with an unknown zero of the inputs.
         DataError: no frame has the inputs of a reference, or a reference has no equilibrium.
     """
     for one in (*recordings, *references):
@@ -57,12 +58,12 @@ def less_reference(robot: Robot, recordings: Sequence[Recording], references: Se
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Missed:
-    """What a model misses of references."""
+    """Residuals of references."""
 
     inputs: FloatArray
     """[N], [m] or [Pa], shape (f, a)."""
     of_markers: FloatArray
-    """Measured less modelled, robot frame [m], shape (f, v, m, 3); NaN where a marker is not seen."""
+    """Measured minus modelled markers, robot frame [m], shape (f, v, m, 3); NaN for hidden markers."""
     poses: tuple[FloatArray, ...]
     """T_robot_camera of each camera of the first reference, each (4, 4)."""
 
@@ -90,7 +91,7 @@ def _missed(robot: Robot, reference: Recording) -> _Missed:
 
 
 def _moved(robot: Robot, recording: Recording, twin: _Missed) -> Recording:
-    """Return a recording whose markers are moved by what was missed at the nearest inputs."""
+    """Return a recording whose markers are moved by the residual at the nearest inputs."""
     width = np.ptp(twin.inputs, axis=0)
     width = np.where(width > 0.01 * width.max(), width, max(float(width.max()), 1e-12))
     off, nearest = map(np.asarray, cKDTree(twin.inputs / width).query(recorded_inputs(recording) / width, p=np.inf))

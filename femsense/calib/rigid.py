@@ -27,7 +27,8 @@ def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray
         weights: ≥ 0, shape (n,); by default all 1.
 
     Raises:
-        InputError: shapes differ; DataError: fewer than three points, or all on a line.
+        InputError: shapes differ.
+        DataError: fewer than three points, or collinear ones.
     """
     a, b = as_points(points_a, "points_a"), as_points(points_b, "points_b")
     if a.shape != b.shape:

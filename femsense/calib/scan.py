@@ -90,7 +90,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RayRows:
-    """Rays of one frame on the surface of one state: measured minus modelled along the surface's normal."""
+    """Residual rows of one frame: measured points minus the modelled surface, along the surface normal."""
 
     hits: SurfaceHits
     points: FloatArray
@@ -186,15 +186,19 @@ def ray_rows(
     reach: float,
     catch: float = 0.0,
 ) -> RayRows:
-    """Return the rows of a scan on the surface of a state.
+    """Cast the ray of each measured point onto the deformed surface, and return one residual row per hit.
+
+    The residual is the distance of the point from the hit face along its normal. Its standard deviation is the noise along the ray times the
+    cosine of incidence.
 
     Arguments:
-        scan: what was seen.
+        scan: measured points of all cameras in one frame.
         surface: the deformed surface.
-        poses, noises: of the cameras.
-        reach: see `Surface.cast` [m].
-        catch: points whose ray misses the body are compared with the closest face, up to this distance [m]: for states far from the
-            solution.
+        poses: T_robot_camera of each camera, shape (4, 4).
+        noises: depth noise of each camera.
+        reach: maximum distance between a point and its face [m]; points farther away belong to another object.
+        catch: maximum distance of the fallback [m]: a point whose ray misses the surface is compared with the closest face. It helps in states
+            far from the solution.
     """
     points, origins = scan.points(poses), scan.origins(poses)
     hits = surface.cast(points, origins, reach=reach)

@@ -26,7 +26,20 @@ its own stiffness. Without `least_m` the gripper pulls its other finger to the l
 
 
 class Follower:
-    """Inputs that move points of a robot towards changing targets, one step per call, within limits."""
+    """Inverse kinematics in real time: inputs with which points of a soft robot follow moving targets.
+
+    Each call of `step` improves the commands of cables and chambers by one or more equilibria (a trust-region method with the compliance
+    of the current state as Jacobian), within the limits of the inputs. The search for a target ends when the target is reached or when no
+    step reduces the distance any more. The last state is the warm start for the next target.
+
+    Example:
+        >>> robot = fs.load_robot("finger")
+        >>> follower = fs.Follower(robot)
+        >>> for height in (0.005, 0.010, 0.015):  # m, a moving target; nan: free
+        ...     motion = follower.step({"tip": (np.nan, np.nan, height)}, seconds=1.0)
+        >>> round(motion.inputs["flexor"], 1), motion.error_m < 1e-4  # N, m
+        (0.7, True)
+    """
 
     def __init__(
         self,
@@ -37,14 +50,14 @@ class Follower:
         calibration: Calibration | None = None,
         options: ReachOptions | None = None,
     ) -> None:
-        """Start at rest.
+        """Start from the equilibrium without inputs.
 
         Arguments:
-            robot: with its effects; its cables' and chambers' limits hold.
+            robot: the robot with its effects. The limits of its cables and chambers apply.
             control: kind of the cable commands: "tension" [N] or "displacement" [m].
-            limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], in addition to those of the robot.
-            calibration: its initial inputs are subtracted from the commands.
-            options: criteria to end a search; an empirical correction is ignored.
+            limits: name → (minimum, maximum): cable commands [N or m] and chamber pressures [Pa], in addition to the limits of the robot.
+            calibration: initial inputs, which are subtracted from the commands.
+            options: criteria to end a search. The empirical correction of a robot is ignored.
 
         Raises:
             InputError: an unknown cable or control, or reversed limits.
@@ -58,9 +71,9 @@ class Follower:
         self._compared = False  # whether a search from rest was compared
 
     def begin(self, inputs: Mapping[str, float]) -> None:
-        """Restart at the equilibrium under given inputs: commands of all cables [N or m] and chambers [Pa].
+        """Restart from the equilibrium under given commands of all cables [N or m] and chambers [Pa].
 
-        If they have no equilibrium, nothing changes.
+        If no equilibrium is found, the follower stays at its current state.
         """
         body = self.robot.body
         true = {
@@ -80,27 +93,26 @@ class Follower:
 
     @property
     def ended(self) -> bool:
-        """Whether the search has ended: further steps change nothing, except with `stays`, which also searches from rest."""
+        """Whether the search for the current target has ended: the target is reached, or the distance is at a local minimum."""
         return self._search is not None and bool(self._search.status)
 
     @property
     def resting(self) -> bool:
-        """Whether further steps towards the same target change nothing, with `stays` too."""
+        """Whether the search from the state without inputs (`stays`) has ended too, so that no further step changes the result."""
         search = self._search
         return search is not None and bool(search.status) and (search.status == REACHED or self._compared)
 
     def step(self, target: Target, *, seconds: float = 0.0, stays: bool = False) -> Motion:
-        """Continue towards a target, and return the motion so far.
+        """Take one or more steps towards a target, and return the commands so far.
 
         Arguments:
-            target: as `reach` takes it.
-            seconds: time after which no further equilibrium is started [s], except to solve the final state to full tolerance; at least one
-                is solved.
-            stays: the target will not move. If the search has ended elsewhere, further steps also search from rest, and a closer
-                result is taken.
+            target: marker or point at rest → target position [m], as for `reach`.
+            seconds: time budget [s]. At least one equilibrium is solved; a reached target is always solved to full tolerance.
+            stays: the target is at rest. If the search ended at a local minimum, a second search starts from the state without inputs, and the
+                closer result is returned.
 
         Returns:
-            the motion; its status is "converging" while further steps reduce the error.
+            the motion. Its status is "converging" while further steps reduce the distance.
 
         Raises:
             InputError: an unknown marker, or an invalid target.

@@ -54,6 +54,7 @@ class Motion:
     limits: tuple[str, ...]
     """The active limits in words, the most costly first."""
     certificate: Certificate
+    """Residuals of the optimality conditions in the final state."""
     iterations: int
     """Number of equilibria that were solved."""
     equilibrium: Equilibrium

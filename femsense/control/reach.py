@@ -43,19 +43,19 @@ def reach(
     contacts: Sequence[WallContact] = (),
     options: ReachOptions | None = None,
 ) -> Motion:
-    """Find the inputs that bring points of the body to target positions, within limits.
+    """Solve the inverse kinematics of a robot: inputs that bring points of the body to target positions, within limits.
 
     Arguments:
-        robot: the robot with its effects; its cables' and chambers' limits hold.
+        robot: the robot with its effects. The limits of its cables and chambers apply.
         target: a marker's name, or a point of the body at rest [m] → its target position, robot frame [m], shape (3,); NaN leaves
             a direction free.
         control: kind of the cable commands: "tension" [N] or "displacement" [m].
-        limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], in addition to those of the robot.
-        forces: known or sensed contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,).
-        start: the current state of the robot; by default at rest without inputs. If the search fails from there, it is repeated
-            from rest.
-        calibration: its initial inputs are subtracted from the commands.
-        contacts: walls to press with a given force.
+        limits: name → (minimum, maximum): cable commands [N or m] and chamber pressures [Pa], in addition to those of the robot.
+        forces: known or estimated contact forces: (point of the body at rest [m], force on the body [N]), each of shape (3,).
+        start: the current state of the robot. Default: the equilibrium without inputs. If the search fails from the current state, it is
+            repeated from there.
+        calibration: initial inputs, which are subtracted from the commands.
+        contacts: walls to press against with a given force.
         options: criteria to end the search.
 
     Returns:

@@ -12,13 +12,26 @@ class FemsenseError(Exception):
 
 
 class InputError(FemsenseError):
-    """Bad input, with its location, what was found, what was expected, and a hint.
+    """Raised when a file or an argument is invalid. The message states the location, the value found, the value expected, and a remedy.
+
+    The arguments are attributes afterwards. A command that raises it returns exit status 2.
 
     Arguments:
-        what: the problem in one sentence.
-        where: file, key, row or argument.
-        found, expected: short texts or values.
-        hint: what to try.
+        what: the problem, one sentence.
+        where: location of the problem: file, key, row or argument.
+        found: the invalid value.
+        expected: the values that would be valid.
+        hint: a remedy.
+
+    Example:
+        >>> try:
+        ...     fs.load_robot("fingre")
+        ... except fs.InputError as error:
+        ...     print(error)
+        fingre: no such robot
+          found:    neither a folder, nor a file, nor a known name
+          expected: a folder with robot.toml, or one of: arm, finger, four-leg, gripper, pneu-finger
+          try:      did you mean 'finger'?
     """
 
     def __init__(
@@ -48,7 +61,7 @@ class UnitError(InputError):
 
 
 class DataError(FemsenseError):
-    """The input is well formed, but the data do not allow a result (exit status 1)."""
+    """Raised when the input is valid but the data do not allow a result, such as a recording with too few markers (exit status 1)."""
 
     exit_status = 1
 

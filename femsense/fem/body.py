@@ -24,7 +24,9 @@ class BodyModel:
     """A body with its clamp, cables and dead loads. A change makes a new object (`with_…`)."""
 
     mesh: TetMesh
+    """Mesh at rest."""
     material: Material
+    """Constitutive law and its parameters, per element."""
     clamped: IntArray
     """Clamped nodes, shape (k,)."""
     clamp_stiffness: float
@@ -32,14 +34,17 @@ class BodyModel:
     clamp_nodes: IntArray
     """The clamped nodes that the declared mesh has (no added mid-edge nodes); these get the springs, shape (s,)."""
     cables: tuple[Cable, ...]
+    """Cables, tied to the mesh."""
     gravity: FloatArray
     """[m/s²], shape (3,)."""
     dead_forces: FloatArray
     """Dead nodal forces in addition to the weight [N], shape (n, 3)."""
     stencil: Stencil
+    """Sparsity pattern and shape functions of the elements."""
     cable_slots: tuple[IntArray, ...]
     """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
     free_map: FreeMap
+    """Map from free to all degrees of freedom."""
     clamp_turn_stiffness: float = np.inf
     """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
     released: list[FreeMap] = field(default_factory=list)
@@ -64,6 +69,7 @@ class BodyModel:
     parts: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """The connected part that each node belongs to, shape (n,); a robot has one (see `mesh_checks.check_mesh`)."""
     chambers: tuple[Chamber, ...] = ()
+    """Pneumatic chambers: closed inner surfaces."""
     chamber_curvature: tuple[sp.csr_matrix, ...] = ()
     """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
     carried_mass: FloatArray | None = None

@@ -123,7 +123,8 @@ def compliance(
         are those of the free ones, with tension or pressure as the input.
 
     Raises:
-        InputError: points and directions do not fit; FemsenseError: nothing holds the body.
+        InputError: points and directions have different shapes.
+        FemsenseError: the body is not clamped.
 
     Example:
         >>> body = fs.load_robot("finger").body

@@ -63,7 +63,7 @@ ADVICE = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Equilibrium:
-    """A static state with its certificate."""
+    """A static equilibrium: node positions, cable tensions, chamber pressures, and the residual that certifies it."""
 
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
@@ -80,6 +80,7 @@ class Equilibrium:
     status: str
     """"converged", or the reason of the failure (a key of ADVICE)."""
     iterations: int
+    """Number of Newton steps."""
     reached: float
     """Share of the load that `positions` balance [1]: 1, or the last successful load step."""
     indefinite_steps: int
@@ -145,17 +146,17 @@ def solve_equilibrium(
     bilateral: bool = False,
     options: SolveOptions | None = None,
 ) -> Equilibrium:
-    """Find the static equilibrium of a body.
+    """Solve for the static equilibrium of a body under cable, chamber and nodal loads, by Newton's method with load steps.
 
     Arguments:
         body: the body with its weight and dead forces.
-        tension: name → tension at the motor [N]; cables that are not named anywhere are slack.
+        tension: name → tension at the motor [N]; cables that are named nowhere are slack.
         shortening: name → imposed shortening of a cable [m]; such a cable never pushes unless `bilateral`.
-        pressure: name → pressure in a chamber above the surroundings [Pa]; chambers that are not named anywhere have none.
-        volume: name → growth of a chamber since rest [m³] that is imposed, as by a liquid pump; its pressure may be negative.
-        nodal_forces: further nodal forces [N], shape (n, 3).
+        pressure: name → pressure in a chamber above the surroundings [Pa]; 0 in chambers that are named nowhere.
+        volume: name → imposed increase of the volume of a chamber since rest [m³], as by a liquid pump; its pressure can be negative.
+        nodal_forces: nodal forces in addition to the weight [N], shape (n, 3).
         start: an equilibrium as warm start (its positions, tensions and factor).
-        bilateral: held cables may push.
+        bilateral: held cables can push.
         options: of the solver, and the history of friction.
 
     Returns:

@@ -1,7 +1,7 @@
-"""A smooth error over the surface of the body: what neighbouring rows share.
+"""A smooth error over the surface of the body: the correlated error of neighbouring rows.
 
-The error at a point s is Σ_i k_i(s) e_i with normalised Gaussian weights k_i (Σ k_i² = 1) about p centres, in place and in the direction that the surface
-faces: a body that sags too far is too low on its upper face and right on its sides.
+The error at a point s is Σ_i k_i(s) e_i with normalised Gaussian weights k_i (Σ k_i² = 1) about p centres, as functions of position and of
+the direction that the surface faces: the error of a body that sags too far is large on its upper face and small on its sides.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ErrorField:
         return len(self.places)
 
     def weights(self, places: FloatArray, facing: FloatArray) -> FloatArray:
-        """Return k_i at places at rest (r, 3) [m] whose surface faces (r, 3), shape (r, p)."""
+        """Return k_i at points at rest (r, 3) [m] with surface normals (r, 3), shape (r, p)."""
         result = np.empty((len(places), len(self.places)))
         _weights(places, facing, self.places, self.facing, self.length, ACROSS_EDGES * self.length, result)
         return result
@@ -50,10 +50,10 @@ def facing_of(corners: FloatArray) -> FloatArray:
 
 
 def spread_field(places: FloatArray, facing: FloatArray, size: float) -> ErrorField:
-    """Return a field whose centres are spread over a surface.
+    """Return a field with centres distributed over a surface.
 
     Arguments:
-        places: of the surface at rest [m], shape (s, 3).
+        places: points of the surface at rest [m], shape (s, 3).
         facing: outward unit normals there, shape (s, 3).
         size: diagonal of the body [m].
     """

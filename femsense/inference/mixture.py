@@ -1,9 +1,9 @@
-"""The noise of a row: a mixture of the robot (Gaussian) and of something else (uniform), with its responsibilities.
+"""The noise of a row: a mixture of the robot (Gaussian) and of other objects (uniform), with its responsibilities.
 
     −2 log[ exp(−z²/2κ²) + o ],   z = r/σ,   o = ω √(2π) σ / size
 
-ω: odds that a pixel shows something else on its side of the surface, in front or behind, rather than the robot; size: length over which that may
-lie. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
+ω: odds that a pixel shows another object on its side of the surface, in front or behind, rather than the robot; size: length over which
+that object may lie. κ ≥ 1 widens the noise while a fit is far from its optimum (graduated non-convexity, Blake & Zisserman 1987).
 Source of the mixture: Verbeek, Vlassis & Kröse 2003 for EM; Aitkin & Wilson 1980 for outliers as a mixture component.
 """
 
@@ -37,19 +37,19 @@ def _misfit(z, log_other, share, weight):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, slots=True)
 class Others:
-    """Odds ω that a pixel shows something else rather than the robot."""
+    """Odds ω that a pixel shows another object rather than the robot."""
 
     front: float
     """In front of the surface."""
     behind: float
-    """Behind it: nobody sees through a robot, but pixels at edges of depth mix both sides."""
+    """Behind it: the robot is opaque, but pixels at depth edges mix both sides."""
 
     def log_odds(self, std: FloatArray, length: float, behind: BoolArray) -> FloatArray:
         """Return log o of pixels, shape (r,).
 
         Arguments:
             std: σ along the ray [m], shape (r,).
-            length: over which something else may lie [m].
+            length: over which another object may lie [m].
             behind: whether a pixel lies behind the surface that its ray meets, shape (r,).
         """
         return np.asarray(np.log(np.where(behind, self.behind, self.front) * np.sqrt(2.0 * np.pi) * std / length))
@@ -68,11 +68,11 @@ class Width:
 
     @property
     def narrow(self) -> bool:
-        """Whether the noise has its own width."""
+        """Whether κ = 1."""
         return self.pixels == 1.0 and self.others == 1.0
 
     def narrowed(self, least: Width | None = None) -> Width:
-        """Return the next, narrower widths: a third, but no narrower than `least`, what is left still scatters."""
+        """Return the next widths: a third, but at least `least`, the scatter of the residual."""
         least = least or Width()
         third = [kappa / 3.0 if kappa > 1.5 else 1.0 for kappa in (self.pixels, self.others)]
         return Width(

@@ -1,4 +1,4 @@
-"""Nuisance parameters η: what moves the rows besides contact forces, with a Gaussian prior that contact-free frames teach.
+"""Nuisance parameters η: causes of residuals other than contact forces, with a Gaussian prior estimated from contact-free frames.
 
     η = (pose step of each camera, relative softness, relative pull of each cable and chamber, error field b of each camera, error field m of the model)
     r = C(x) η + noise,   C = [∂r/∂pose, d·∂x/∂softness, d·∂x/∂pulls, k by camera, |x − x_rest| k]
@@ -28,7 +28,7 @@ COMMON = (0.0, 0.5, 0.8, 0.95)
 EXPECTED, SIZE_FACTOR = np.array([1e-4, 0.01]), 8.0
 """Prior of s_b and s_m: log-normal about these, within this factor at one standard deviation."""
 EM_STEPS, EM_TOLERANCE = 8, 0.1
-"""Steps of a fit of η at most, and the decrease of Φ below which it ends."""
+"""Maximum number of steps of a fit of η, and the decrease of Φ at which it ends."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,7 +36,7 @@ class Nuisance:
     """The prior N(μ, R Rᵀ) of η in the next frame."""
 
     first_mean: FloatArray
-    """Mean of (pose steps, softness, pulls) before any frame is seen, shape (c,)."""
+    """Mean of (pose steps, softness, pulls) before any frame is used, shape (c,)."""
     first_covariance: FloatArray
     """Its covariance, shape (c, c)."""
     mean: FloatArray
@@ -50,18 +50,18 @@ class Nuisance:
 
     @property
     def common(self) -> int:
-        """Number of parameters that are not of the error field."""
+        """Number of parameters outside of the error fields."""
         return len(self.first_mean)
 
     @property
     def fields(self) -> IntArray:
-        """Which size, s_b or s_m, each parameter of the error fields has, shape ((v + 1) p,)."""
+        """Standard deviation, s_b or s_m, of each parameter of the error fields, shape ((v + 1) p,)."""
         count = len(self.mean) - self.common
         return np.repeat([0, 1], [count - self.centres, self.centres])
 
 
 def first_nuisance(mean: FloatArray, covariance: FloatArray, centres: int, views: int) -> Nuisance:
-    """Return the prior before any contact-free frame is seen, with error fields of so many centres of so many cameras and the model."""
+    """Return the prior before contact-free frames are used, with error fields for each camera and for the model."""
     root = block_diag(root_of(covariance), np.diag(np.repeat(EXPECTED, [views * centres, centres])))
     full = freeze(np.append(mean, np.zeros((views + 1) * centres)))
     return Nuisance(freeze(mean), freeze(covariance), full, freeze(root), centres)
@@ -109,7 +109,7 @@ def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[floa
 
     Arguments:
         grams: of `gram_of`, one a frame.
-        sizes: (s_b, s_m, a) where they are known; else those of the highest evidence.
+        sizes: (s_b, s_m, a), if known; by default those with the highest evidence.
     """
     if sizes is None:
         grid = ((b, m, a) for b in BIAS_M for m in MODEL_SHARE for a in (0.0, 0.8))
@@ -123,8 +123,8 @@ def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[floa
 
 
 def without_poses(gram: FloatArray, pose_steps: int, common: int) -> FloatArray:
-    """Return inner products of a frame with the error field made orthogonal to the pose: what looks like a pose is one (restricted spatial
-    regression, Reich, Hodges & Zadnik 2006).
+    """Return inner products of a frame with the error field made orthogonal to the pose: the part that a pose can explain is attributed to
+    the pose (restricted spatial regression, Reich, Hodges & Zadnik 2006).
 
     Arguments:
         gram: of `gram_of`.

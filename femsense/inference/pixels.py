@@ -21,37 +21,37 @@ from femsense.pointcloud.casting import Rays, rays_through
 from femsense.pointcloud.rays import Surface
 
 GRAZING = 0.25
-"""Rays with a smaller cosine of incidence pass for misses: there depth is interpolated across the silhouette."""
+"""Minimum cosine of incidence of a hit: below it, cameras interpolate depth across the silhouette."""
 FAR = 6.0
 """Pixels in front of the surface by more than this many σ are compared with its closest point."""
 ANCHORED = 30.0
-"""Pixels that cannot be nearer to the surface than this many σ stay tied to the point that was closest: they are not of the robot there."""
+"""Pixels farther from the surface than this many σ keep their closest point from an earlier state: they do not belong to the robot."""
 FEW = 400
-"""Up to so many points are compared with all triangles; more are worth boxes about these."""
+"""Number of points up to which all triangles are compared; for more, bounding volumes are built."""
 ON_SURFACE = 1e-5
-"""Nearer than this the direction to the closest point is the face's normal [m]."""
+"""Distance below which the normal of the face is used as direction to the closest point [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Anchors:
-    """Closest points of a body in one state, to which pixels far from it stay tied."""
+    """Closest points of a body in one state, which pixels far from it keep."""
 
     positions: FloatArray
     """Nodes of the state [m], shape (n, 3)."""
     triangle: IntArray
-    """On which the point closest to each pixel lies, shape (m,)."""
+    """Triangle of the closest point of each pixel, shape (m,)."""
     weights: FloatArray
-    """Its barycentric coordinates there, shape (m, 3)."""
+    """Barycentric coordinates of that point, shape (m, 3)."""
     gap: FloatArray
-    """How far it is [m], shape (m,)."""
+    """Its distance [m], shape (m,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pixels:
-    """Measured points of one frame that may show the robot, the same for all hypotheses."""
+    """Measured points of one frame that may belong to the robot; the same for all hypotheses."""
 
     points: FloatArray
-    """Robot frame [m], shape (m, 3)."""
+    """Points in the robot frame [m], shape (m, 3)."""
     origins: FloatArray
     """Centre of the camera of each [m], shape (m, 3)."""
     view: IntArray
@@ -59,14 +59,14 @@ class Pixels:
     ray_std: FloatArray
     """Noise along the ray [m], shape (m,)."""
     others: Others
-    """Odds that it shows something else."""
+    """Odds that a pixel shows another object."""
     share: float
     """1/T: how many independent measurements a pixel counts for."""
     coloured: bool
     """Whether colour separates the robot from the rest."""
     anchors: Anchors | None = None
     rays: tuple[tuple[IntArray, Rays], ...] = field(init=False)
-    """Of each camera: which of the points are its own, and their rays."""
+    """For each camera, the indices of its points, and their rays."""
     ways: FloatArray = field(init=False)
     """Unit directions of the rays, shape (m, 3)."""
 
@@ -78,14 +78,14 @@ class Pixels:
         object.__setattr__(self, "ways", freeze(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)))
 
     def anchored(self, skin: Skin, positions: FloatArray) -> Pixels:
-        """Return the pixels with those far from the body in a state, nodes (n, 3) [m], tied to its closest points: these change too little to be looked for
-        again in each state."""
+        """Return the pixels with fixed closest points for those far from the body in a state, nodes (n, 3) [m]. These change too little to
+        be recomputed in each state."""
         return replace(self, anchors=Anchors(positions, *closest_points(positions, skin.triangles, self.points)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Skin:
-    """What of the body pixels are compared with."""
+    """The surface of the body, to which pixels are compared."""
 
     triangles: IntArray
     """Outward, shape (t, 3)."""
@@ -132,8 +132,8 @@ def pixel_rows(pixels: Pixels, skin: Skin, positions: FloatArray, views: int) ->
 
 
 def closest_points(positions: FloatArray, triangles: IntArray, points: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the triangle of a surface that is closest to each point (k, 3), shape (k,), the barycentric weights there, shape (k, 3), and how far that is
-    [m], shape (k,)."""
+    """Return the closest triangle of each point (k, 3), shape (k,), the barycentric weights there, shape (k, 3), and the distance [m],
+    shape (k,)."""
     k = len(points)
     triangle, weights, gap = np.empty(k, dtype=np.int64), np.empty((k, 3)), np.empty(k)
     if k <= FEW:
@@ -144,7 +144,8 @@ def closest_points(positions: FloatArray, triangles: IntArray, points: FloatArra
 
 
 def _closest_points(pixels: Pixels, far: IntArray, x: FloatArray, triangles: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return triangle, barycentric weights and distance [m] of the points of a surface closest to some pixels (k,); of anchored ones where they are tied."""
+    """Return triangle, barycentric weights and distance [m] of the surface points closest to some pixels (k,); for anchored pixels those of
+    their anchors."""
     anchors = pixels.anchors
     if anchors is None:
         return closest_points(x, triangles, pixels.points[far])
@@ -175,7 +176,7 @@ def rows_on(
     """Return rows at points of the surface, with the derivatives by pose and field.
 
     Arguments:
-        triangle, weights: where on the surface, shapes (r,) and (r, 3).
+        triangle, weights: points of the surface, shapes (r,) and (r, 3).
         direction, residual, std, log_other, share: as in `Rows`.
         points: measured [m], shape (r, 3); view: their cameras, shape (r,).
     """

@@ -26,7 +26,8 @@ class Rows:
     std: FloatArray
     """Standard deviation σ [m], shape (r,)."""
     log_other: FloatArray
-    """Log of o_j, the odds that the row shows something else, relative to the density of the robot at a residual of 0; −inf: never. Shape (r,)."""
+    """Log of o_j, the odds that the row shows another object, relative to the density of the robot at a residual of 0; −inf: never. Shape
+    (r,)."""
     share: FloatArray
     """1/T_j: how many independent measurements each row counts for, shape (r,)."""
     nodes: IntArray
@@ -38,11 +39,11 @@ class Rows:
     by_pose: FloatArray
     """Derivative of the measured side with (rotation about the pivot [rad], shift [m]) of each camera, shape (r, 6 v)."""
     field: FloatArray
-    """Weights of the error field's centres (see `error_field`), shape (r, p); 0 where the row has no correlated error."""
+    """Weights of the error field's centres (see `error_field`), shape (r, p); 0 for rows without a correlated error."""
     camera: FloatArray
-    """Share of each camera in the measured side, shape (r, v); 0 where no camera's error field is part of it."""
+    """Share of each camera in the measured side, shape (r, v); 0 without an error field of a camera."""
     way: FloatArray
-    """Distance of the point from its place at rest [m], shape (r,)."""
+    """Displacement of the point from rest [m], shape (r,)."""
     rest: FloatArray
     """The point at rest [m], shape (r, 3)."""
     pixel: BoolArray
@@ -59,11 +60,12 @@ class Rows:
         return result
 
     def some(self, index: IntArray) -> Rows:
-        """Return some of the rows, index (s,)."""
+        """Return a selection of the rows, index (s,)."""
         return Rows(*(getattr(self, name)[index] for name in Rows.__slots__))
 
     def averaged(self, weight: FloatArray) -> Averaged:
-        """Return the rows with the pixels of each triangle averaged under weights (r,), for what hardly changes over a triangle."""
+        """Return the rows with the pixels of each triangle averaged under weights (r,), for quantities that hardly change over a
+        triangle."""
         others = np.flatnonzero(~self.pixel)
         label = np.full(len(self), -1, dtype=np.int64)
         size = int(self.nodes.max(initial=0)) + 1
@@ -83,13 +85,13 @@ class Rows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Averaged:
-    """Rows of which some are means of others."""
+    """Rows, some of which are means of other rows."""
 
     rows: Rows
     weight: FloatArray
     """Sum of the weights of each, shape (a,)."""
     label: IntArray
-    """To which of them each row belongs, shape (r,)."""
+    """Index of the mean to which each row belongs, shape (r,)."""
     share: FloatArray
     """Share of each row in its mean, shape (r,)."""
 

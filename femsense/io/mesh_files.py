@@ -158,7 +158,7 @@ def _no_triangles(path: Path, where: str) -> InputError:
 
 
 def write_mesh(mesh: TetMesh, path: Path) -> None:
-    """Write a mesh in metres, in the format that the ending names (.vtu keeps all digits)."""
+    """Write a mesh in metres, in the format of the file extension; .vtu keeps all digits."""
     import meshio
 
     kind = "tetra10" if mesh.is_quadratic else "tetra"

@@ -51,15 +51,25 @@ OWN_FILES = re.compile(
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Load a recording folder, or its recording.toml. Clouds and images are read later, frame by frame.
+    """Load a recording: times, inputs of the cables and chambers, markers and camera data of one experiment.
+
+    Clouds and images are read later, frame by frame, so that long recordings need little memory.
+
+    Arguments:
+        path: the folder of the recording, or its recording.toml.
+
+    Returns:
+        the recording, in SI units, markers in the frames of their cameras.
 
     Raises:
-        InputError: with file, place, found and expected value.
+        InputError: a file is missing or invalid; the error states file, row, value found and value expected.
 
     Example:
-        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
-        >>> recording.frame_count, recording.cable_names
-        (44, ('north', 'west', 'south', 'east'))
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")  # or a path of your own
+        >>> recording
+        Recording(44 frames, 43 s; north, west, south, east [tension]; 16 markers; clouds)
+        >>> recording.inputs.shape  # tensions of 44 frames and 4 cables [N]
+        (44, 4)
     """
     folder = _recording_folder(Path(path).expanduser())
     toml = folder / "recording.toml"

@@ -37,7 +37,7 @@ def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Seque
 
 
 def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any] | None = None) -> Path:
-    """Write the improved robot, then loop.json; return the folder.
+    """Write the result of `improve`: the improved robot, then loop.json. Return the folder.
 
     Raises:
         InputError: see `check_loop_folder`.
@@ -81,7 +81,17 @@ def check_loop_folder(folder: str | Path, robot: Robot | None = None) -> None:
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:
-    """Return the content of loop.json, or of the one in a folder. Raises InputError."""
+    """Read loop.json, the result of `improve`.
+
+    Arguments:
+        path: the file, or the folder that contains it.
+
+    Returns:
+        its content (docs/formats/results.md).
+
+    Raises:
+        InputError: the file is missing or of another kind.
+    """
     file = Path(path).expanduser()
     return read_document(file / "loop.json" if file.is_dir() else file, FORMAT)
 

@@ -76,10 +76,11 @@ def improve(
     progress: Progress | None = None,
     options: ImproveOptions | None = None,
 ) -> LoopResult:
-    """Search for the effects that the declared model lacks, and report the held-out error with and without them.
+    """Identify the physical effects that the declared model lacks, by stepwise model selection.
 
-    Effects are added one at a time. An effect is accepted if its evidence (the decrease of χ² less the BIC penalty of its parameters)
-    is significant and sweeps that were not fitted do not contradict it. Camera poses, modulus and inputs are fitted along.
+    Candidates (cable friction, slack, creep, payload, …: docs/effects) are fitted one at a time by nonlinear least squares, together with
+    camera poses, modulus and inputs. One is accepted if its evidence (the decrease of χ² less the BIC penalty of its parameters) is
+    significant, and if sweeps that were not fitted do not contradict it. The method is in docs/method/closing-the-loop.md.
 
     Arguments:
         robot: the declared robot.
@@ -94,7 +95,8 @@ def improve(
         the verdict, accepted and rejected effects with their evidence, held-out errors, and the improved robot.
 
     Raises:
-        InputError: an unknown effect, or no recording. DataError: the data do not allow a fit.
+        InputError: an unknown effect, or no recording.
+        DataError: the data do not allow a fit.
 
     Example:
         >>> robot = fs.load_robot("finger")

@@ -47,9 +47,11 @@ class Recording:
     time_s: FloatArray
     """[s], increasing, shape (F,)."""
     cable_names: tuple[str, ...]
+    """Name of each cable, in the order of the columns of `inputs`."""
     inputs: FloatArray
     """[N] or [m], shape (F, a)."""
     chamber_names: tuple[str, ...]
+    """Name of each chamber, in the order of the columns of `pressures`."""
     pressures: FloatArray
     """[Pa], shape (F, c)."""
     free: BoolArray | None
@@ -69,6 +71,7 @@ class Recording:
     marker_xyz: FloatArray
     """Its place in that camera's frame [m], shape (K, 3)."""
     rest: RestMarkers | None
+    """Markers of the unloaded body; None: not measured."""
     load_frame: IntArray
     """Frame of each known load, an index 0 … F − 1, shape (L,)."""
     load_points: FloatArray

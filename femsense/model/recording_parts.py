@@ -15,41 +15,44 @@ from femsense.model.camera import Camera
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Timeline:
-    """The frames in order of time, with their labels."""
+    """Times and labels of the frames of a recording."""
 
     time_s: npt.ArrayLike
-    """[s], increasing, shape (F,)."""
+    """Time of each frame [s], increasing, shape (F,)."""
     frame_numbers: npt.ArrayLike | None = None
-    """As in frames.csv, shape (F,); None: 0 … F − 1."""
+    """Number of each frame, as in frames.csv, shape (F,); None: 0 … F − 1."""
     free: npt.ArrayLike | None = None
-    """Frames in which nothing undeclared touches the robot, shape (F,); None where not known."""
+    """Mask of the contact-free frames, those without undeclared contact, shape (F,); None: unknown."""
     sweep: Sequence[str] | None = None
-    """Label of each frame; frames of one label are held out together. None if not given."""
+    """Label of the sweep of each frame; the frames of a sweep are held out together. None: not given."""
     gravity: npt.ArrayLike | None = None
-    """In the robot frame [m/s²], shape (F, 3); None: as the robot declares."""
+    """Gravity of each frame in the robot's coordinate system [m/s²], shape (F, 3); None: that of the robot."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drives:
-    """Inputs of the robot."""
+    """Inputs of the robot in each frame: cables and chambers."""
 
     cable_names: Sequence[str] = ()
+    """Name of each cable, in the order of the columns of `inputs`."""
     inputs: npt.ArrayLike | None = None
-    """Of the cables [N] or [m, > 0 shortens], shape (F, a)."""
+    """Cable inputs, shape (F, a): tensions [N], or displacements [m], > 0 shortens."""
     actuation: str = "tension"
-    """Kind of `inputs`: "tension" or "displacement"."""
+    """Kind of `inputs`: "tension" [N] or "displacement" [m]."""
     actuation_zero: str = "absolute"
     """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
     chamber_names: Sequence[str] = ()
+    """Name of each chamber, in the order of the columns of `pressures`."""
     pressures: npt.ArrayLike | None = None
-    """[Pa], shape (F, c)."""
+    """Chamber pressures above the surroundings [Pa], shape (F, c)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MarkerRows:
-    """K observations of markers that have names."""
+    """Observations of named markers, K rows."""
 
     names: Sequence[str]
+    """Names of the markers."""
     frame: npt.ArrayLike
     """An index 0 … F − 1, shape (K,)."""
     index: npt.ArrayLike
@@ -64,7 +67,7 @@ class MarkerRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UnnamedRows:
-    """U observations of markers that nobody named."""
+    """Observations of markers without names, U rows; calibration assigns them."""
 
     frame: npt.ArrayLike = ()
     """An index 0 … F − 1, shape (U,)."""
@@ -76,14 +79,14 @@ class UnnamedRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadRows:
-    """L known loads."""
+    """Known loads, L rows."""
 
     frame: npt.ArrayLike = ()
     """An index 0 … F − 1, shape (L,)."""
     points: npt.ArrayLike = ()
-    """The place on the body at rest, robot frame [m], shape (L, 3)."""
+    """Point of the body at rest, robot frame [m], shape (L, 3)."""
     forces: npt.ArrayLike = ()
-    """Robot frame [N], shape (L, 3)."""
+    """Force on the body, robot frame [N], shape (L, 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,6 +94,7 @@ class Views:
     """V cameras and the files of their images or clouds."""
 
     names: Sequence[str] = ("",)
+    """Name of each camera; ("",) for a single one."""
     cameras: Sequence[Camera | None] | None = None
     """One a view; None where the lens is not known."""
     T_robot_camera: Sequence[npt.ArrayLike | None] | None = None
@@ -113,6 +117,7 @@ class Tool:
     """
 
     name: str
+    """Name of the object."""
     kind: str
     """"ball", "cylinder" or "mesh"."""
     radius: float = 0.0
@@ -134,6 +139,7 @@ class RestMarkers:
     """Markers measured with the body unloaded, camera frame."""
 
     names: tuple[str, ...]
+    """Names of the markers."""
     positions: FloatArray
     """[m], shape (r, 3)."""
     std: FloatArray
@@ -147,7 +153,7 @@ class About:
     """Properties of a whole recording."""
 
     folder: Path | None = None
-    """Where it was read; None where it was made in Python."""
+    """Folder that it was loaded from; None: made in Python."""
     session: str | None = None
     """Recordings of one session share values that are constant within a session; None if not given."""
     rest: RestMarkers | None = None

@@ -71,8 +71,11 @@ class Robot:
     """A robot: a finite-element body with cables and chambers, markers, candidate contact points, and the effects of its model."""
 
     name: str
+    """Name of the robot."""
     body: BodyModel
+    """Finite-element model of the body, with cables and chambers."""
     marker_names: tuple[str, ...]
+    """Name of each marker."""
     marker_points: FloatArray
     """Markers at rest [m], shape (k, 3)."""
     markers: Embedding
@@ -82,7 +85,9 @@ class Robot:
     color_rgb: FloatArray | None
     """Colour of the body for the segmentation, each in [0, 1], shape (3,)."""
     actuation: Actuation
+    """Effects between recorded and true inputs: offsets, gains, friction."""
     observation: Observation
+    """Effects between true and measured positions: scale of depths, marker offsets."""
     creep: tuple[tuple[float, float], ...] = ()
     """Terms (fraction [1], time [s]) of the creep compliance."""
     document: dict[str, Any] | None = None

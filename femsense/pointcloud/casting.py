@@ -1,7 +1,7 @@
 # mypy: allow-untyped-decorators
-"""Rays of a camera cast onto a deforming surface: triangles are projected onto the image plane, where the rays are sorted into cells.
+"""Ray casting onto a deforming surface: triangles are projected onto the image plane, where the rays are sorted into cells.
 
-A hierarchy of boxes, as Embree builds one, would be built anew at each state of the body and asked once.
+A bounding volume hierarchy (Embree) would have to be rebuilt for each state of the body, and would be queried only once.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from femsense.core.arrays import FloatArray, IntArray, read_only
 from femsense.core.kernels import njit
 
 PER_CELL = 2.0
-"""Rays in a cell of the image plane, on average."""
+"""Average number of rays per cell of the image plane."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rays:
-    """Rays from one centre through points, sorted by cells of a plane across their mean direction."""
+    """Rays from one centre through points, sorted by cells of a plane normal to their mean direction."""
 
     origin: FloatArray
     """Centre of the camera [m], shape (3,)."""
     basis: FloatArray
     """Rows: two directions of the plane, then the mean direction, shape (3, 3)."""
     uv: FloatArray
-    """Where each ray meets the plane at distance 1, shape (k, 2)."""
+    """Intersection of each ray with the plane at distance 1, shape (k, 2)."""
     order: IntArray
     """Rays by cell, shape (k,)."""
     starts: IntArray
-    """Where each cell begins in `order`, and its length at the end: row by row, shape (rows · columns + 1,)."""
+    """Start of each cell in `order`, row by row, and the length of `order`, shape (rows · columns + 1,)."""
     corner: FloatArray
-    """Of the first cell, shape (2,)."""
+    """Corner of the first cell, shape (2,)."""
     cell: float
     """Side of a cell [1]."""
     columns: int
-    """Cells in a row."""
+    """Number of cells in a row."""
 
     def cast(self, positions: FloatArray, triangles: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return the triangle that each ray meets first, −1 for a miss, shape (k,), the barycentric weights there, shape (k, 3), and how far from the
-        centre that is [m], shape (k,), inf for a miss.
+        """Return the first triangle that each ray hits, shape (k,), −1 for a miss; the barycentric weights of the hit, shape (k, 3); and
+        its distance from the centre [m], shape (k,), inf for a miss.
 
         Arguments:
             positions: nodes [m], shape (n, 3).
@@ -52,8 +52,8 @@ class Rays:
         return met, weights, depth * np.sqrt(1.0 + (self.uv**2).sum(axis=1))
 
     def beside(self, positions: FloatArray, triangles: IntArray, *, within: float) -> tuple[FloatArray, FloatArray]:
-        """Return how far rays that miss a surface pass it [m], inf beyond an angle `within` [rad], and how far from the centre that is [m], both of
-        shape (k,). Triangles that are partly behind the camera do not count.
+        """Return the distance at which rays pass a surface that they miss [m], inf beyond an angle `within` [rad], and the distance of that
+        point from the centre [m], both of shape (k,). Triangles that are partly behind the camera are ignored.
         """
         k = len(self.uv)
         passes, depth = np.full(k, np.inf), np.full(k, np.inf)
@@ -61,7 +61,7 @@ class Rays:
         return passes, depth * np.sqrt(1.0 + (self.uv**2).sum(axis=1))
 
     def _seen(self, positions: FloatArray) -> FloatArray:
-        """Return nodes along the axes of the plane and its normal [m], shape (n, 3)."""
+        """Return nodes in the axes of the plane and its normal [m], shape (n, 3)."""
         return np.asarray((positions - self.origin) @ self.basis.T)
 
     def _cells(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray, float, int]:
@@ -89,7 +89,7 @@ def rays_through(points: FloatArray, origin: FloatArray) -> Rays:
 
 @njit(cache=True)
 def _span(low, high, corner, cell, count):  # type: ignore[no-untyped-def]
-    """Return the first and the last cell along an axis that an interval meets; the last is smaller where there is none."""
+    """Return the first and the last cell along an axis that an interval intersects; without one, the last is smaller than the first."""
     first, last = np.floor((low - corner) / cell), np.floor((high - corner) / cell)
     return int(min(max(first, 0.0), count)), int(max(min(last, count - 1.0), -1.0))
 
@@ -169,5 +169,5 @@ def _beside(seen, triangles, uv, order, starts, corner, cell, columns, reach, pa
                     along = min(max((ru * du + rv * dv) / square, 0.0), 1.0) if square > 0.0 else 0.0
                     off = np.sqrt((ru - along * du) ** 2 + (rv - along * dv) ** 2)
                     here = 1.0 / ((1.0 - along) / seen[triangles[t, p], 2] + along / seen[triangles[t, q], 2])
-                    if off < reach and off * here < passes[r]:  # the ray is least far from the surface in space, not in the image
+                    if off < reach and off * here < passes[r]:  # the smallest distance is that in space, not in the image
                         passes[r], depth[r] = off * here, here

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Point clouds, and the files and depth images they come from."""
+"""Point clouds, and their construction from depth images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from femsense.pointcloud.rays import GRAZING
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PointCloud:
-    """Points that a camera saw, with their colours where it has them. Raises InputError."""
+    """Measured points of a camera, with colours if it has them. Raises InputError."""
 
     points: FloatArray
     """Positions [m], shape [n, 3], finite."""
@@ -40,8 +40,8 @@ class PointCloud:
         return len(self.points)
 
     def select(self, mask: npt.ArrayLike) -> PointCloud:
-        """Return the points that a mask (n,) or indices (k,) choose, in that order."""
-        chosen, part = np.asarray(mask), object.__new__(PointCloud)  # without checks: what is right for all is right for some
+        """Return the points selected by a mask (n,) or by indices (k,), in that order."""
+        chosen, part = np.asarray(mask), object.__new__(PointCloud)  # no checks: a subset of valid points is valid
         object.__setattr__(part, "points", freeze(self.points[chosen]))
         object.__setattr__(part, "colors", None if self.colors is None else freeze(self.colors[chosen]))
         return part
@@ -65,7 +65,7 @@ def cloud_from_depth(
         X = ((u − cx)/fx, (v − cy)/fy, 1) · depth · depth_unit_m,   after undoing the lens distortion of (u, v)
 
     Arguments:
-        depth: distances along z in units of depth_unit_m, shape (H, W); 0 where there is none.
+        depth: distances along z in units of depth_unit_m, shape (H, W); 0: no measurement.
         fx, fy, cx, cy: focal lengths and principal point [px]; the centre of the first pixel is (0, 0).
         distortion: OpenCV's k1, k2, p1, p2, k3, shape (5,) or with k4, k5, k6 (8,); of a fisheye k1, k2, k3, k4 and zeros.
         depth_unit_m: metres per unit of depth.
@@ -73,8 +73,8 @@ def cloud_from_depth(
         distortion_model: "brown_conrady" (straight rays to bent ones),
             "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones, as in RealSense's SDK) or
             "kannala_brandt" (OpenCV's fisheye).
-        within: only points in a box, which is faster than to choose them afterwards: the pose of the camera in the frame of the box, shape (4, 4),
-            and two corners of the box, lower first [m], shapes (3,).
+        within: restrict the result to a box, which is faster than a selection afterwards: the pose of the camera in the frame of the box,
+            shape (4, 4), and the lower and upper corner of the box [m], shapes (3,).
     Returns:
         The cloud in row-major order of the pixels, pixels without depth left out.
     Raises:
@@ -95,12 +95,12 @@ def cloud_from_depth(
 
 
 EVERYWHERE = (np.eye(4), np.full(3, -np.inf), np.full(3, np.inf))
-"""A box that holds everything, see `cloud_from_depth`."""
+"""An unbounded box, see `cloud_from_depth`."""
 
 
 @njit(cache=True)
 def _lifted(depth, cx, cy, fx, fy, unit, T, low, high):  # type: ignore[no-untyped-def]
-    """Return the points along straight rays that lie in a box, and their places in the flat image."""
+    """Return the points along straight rays that lie in a box, and their indices in the flat image."""
     height, width = depth.shape
     points, seen, count = np.empty((height * width, 3)), np.empty(height * width, dtype=np.int64), 0
     for v in range(height):
@@ -120,13 +120,13 @@ def _lifted(depth, cx, cy, fx, fy, unit, T, low, high):  # type: ignore[no-untyp
 
 
 def without_mixed_pixels(depth: npt.ArrayLike, fx: float, fy: float) -> FloatArray:
-    """Return a depth image without pixels that saw two surfaces at once: they lie between both, and look like small objects beside an edge.
+    """Remove mixed (flying) pixels from a depth image: their depth lies between two surfaces, and looks like a small object at an edge.
 
-    Such a pixel is farther than its neighbour on one side and nearer than that on the other, along a row or a column, each by more than on a
-    surface that is seen at a cosine of GRAZING. Thin objects are nearer than both neighbours, and stay.
+    A mixed pixel is farther than its neighbour on one side and nearer than that on the other, along a row or a column, each by more than on a
+    surface at a cosine of incidence of GRAZING. Thin objects are nearer than both neighbours and are kept.
 
     Arguments:
-        depth: distances along z, shape (H, W); 0 where there is none.
+        depth: distances along z, shape (H, W); 0: no measurement.
         fx, fy: focal lengths [px].
     """
     image = np.array(depth, dtype=np.float64)
@@ -141,7 +141,7 @@ def without_mixed_pixels(depth: npt.ArrayLike, fx: float, fy: float) -> FloatArr
 
 
 def straight_rays(rays: FloatArray, distortion: FloatArray, model: str) -> FloatArray:
-    """Return straight rays (n, 2) of bent ones (n, 2); distortion and model as of `cloud_from_depth`. Raises InputError."""
+    """Return undistorted rays (n, 2) of distorted ones (n, 2); distortion and model as for `cloud_from_depth`. Raises InputError."""
     if not np.any(distortion != 0.0):
         return rays
     if model == "inverse_brown_conrady":
@@ -171,7 +171,7 @@ def _unfished(rays: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def _bent(rays: FloatArray, distortion: FloatArray) -> FloatArray:
-    """Return OpenCV's forward model of rays (n, 2)."""
+    """Return distorted rays (n, 2) by OpenCV's forward model."""
     import cv2
 
     if len(rays) == 0:
@@ -183,7 +183,7 @@ def _bent(rays: FloatArray, distortion: FloatArray) -> FloatArray:
 
 
 def _undistort(rays: FloatArray, distortion: FloatArray) -> FloatArray:
-    """Return straight rays (n, 2): OpenCV's inverse, then corrected while its forward model says that the error falls."""
+    """Return undistorted rays (n, 2): OpenCV's inverse, then corrected while the error under the forward model decreases."""
     import cv2
 
     if len(rays) == 0:
@@ -200,7 +200,7 @@ def _undistort(rays: FloatArray, distortion: FloatArray) -> FloatArray:
 
 
 def _pixel_colors(color: npt.ArrayLike, shape: tuple[int, ...], seen: IntArray) -> FloatArray:
-    """Return the colours of some pixels by their places in a flat image, 0 … 1, shape (k, 3)."""
+    """Return the colours of pixels by their indices in a flat image, 0 … 1, shape (k, 3)."""
     image = np.asarray(color)
     if image.shape != (*shape, 3):
         raise InputError("the colour image does not fit", where="color", found=image.shape, expected=(*shape, 3))

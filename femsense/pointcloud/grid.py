@@ -31,7 +31,7 @@ class VoxelGrid:
     dims: IntArray
     """Cells along each axis, shape [3]."""
     cell: float
-    """Edge of a cell [m]: the largest radius that can be asked for."""
+    """Edge of a cell [m]: the maximum radius of a query."""
 
 
 def positive(value: float, name: str) -> float:
@@ -79,16 +79,16 @@ def build_grid(points: FloatArray, cell: float) -> VoxelGrid:
 
 
 def count_within(grid: VoxelGrid, queries: FloatArray, radius: float, *, enough: int = 2**62) -> IntArray:
-    """Return how many of the grid's points lie within radius [m] of each query (n, 3); counting may end at `enough`."""
+    """Return the number of points of the grid within radius [m] of each query (n, 3); counting can end at `enough`."""
     if len(grid.keys) == 0 or len(queries) == 0:
         return np.zeros(len(queries), dtype=np.int64)
-    own = np.array(queries)  # one kind of array for the kernels: each kind compiles anew
+    own = np.array(queries)  # one array type for the kernels: each type is compiled separately
     counts: IntArray = _count_within(own, grid.points, grid.keys, grid.origin, grid.dims, grid.cell, radius**2, enough)
     return counts
 
 
 def count_neighbors(grid: VoxelGrid, radius: float, *, enough: int = 2**62) -> IntArray:
-    """Return how many other points of the grid lie within radius [m] of each one, in the original order, shape (n,)."""
+    """Return the number of other points within radius [m] of each point, in the original order, shape (n,)."""
     counts = np.zeros(len(grid.keys), dtype=np.int64)
     if len(counts):
         counts[grid.order] = _count_self(grid.points, grid.keys, grid.dims, radius**2, enough + 1) - 1
@@ -98,7 +98,7 @@ def count_neighbors(grid: VoxelGrid, radius: float, *, enough: int = 2**62) -> I
 def connected_labels(grid: VoxelGrid, radius: float, features: FloatArray, feature_distance: float) -> IntArray:
     """Return the root of each point's component, in the original order, shape (n,).
 
-    Two points are joined where they are within radius [m] and their features (n, k) within feature_distance.
+    Two points are connected if they lie within radius [m] and their features (n, k) within feature_distance.
     """
     labels = np.zeros(len(grid.keys), dtype=np.int64)
     if len(labels):
@@ -145,7 +145,7 @@ def runs_around(keys: IntArray, key: int, stride_x: int, stride_y: int, starts: 
 
 @njit(cache=True)
 def key_of(point: FloatArray, origin: FloatArray, dims: IntArray, cell: float) -> int:
-    """Return the cell key of a point, −1 where no cell of the grid is near."""
+    """Return the cell key of a point, −1 if no cell of the grid is near."""
     key = 0
     for axis in range(3):
         step = np.floor((point[axis] - origin[axis]) / cell)

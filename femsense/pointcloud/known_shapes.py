@@ -1,7 +1,7 @@
-"""Objects whose shape is known, registered to what is seen of them: point to surface, from many turns, by Gauss–Newton.
+"""Registration of objects of known shape to their visible points: point to surface, from many initial rotations, by Gauss–Newton.
 
 The residual of a point is its distance from the surface along the normal there, over its noise along the ray (Chen and
-Medioni 1992). Points are seen from outside, so a pose where the surface looks away from the camera is none.
+Medioni 1992). Points are measured from outside, so poses in which the surface faces away from the camera are excluded.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from femsense.pointcloud.primitives import FITS, MOST_POINTS, ROUGH_STD, Shape, 
 from femsense.pointcloud.rays import Surface
 
 FACETS = 48
-"""Sides of a cylinder: its surface is off by 0.2 % of the radius."""
+"""Number of facets of a cylinder; the error of its surface is 0.2 % of the radius."""
 COARSE = 60
-"""Points that tell which turns are worth a full fit."""
+"""Number of points for the coarse fits that select rotations."""
 COARSE_STEPS, FULL_FITS = 8, 3
-"""Steps of a fit to these, and how many of the best turns are fitted to all."""
+"""Steps of a coarse fit, and number of rotations that are fitted to all points."""
 DEPTH = 0.35
-"""The middle of an object lies so much of its extent along the view behind what is seen of it."""
+"""Initial distance of the centre of an object behind its visible points, relative to its extent along the view."""
 LOST = 5.0
-"""Where poses are compared, a whitened residual counts as this at most."""
+"""Cap of the whitened residuals when poses are compared."""
 SPREAD = 72
-"""Turns that are tried beside those along the main axes of what is seen."""
+"""Number of random rotations in addition to those along the principal axes of the visible points."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KnownShape:
-    """The surface of an object in its own frame, closed and outward."""
+    """The closed surface of an object in its own frame, with outward triangles."""
 
     points: FloatArray
     """[m], shape (n, 3)."""
@@ -40,17 +40,17 @@ class KnownShape:
 
     @property
     def middle(self) -> FloatArray:
-        """Middle of its box [m], shape (3,)."""
+        """Centre of its bounding box [m], shape (3,)."""
         return np.asarray(0.5 * (self.points.min(axis=0) + self.points.max(axis=0)))
 
     @property
     def reach(self) -> float:
-        """Half the diagonal of its box [m]."""
+        """Half the diagonal of its bounding box [m]."""
         return 0.5 * float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
 
 def cylinder_shape(radius_m: float, length_m: float) -> KnownShape:
-    """Return a cylinder about its centre with its axis along z."""
+    """Return a cylinder centred at the origin, with its axis along z."""
     angle = 2.0 * np.pi * np.arange(FACETS) / FACETS
     ring = radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
     ends = [np.column_stack([ring, np.full(FACETS, z)]) for z in (-0.5 * length_m, 0.5 * length_m)]
@@ -63,15 +63,14 @@ def cylinder_shape(radius_m: float, length_m: float) -> KnownShape:
 
 
 def register(known: KnownShape, points: FloatArray, std: FloatArray, origins: FloatArray) -> tuple[float, Shape | None]:
-    """Return the robust mean square of whitened residuals of the best pose (1: noise alone) and the shape there.
-
-    None where none fits.
+    """Return the robust mean square of the whitened residuals of the best pose (1: noise only) and the shape at that pose; None if no pose
+    fits.
 
     Arguments:
         known: the shape.
-        points: what is seen of one object [m], shape (k, 3).
-        std: noise of each along its ray [m], shape (k,).
-        origins: where its ray begins [m], shape (k, 3).
+        points: visible points of one object [m], shape (k, 3).
+        std: noise of each point along its ray [m], shape (k,).
+        origins: centre of the camera of each point [m], shape (k, 3).
     """
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
@@ -91,15 +90,15 @@ Pose = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Fit:
-    pose: Pose  # turn (3, 3) and shift (3,) of the object
-    curve: FloatArray  # of the misfit, over (rotation about the points' middle, shift), (6, 6)
-    residual: FloatArray  # whitened, (k,)
+    pose: Pose  # rotation (3, 3) and translation (3,) of the object
+    curve: FloatArray  # curvature of the misfit by (rotation about the mean of the points, shift), (6, 6)
+    residual: FloatArray  # whitened residuals, (k,)
     misfit: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _View:
-    """What is seen of an object."""
+    """The visible points of an object."""
 
     known: KnownShape
     points: FloatArray
@@ -107,15 +106,15 @@ class _View:
     ray: FloatArray
 
     def start(self, turn: FloatArray) -> Pose:
-        """Return the pose of a turn whose middle lies behind what is seen."""
+        """Return the initial pose of a rotation, with the centre behind the visible points."""
         look = self.ray.mean(axis=0)
         depth = DEPTH * float(np.ptp(self.known.points @ turn.T @ look))
         return turn, self.points.mean(axis=0) + depth * look - turn @ self.known.middle
 
     def fit(self, start: Pose, steps: int | None = None) -> _Fit:
-        """Return the pose near a start that fits best, by the faces that look at the camera there."""
+        """Return the best pose near a start, fitted to the faces that face the camera."""
         middle, seen = self.points.mean(axis=0), self._seen(start[0])
-        scale = np.append(np.full(3, 1.0 / self.known.reach), np.ones(3))  # turns as way at the object's end
+        scale = np.append(np.full(3, 1.0 / self.known.reach), np.ones(3))  # rotations as displacement at the object's end
 
         def pose(x: FloatArray) -> Pose:
             more = Rotation.from_rotvec(scale[:3] * x[:3]).as_matrix()
@@ -129,14 +128,15 @@ class _View:
         return _Fit(pose(x), curve / np.outer(scale, scale), residual, float(np.minimum(np.abs(residual), LOST).sum()))
 
     def _seen(self, turn: FloatArray) -> Surface:
-        """Return the faces of the object that look at the camera."""
+        """Return the faces of the object that face the camera."""
         corners = self.known.points[self.known.triangles]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         looks = normal @ turn.T @ self.ray.mean(axis=0) < 0.0
         return Surface(self.known.points, self.known.triangles[looks])
 
     def _residual(self, seen: Surface, pose: Pose) -> tuple[FloatArray, FloatArray]:
-        """Return whitened residuals at a pose, and their slopes by (rotation about the points' middle, shift), shape (k, 6)."""
+        """Return the whitened residuals at a pose, and their derivatives by (rotation about the mean of the points, shift), shape (k,
+        6)."""
         turn, shift = pose
         local = (self.points - shift) @ turn
         place, _, triangle, _ = seen.closest(local)
@@ -145,7 +145,7 @@ class _View:
         face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-300)
         gap = np.linalg.norm(own, axis=1) * np.where(np.einsum("pc,pc->p", own, face) < 0, -1.0, 1.0)
-        away = np.abs(gap) > 1e-7  # beside an edge the direction to the closest point is the slope
+        away = np.abs(gap) > 1e-7  # next to an edge, the gradient is the direction to the closest point
         normal = np.where(away[:, None], own / np.where(away, gap, 1.0)[:, None], face) @ turn.T
         scale = self.std * np.maximum(np.abs(np.einsum("pc,pc->p", normal, self.ray)), 0.2)
         arm = self.points - self.points.mean(axis=0)
@@ -153,7 +153,7 @@ class _View:
 
 
 def _shape(view: _View, fit: _Fit) -> Shape:
-    """Return the object at its pose; its surface is known as the pose moves it along its normals."""
+    """Return the object at its pose, with the standard deviation of its surface along the normals from that of the pose."""
     turn, shift = fit.pose
     vertices = view.known.points @ turn.T + shift
     corners = vertices[view.known.triangles]
@@ -171,7 +171,7 @@ def _shape(view: _View, fit: _Fit) -> Shape:
 
 
 def _turns(points: FloatArray) -> list[FloatArray]:
-    """Return rotations: the object's axes along the main axes of the points in each of 24 ways, and others spread at random."""
+    """Return initial rotations: the 24 alignments of the axes of the object with the principal axes of the points, and random ones."""
     main = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2].T
     main[:, 2] *= np.sign(np.linalg.det(main))
     along = [main @ turn for turn in Rotation.create_group("O").as_matrix()]

@@ -1,4 +1,4 @@
-"""A scene as the planes that neighbouring points of it lie on."""
+"""A scene as local planes through neighbouring points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from femsense.core.arrays import FloatArray, IntArray, freeze
 
 AROUND = 24
-"""Neighbours that tell the plane on which a point lies."""
+"""Number of neighbours to which the plane of a point is fitted."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -22,12 +22,12 @@ class LocalPlanes:
     normals: FloatArray
     """Unit normals, shape (b, 3)."""
     rough: FloatArray
-    """How far the neighbours lie off the plane, root mean square [m], shape (b,)."""
+    """Root mean square distance of the neighbours from the plane [m], shape (b,)."""
     tree: cKDTree = field(repr=False)
-    """Of the points."""
+    """Search tree of the points."""
 
     def nearest(self, points: FloatArray) -> IntArray:
-        """Return which point is the nearest one of each (k, 3), shape (k,)."""
+        """Return the index of the nearest point of each query (k, 3), shape (k,)."""
         return np.asarray(self.tree.query(points)[1])
 
 

@@ -35,7 +35,7 @@ def find_plane(points: npt.ArrayLike, distance_m: float, *, trials: int = 300, r
         points: [m], shape (n, 3).
         distance_m: half the thickness of the plane [m], about two standard deviations of the depth.
         trials: planes through three random points; 300 miss a plane that holds 30 % of the points with probability 3e-4.
-        rng: source of randomness; a fixed seed where it is not given.
+        rng: source of randomness; a fixed seed by default.
     Raises:
         DataError: fewer than three points, or all of them on a line.
     """
@@ -86,7 +86,7 @@ def remove_plane(
 def euclidean_clusters(points: npt.ArrayLike, distance_m: float, min_size: int = 1) -> IntArray:
     """Return the cluster of each point, shape (n,): 0 is the largest, −1 a cluster below min_size.
 
-    Points closer than distance_m [m] to each other belong together. points [m], shape (n, 3). Raises InputError.
+    Points closer than distance_m [m] to each other belong to the same cluster. points [m], shape (n, 3). Raises InputError.
     """
     positions = as_points(points)
     distance = positive(distance_m, "distance_m")
@@ -104,18 +104,17 @@ def objects_on_plane(
     face_angle_deg: float = 35.0,
     rng: np.random.Generator | None = None,
 ) -> IntArray:
-    """Return the object of each point, shape (n,): 0 is the largest; −1 the plane, what is behind it, and small clusters.
+    """Return the object of each point, shape (n,): 0 is the largest; −1: the plane, points behind it, and small clusters.
 
-    Objects that stand side by side are clusters above the plane. Objects that stand on one another touch; there,
-    the faces parallel to the plane are set aside, the sides cluster alone, and each face goes to the lowest sides that it meets:
-    a lid belongs to what is under it.
+    Objects next to each other are clusters above the plane. Stacked objects touch: their faces parallel to the plane are removed, the sides
+    are clustered, and each face is assigned to the lowest sides that it touches. A lid belongs to the object below it.
 
     Arguments:
-        points: [m], shape (n, 3), camera frame (the plane is seen from the origin).
-        plane_distance_m: points closer to the plane are the plane [m].
-        cluster_distance_m: gap that parts two clusters [m].
+        points: [m], shape (n, 3), camera frame (the camera is at the origin).
+        plane_distance_m: maximum distance of a point of the plane [m].
+        cluster_distance_m: minimum distance between two clusters [m].
         normal_radius_m: neighbourhood of a normal [m]; several times the depth noise.
-        min_size: points of the smallest object.
+        min_size: minimum number of points of an object.
         face_angle_deg: largest angle between the plane and a face parallel to it [deg].
         rng: see `find_plane`.
     Raises:
@@ -147,7 +146,7 @@ def _renamed(labels: IntArray, min_size: int) -> IntArray:
 
 
 def _stacked(points: FloatArray, height: FloatArray, face: BoolArray, distance: float, min_size: int) -> IntArray:
-    """Return a label per point (n,): sides that hang together, then every other patch with the lowest sides that it touches."""
+    """Return a label per point (n,): connected sides, then every other patch with the lowest sides that it touches."""
     labels = np.full(len(points), -1, dtype=np.int64)
     labels[~face] = euclidean_clusters(points[~face], distance, min_size)
     sides = int(labels.max()) + 1

@@ -1,4 +1,4 @@
-"""The pixels from which the points of an unorganised cloud come, where their rays tell them."""
+"""Recovery of the pixel grid of an unorganised cloud from its rays."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.pointcloud.cloud import PointCloud, without_mixed_pixels
 
 FINEST = 1e-4
-"""No pixel is narrower than this [1]; rays that are closer differ by the digits of a file."""
+"""Minimum width of a pixel [1]; smaller differences of rays are rounding errors of a file."""
 REGULAR = 0.1
-"""Rays are those of pixels where they lie so few pixels off their centres, root mean square [1]."""
+"""Maximum root mean square distance of rays from the centres of pixels [px]."""
 WIDEST = 5_000
-"""More pixels than this no camera has along a line."""
+"""Maximum number of pixels along a line."""
 
 
 def without_mixed_points(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without points that saw two surfaces at once (see `without_mixed_pixels`): its points are put back into a depth image.
+    """Remove mixed points from a cloud (see `without_mixed_pixels`), by means of the depth image that it came from.
 
-    A cloud whose rays are not those of pixels stays as it is: one that was thinned to a grid of voxels, merged, or bent straight by a lens.
+    A cloud without a regular pixel grid is returned unchanged: one that was thinned by voxels, merged, or undistorted.
     """
     z = cloud.points[:, 2]
     if len(z) < 2 or z.min() <= 0.0:
@@ -35,7 +35,8 @@ def without_mixed_points(cloud: PointCloud) -> PointCloud:
 
 
 def _pixels(rays: FloatArray) -> tuple[IntArray, float] | None:
-    """Return along one axis the pixel of each ray (n,), counted from the first, and the width of a pixel [1]; None where the rays are not regular."""
+    """Return the pixel index of each ray along one axis (n,), counted from the first, and the width of a pixel [1]; None if the rays are
+    not regular."""
     ordered = np.sort(rays)
     group = np.append(0, np.cumsum(np.diff(ordered) > FINEST))
     count = np.bincount(group)

@@ -1,7 +1,7 @@
-"""Objects that are seen from one side, completed: a sphere, a cylinder or a plate fitted to their points.
+"""Completion of objects that are visible from one side: a sphere, a cylinder or a plate is fitted to their points.
 
-The closest visible points of an object that touches are not where it touches: they lie towards the camera,
-5 to 7 mm off for a ball of 10 mm. Where the completed object comes closest to a surface is.
+The visible point of a touching object that is closest to the body is not the contact point: it lies towards the camera, 5 to 7 mm away for
+a ball of 10 mm. The contact point is where the completed object comes closest to the surface.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.round_fits import BALL, CYLINDER, ROUND_END, SPHERE, fit_plane, fit_round
 
 LONGER = {"cylinder": (True, False, False), "plate": (True, True, False)}
-"""Along which of its axes a shape may go on beyond what was seen of it."""
+"""Axes along which a shape can extend beyond its visible points."""
 OUTLIERS = 0.05
-"""Share of the points of an edge that may lie farther off."""
+"""Maximum share of outliers among the points of an edge."""
 Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
 FITS = 4.0
-"""Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
+"""Maximum median of the squared whitened residuals of an accepted shape, relative to that of noise."""
 SIMPLER = 2.0
-"""A shape with more parameters has to leave less by so many standard deviations of the variance of its points' noise."""
+"""A shape with more parameters must reduce the residual variance by this many standard deviations of that variance."""
 LEAST_SCATTER = 0.1
-"""Variance of the scatter of an object's points about its shape, relative to the noise that is stated, at least."""
+"""Minimum variance of an object's points about its shape, relative to the stated noise."""
 ROUGH_STD = 0.006
-"""How far the closest visible points are off where no shape fits [m] (METHODS section 3)."""
+"""Standard deviation of the surface of an object without a fitting shape [m]."""
 LARGEST = 0.1
-"""A larger radius is a plate [m]."""
+"""Maximum radius of a sphere or cylinder; a larger one is a plate [m]."""
 FIT_STEPS = 25
-"""Steps of a fit at most."""
+"""Maximum number of steps of a fit."""
 NEAREST, END = 0.1, 0.5
-"""A rod meets a body with its end where this share of its points, the nearest, lie within so many radii of that end."""
+"""A rod touches with its end if this share of its points, the ones nearest to the body, lies within so many radii of the end."""
 ROD = 3.0
-"""How much farther than for other shapes the points of a rod count, for the direction of its axis."""
+"""Factor on the extent of the points of a rod relative to other shapes, for the direction of its axis."""
 MOST_POINTS = 400
-"""More points than this are thinned out: the shape of an object is known well enough."""
+"""Maximum number of points of a fit; more are thinned out."""
 FEWEST = 12
-"""Fewer points make no shape."""
+"""Minimum number of points of a shape."""
 FLAT = 0.01
-"""A surface that falls off by less than this share of the way is flat."""
+"""A surface is flat if its depth below the tangent plane is less than this share of the distance."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,30 +54,31 @@ class Shape:
     kind: str
     """"sphere", "cylinder", "plate", "known" or "points"."""
     center: FloatArray
-    """Of the sphere; a point of the axis; middle of the plate or of the box about the known one [m], shape (3,)."""
+    """Centre of the sphere, a point of the axis, or the centre of the plate or of the bounding box of a known shape [m], shape (3,)."""
     axes: FloatArray
     """Rows: axis of the cylinder first; sides of the plate, then its normal, shape (3, 3)."""
     half: FloatArray
     """Half extents along the axes [m], shape (3,)."""
     radius: float
-    """Of curvature at its surface [m]; inf: flat; 0: not known."""
+    """Radius of curvature of its surface [m]; inf: flat; 0: unknown."""
     std_m: float
-    """How well its surface is known [m]."""
+    """Standard deviation of its surface [m]."""
     points: FloatArray
-    """What was seen of it [m], shape (k, 3)."""
+    """Its visible points [m], shape (k, 3)."""
     tree: cKDTree | None = field(default=None, repr=False)
     behind_m: float = 0.0
-    """How far behind what was seen of it its surface may lie: the thickness of a plate whose other side touches [m]."""
+    """Possible distance of its surface behind the visible points: the unknown thickness of a plate that touches with its hidden side
+    [m]."""
     surface: Surface | None = field(default=None, repr=False)
-    """Of a known one, where it stands."""
+    """Surface of a known shape at its pose."""
     covariance: FloatArray | None = field(default=None, repr=False)
-    """Of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
+    """Covariance of (centre, radius) of a sphere or cylinder [m²], shape (4, 4)."""
     seen_by: FloatArray = field(default_factory=lambda: np.ones(1), repr=False)
-    """Share of its points that each camera showed, shape (v,)."""
+    """Share of its points from each camera, shape (v,)."""
 
     @property
     def radius_std(self) -> float:
-        """Standard deviation of a radius that was fitted [m]; inf where none was."""
+        """Standard deviation of the fitted radius [m]; inf without one."""
         return np.inf if self.covariance is None else float(np.sqrt(self.covariance[3, 3]))
 
     def moved(self, T: FloatArray) -> Shape:
@@ -100,10 +101,11 @@ class Shape:
         )
 
     def towards(self, body: FloatArray) -> Shape:
-        """Return the shape with the side that faces a body, and how well that side is known; places of the body's surface [m], shape (k, 3).
+        """Return the shape with the side that faces a body, and the standard deviation of that side; points of the body's surface [m],
+            shape (k, 3).
 
-        A camera sees the back of a plate that is pressed on a body from the camera's side. It is no thicker than it is wide. The hidden side of a ball
-        is known as well as the sum of its centre and its radius, which the points of the side that is seen determine together.
+        If a plate is pressed onto the body from the side of the camera, the camera sees its back; its thickness is at most its width. The standard
+        deviation of the hidden side of a ball is that of the sum of centre and radius, which are correlated.
         """
         if self.covariance is not None:
             away = body[np.argmin(self.distance(body))] - self.center
@@ -119,7 +121,8 @@ class Shape:
         return replace(self, axes=self.axes * np.array([[1.0], [1.0], [-1.0]]), behind_m=2.0 * float(self.half[:2].min()))
 
     def distance(self, places: FloatArray, *, within: float = np.inf) -> FloatArray:
-        """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,); inf may stand for more than `within` [m]."""
+        """Return the signed distance of points (k, 3) from its surface [m], > 0 outside, shape (k,); distances above `within` [m] can be
+        inf."""
         if self.kind == "points":
             assert self.tree is not None
             return np.asarray(self.tree.query(places, distance_upper_bound=within)[0])
@@ -136,10 +139,7 @@ class Shape:
         return np.asarray(np.where(beyond > 0.0, np.hypot(beyond, np.maximum(local[:, 2], 0.0)), local[:, 2]))
 
     def radius_at(self, place: FloatArray, reach: float) -> float:
-        """Return the mean radius of curvature of the surface closest to a place (3,), over so much of it [m].
-
-        inf: flat or not known.
-        """
+        """Return the mean radius of curvature of the surface near a point (3,), over an extent [m]; inf: flat or unknown."""
         if self.surface is None:
             return self.radius if self.radius > 0 else np.inf
         foot, _, triangle, _ = self.surface.closest(place[None])
@@ -151,7 +151,7 @@ class Shape:
         return (reach**2 - drop**2) / (2.0 * drop) if drop > FLAT * reach else np.inf
 
     def holds(self, points: FloatArray, std: FloatArray) -> bool:
-        """Return whether points (k, 3) lie on its surface, or on that of a rod or plate that goes on beyond what was seen of it."""
+        """Return whether points (k, 3) lie on its surface, or on the extension of a rod or plate beyond its visible points."""
         if self.kind not in ("cylinder", "plate"):
             return self.kind in ("sphere", "known") and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
         longer = replace(self, half=np.where(LONGER[self.kind], np.inf, self.half))
@@ -171,19 +171,19 @@ def find_shapes(
     view: IntArray | None = None,
     ends: bool = True,
 ) -> list[Shape]:
-    """Return the objects among points as shapes, each fitted to what lies near a surface.
+    """Return the objects among points as shapes, each fitted to its part near a surface.
 
     Arguments:
-        points: of the surroundings [m], shape (o, 3).
-        std: noise of each along its ray [m], shape (o,).
-        origins: where its ray begins [m], shape (o, 3).
-        near: distance of each from the surface that may be touched [m], shape (o,).
-        local_m: how much of an object counts: points up to so far beyond its nearest one [m].
-        fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
-        is_edge: whether points, by their indices, are what a camera shows of the edge of that surface: they are no object.
-        halo: which points stereo matching may have added around the silhouette of the body, shape (o,): no shape is fitted to them.
-        view: camera of each point, shape (o,); one camera if not given.
-        ends: whether rods may end in a half ball that is not among the known objects of `fit`.
+        points: points of the surroundings [m], shape (o, 3).
+        std: noise of each point along its ray [m], shape (o,).
+        origins: centre of the camera of each point [m], shape (o, 3).
+        near: distance of each point from the surface of the body [m], shape (o,).
+        local_m: extent of the part of an object that is fitted, beyond its nearest point [m].
+        fit: function that fits a shape to points, noise and origins; `fit_shape` by default.
+        is_edge: function that returns whether points, given by indices, belong to the edge of that surface: these are not an object.
+        halo: possible depth bleeding around the silhouette of the body, shape (o,): no shape is fitted to these points.
+        view: camera of each point, shape (o,); by default the same for all.
+        ends: whether rods can end in a hemisphere that is not among the known objects of `fit`.
     """
     fit = fit or fit_shape
     view = np.zeros(len(points), dtype=np.int64) if view is None else view
@@ -202,7 +202,7 @@ def find_shapes(
             continue
         own = np.ones(len(close), dtype=np.bool_) if halo is None else ~halo[close]
         shape = _completed(fit, points[close], std[close], origins[close], own)
-        # the other end of a rod that passes behind, the table in pieces
+        # the other end of a rod that passes behind the body, or pieces of the table
         more = [g for g in left if shape.holds(points[g], std[g])]
         if more:
             left = [g for g in left if not any(g is m for m in more)]
@@ -228,10 +228,10 @@ def find_shapes(
 
 
 def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArray, own: BoolArray) -> Shape:
-    """Return the shape of an object from its own points, not from what a camera adds around the silhouette of a body.
+    """Return the shape of an object, fitted without the depth bleeding around the silhouette of a body.
 
-    Stereo matching widens a silhouette by one to three pixels, with the colour of what is behind it and a depth in between: next to a finger that
-    touches, these points hang together with its own.
+    Stereo matching widens a silhouette by one to three pixels with the colour of the background and an intermediate depth. Next to a touching
+    finger, these points are connected with the finger's own.
     """
     if own.sum() < FEWEST:
         return _raw(points, std)
@@ -240,8 +240,8 @@ def _completed(fit: Fit, points: FloatArray, std: FloatArray, origins: FloatArra
 
 
 def _ends(shape: Shape, points: FloatArray, near: FloatArray) -> bool:
-    """Return whether the part of an object that is nearest to a body is its end, of another form than the rest: the tip of a finger or of a rod, the
-    ball on a stick. points, near: as for `find_shapes`."""
+    """Return whether the part of an object nearest to a body is an end of another form than the rest: a fingertip, the end of a rod, a ball
+    on a stick. points, near: as for `find_shapes`."""
     if shape.kind == "points":
         return len(points) >= FEWEST
     if shape.kind != "cylinder":
@@ -251,7 +251,7 @@ def _ends(shape: Shape, points: FloatArray, near: FloatArray) -> bool:
 
 
 def same_object(first: Shape, second: Shape) -> bool:
-    """Return whether two shapes are of one object: their points lie in the same place."""
+    """Return whether two shapes belong to the same object: their points coincide."""
     if first.points is second.points:
         return True
     apart = float(np.linalg.norm(first.points.mean(axis=0) - second.points.mean(axis=0)))
@@ -260,7 +260,7 @@ def same_object(first: Shape, second: Shape) -> bool:
 
 
 def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
-    """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
+    """Return the simplest shape that fits points within their noise; "points" if none does. Arguments as for `find_shapes`."""
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if len(points) < FEWEST:
@@ -280,9 +280,8 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape
 
 
 def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m: float) -> tuple[float, Shape | None]:
-    """Return the robust mean square of whitened residuals of a ball of known radius (1: noise alone), and the ball.
-
-    None where it does not fit.
+    """Return the robust mean square of the whitened residuals of a ball of known radius (1: noise only), and the ball; None if it does not
+    fit.
     """
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
@@ -292,9 +291,9 @@ def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m:
 
 
 def _as_well_as_it_fits(cost: float, shape: Shape, share: float) -> Shape:
-    """Return a shape whose surface is known as well as its own points scatter, `cost` times the variance of the noise that is stated.
+    """Return a shape with the standard deviation of its surface from the scatter of its points, `cost` times the stated variance.
 
-    share: of its points that were fitted.
+    share: share of its points that were fitted.
     """
     scatter = max(cost, LEAST_SCATTER)
     covariance = None if shape.covariance is None else share * scatter * shape.covariance
@@ -305,7 +304,7 @@ def _as_well_as_it_fits(cost: float, shape: Shape, share: float) -> Shape:
 
 
 def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
-    """Return points that hang together, the largest group first."""
+    """Return connected points, the largest group first."""
     if len(points) < 3:
         return []
     some = points[:: max(1, len(points) // MOST_POINTS)]
@@ -316,7 +315,7 @@ def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
 
 
 def typical_square(residual: FloatArray) -> float:
-    """Return the robust mean square of whitened residuals: 1 for noise alone."""
+    """Return the robust mean square of whitened residuals: 1 for noise only."""
     return float((1.483 * np.median(np.abs(residual))) ** 2)
 
 
@@ -367,14 +366,14 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
 
 
 def _round_end(points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, reach_m: float) -> Shape | None:
-    """Return the half ball at the end of a rod that meets a body with it, as a sphere: a fingertip, a rounded stick. None where the points are of no such
-    rod, or do not tell where it ends.
+    """Return the hemisphere at the touching end of a rod as a sphere: a fingertip, a rounded stick. None if the points do not belong to
+    such a rod, or do not show its end.
 
-    The half ball alone is seen in part, next to a body and its silhouette; the side of the rod gives its radius and its axis.
+    Of the hemisphere itself only a part is visible, next to the silhouette of the body; the side of the rod determines radius and axis.
 
     Arguments:
         points, std, origins, near: as for `find_shapes`, of one object.
-        reach_m: how much of it counts: points up to so far beyond its nearest one [m].
+        reach_m: extent of the fitted part beyond its nearest point [m].
     """
     if len(points) < 2 * FEWEST or not np.isfinite(reach_m):
         return None
@@ -458,8 +457,7 @@ def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float,
 
 
 def _spread(curve: FloatArray, count: int) -> float:
-    """Return the standard deviation of the first parameters from the curvature of the misfit [m];
-    ROUGH_STD where they are not determined."""
+    """Return the standard deviation of the first parameters from the curvature of the misfit [m]; ROUGH_STD if they are not determined."""
     variance = float(np.trace(np.linalg.pinv(curve)[:count, :count])) / count
     return min(float(np.sqrt(variance)), ROUGH_STD) if variance > 0 else ROUGH_STD
 

@@ -1,4 +1,4 @@
-"""Rays of a camera cast onto a surface: how far a measured point lies from the surface that its own ray meets."""
+"""Ray casting: the distance of a measured point from the face that its own ray hits."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.pointcloud.casting import rays_through
 
 GRAZING = 0.25
-"""Rays that meet the surface at a smaller |cos| say little and err at silhouettes:
-one pixel beside it they miss (METHODS section 3)."""
+"""Minimum |cos| of incidence. Grazing rays carry little information and are wrong at silhouettes, where the next pixel misses the
+surface."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SurfaceHits:
-    """Where rays meet a surface, and how far the measured points lie from it."""
+    """Hits of rays on a surface, and the distances of the measured points."""
 
     index: IntArray
-    """Which of the measured points, ascending, shape (r,)."""
+    """Indices of the measured points, ascending, shape (r,)."""
     nodes: IntArray
-    """Nodes of the triangle that is met, shape (r, 3)."""
+    """Nodes of the triangle that is hit, shape (r, 3)."""
     weights: FloatArray
     """Barycentric coordinates there, shape (r, 3)."""
     normal: FloatArray
     """Outward unit normal of the triangle, shape (r, 3)."""
     distance: FloatArray
-    """Of the measured point from the triangle's plane, > 0 outside [m], shape (r,)."""
+    """Distance of the measured point from the plane of the triangle, > 0 outside [m], shape (r,)."""
     cosine: FloatArray
     """|cos| between ray and normal, shape (r,)."""
 
     def place(self, positions: FloatArray) -> FloatArray:
-        """Return where the rays meet the surface when its nodes are at `positions` (n, 3) [m], shape (r, 3)."""
+        """Return the hit points for node positions (n, 3) [m], shape (r, 3)."""
         return np.asarray(np.einsum("ri,ric->rc", self.weights, positions[self.nodes]))
 
     def pick(self, which: BoolArray) -> SurfaceHits:
-        """Return some of the hits, which (r,)."""
+        """Return the hits selected by a mask (r,)."""
         return SurfaceHits(
             self.index[which],
             self.nodes[which],
@@ -49,7 +49,7 @@ class SurfaceHits:
 
 
 class Surface:
-    """A triangulated surface that rays can be cast on and closest points be found of."""
+    """A triangulated surface, for ray casting and closest points."""
 
     def __init__(self, positions: FloatArray, triangles: IntArray) -> None:
         """positions: nodes [m], shape (n, 3); triangles: outward, shape (t, 3)."""
@@ -57,7 +57,7 @@ class Surface:
 
     @cached_property
     def _scene(self):  # type: ignore[no-untyped-def]
-        """Open3D's scene of it, with boxes about its triangles that take a millisecond to build."""
+        """Open3D's scene, whose bounding volumes take a millisecond to build."""
         import open3d as o3d
 
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -65,12 +65,12 @@ class Surface:
         return scene
 
     def cast(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
-        """Return how measured points lie to what their rays meet.
+        """Return the hits of the rays through measured points.
 
         Arguments:
             points: measured [m], shape (k, 3).
-            origins: where the ray of each begins (its camera) [m], shape (k, 3).
-            reach: points farther from the surface than this along its normal belong to something else [m]; so do grazing rays.
+            origins: centre of the camera of each point [m], shape (k, 3).
+            reach: maximum distance of a point from the hit face along its normal [m]. Points farther away, and grazing rays, are not hits.
         """
         rays = points - origins
         ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
@@ -81,7 +81,7 @@ class Surface:
         return hits.pick((np.abs(hits.distance) <= reach) & (hits.cosine >= GRAZING))
 
     def near(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
-        """Return how measured points lie to the closest faces that look at their camera; arguments as for `cast`."""
+        """Return the closest faces of measured points that face their camera; arguments as for `cast`."""
         rays = points - origins
         ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         _, gap, triangle, weights = self.closest_points(points)
@@ -90,8 +90,8 @@ class Surface:
         return hits.pick((gap <= reach) & looking)
 
     def beside_rays(self, points: FloatArray, origin: FloatArray, *, within: float) -> tuple[FloatArray, FloatArray]:
-        """Return how far the rays of a camera through points (k, 3) pass the surface near them [m], 0 where they meet it, and how far behind each point they
-        do so [m]; both of shape (k,), inf where a ray passes beyond an angle `within` [rad].
+        """Return the distance at which the rays of a camera through points (k, 3) pass the surface [m], 0 for a hit, and the distance of
+        that passage behind each point [m]; both of shape (k,), inf beyond an angle `within` [rad].
 
         Arguments:
             origin: centre of the camera [m], shape (3,).
@@ -106,11 +106,11 @@ class Surface:
         return passes, along - np.linalg.norm(points - origin, axis=1)
 
     def gap(self, points: FloatArray) -> FloatArray:
-        """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
+        """Return the unsigned distance of points (k, 3) from the surface [m], shape (k,)."""
         return np.asarray(self._scene.compute_distance(_tensor(points)).numpy(), dtype=np.float64)
 
     def signed_gap(self, points: FloatArray, *, within: float) -> FloatArray:
-        """Return how far points (k, 3) lie outside the surface [m], shape (k,): < 0 inside; beyond `within` both count as outside."""
+        """Return the signed distance of points (k, 3) from the surface [m], shape (k,): < 0 inside; beyond `within` always > 0."""
         gap = self.gap(points)
         near = np.flatnonzero(gap < within)
         inside = near[self._scene.compute_occupancy(_tensor(points[near])).numpy() > 0.5]

@@ -1,8 +1,8 @@
 # mypy: allow-untyped-decorators
 """Spheres, cylinders, round ends of rods and planes fitted to noisy points: compiled.
 
-A robust fit (Huber's function, Levenberg's damping) of the distances of points from the surface, over their noise along the ray; for planes least squares
-without what is left out.
+A robust fit (Huber's function, Levenberg's damping) of the distances of points from the surface, over their noise along the ray; for planes
+trimmed least squares.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ from femsense.core.arrays import BoolArray, FloatArray, read_only
 from femsense.core.kernels import njit
 
 SPHERE, BALL, CYLINDER, ROUND_END = 0, 1, 2, 3
-"""A sphere: centre, log radius. A ball of known radius: centre. A cylinder: two shifts across the first axis of its frame, log radius, two tilts. A rod
-with a round end: those of a cylinder, and where along the first axis the centre of the half ball at its end is."""
+"""A sphere: centre, log radius. A ball of known radius: centre. A cylinder: two shifts across the first axis of its frame, log radius, two
+tilts. A rod with a round end: those of a cylinder, and the position of the centre of the hemisphere along the first axis."""
 CUT = 2.0
 """Whitened residuals beyond this count linearly."""
 TRIMMED, FARTHER = 4, 3.0
-"""Rounds of a fit of a plane, and whitened residuals, over their typical size or 1, beyond which a point is left out of the next."""
+"""Rounds of a fit of a plane, and the whitened residual, relative to their typical size or 1, beyond which a point is excluded from the
+next round."""
 GRAZING = 0.2
-"""The noise of a point across the surface is that along its ray times the cosine, which counts as this at least."""
+"""Minimum cosine of incidence: the noise of a point normal to the surface is that along its ray times this cosine."""
 
 
 def fit_round(
@@ -42,9 +43,9 @@ def fit_round(
         points: measured [m], shape (k, 3).
         std: noise of each along its ray [m], shape (k,).
         ray: unit directions of the rays, shape (k, 3).
-        start: parameters to begin with.
-        steps: at most.
-        radius: of a BALL [m].
+        start: initial parameters.
+        steps: maximum number of steps.
+        radius: radius of a BALL [m].
         frame, middle: axes and a point near the axis of a CYLINDER or ROUND_END, shapes (3, 3) and (3,) [m].
     """
     x, n, k = np.array(start, dtype=np.float64), len(points), len(start)
@@ -56,8 +57,8 @@ def fit_round(
 
 
 def fit_plane(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return a point of the plane [m], rows of two directions in it and the normal that looks at the camera, (3, 3), whitened residuals (k,), and which points
-    were used last, (k,). Arguments as for `fit_round`."""
+    """Return a point of the plane [m]; two directions in it and the normal towards the camera as rows, (3, 3); the whitened residuals (k,);
+    and the points used in the last round, (k,). Arguments as for `fit_round`."""
     residual, keep = np.empty(len(points)), np.ones(len(points), dtype=np.bool_)
     middle, axes = np.empty(3), np.empty((3, 3))
     _fit_plane(read_only(points), read_only(std), read_only(ray), middle, axes, residual, keep)
@@ -218,7 +219,7 @@ def _evaluate(
 
 @njit(cache=True, nogil=True)
 def _normal(residual: FloatArray, slopes: FloatArray, robust: bool, curve: FloatArray, right: FloatArray) -> None:
-    """Write the curvature (k, k) and the gradient (k,), rows that stand out with less weight where that is asked."""
+    """Write the curvature (k, k) and the gradient (k,), with less weight of outliers if requested."""
     n, k = slopes.shape
     curve[:], right[:] = 0.0, 0.0
     for i in range(n):
@@ -235,7 +236,7 @@ def _normal(residual: FloatArray, slopes: FloatArray, robust: bool, curve: Float
 
 @njit(cache=True, nogil=True)
 def _solve(matrix: FloatArray, right: FloatArray) -> None:
-    """Write the solution of a small positive definite system in place of its right-hand side (k,); zeros where it is singular."""
+    """Write the solution of a small positive definite system in place of its right-hand side (k,); zeros if it is singular."""
     k = len(right)
     for j in range(k):
         if not matrix[j, j] > 0.0:

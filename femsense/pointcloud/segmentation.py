@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Which points are robot and which are something else: by colour, or by the model.
+"""Segmentation of a cloud into robot and surroundings, by colour or by the model.
 
 Source: "Calibration and force sensing with an RGB-D camera", section V.A.2. The idea of growing regions by colour and then
 merging them is that of the Point Cloud Library (Zhan, Liang and Xiao 2009); here it is a union of neighbours in a grid.
@@ -25,10 +25,10 @@ from femsense.pointcloud.grid import (
     positive,
 )
 
-_DARK = 0.08  # brightness below which a colour says nothing: a few steps of 8-bit noise turn its hue
-_FEW, _FLAT = 100, 0.3  # points beyond the robot, and the share of them in one plane, that make a floor or wall
-_DRAWS = 1000  # planes that are tried: with 0.3 of the points in it one is missed once in 10¹²
-_LEFT = 0.1  # share of the near points that have to be left beside a plane
+_DARK = 0.08  # minimum brightness of a colour: below it, a few steps of 8-bit noise change the hue
+_FEW, _FLAT = 100, 0.3  # minimum number of points away from the robot, and minimum share of them in one plane, of a floor or wall
+_DRAWS = 1000  # number of trial planes: one with 30 % of the points is missed with probability 10⁻¹²
+_LEFT = 0.1  # minimum share of the near points outside of the plane
 
 
 # --- colour -----------------------------------------------------------------------------------------------------------
@@ -63,15 +63,15 @@ def region_growing(
 ) -> IntArray:
     """Return the region of each point, shape (n,): 0 is the largest, −1 a small region that touches no other.
 
-    1. Neighbours within radius_m whose colours differ by at most color_threshold belong together.
-    2. Regions that touch are merged while their mean colours differ by at most merge_threshold, the most alike first.
+    1. Neighbours within radius_m whose colours differ by at most color_threshold belong to the same region.
+    2. Regions that touch are merged while their mean colours differ by at most merge_threshold, the most similar first.
     3. A region below min_size joins the neighbour whose mean colour is closest.
 
     Arguments:
         cloud: with colours.
         radius_m: neighbourhood [m], about three times the spacing of the points.
         color_threshold, merge_threshold: distances of `shading_features`, no unit.
-        min_size: points of the smallest region that stands alone.
+        min_size: minimum number of points of a separate region.
         brightness_weight: see `shading_features`.
     Raises:
         InputError: a cloud without colours, a radius that is not positive.
@@ -95,13 +95,13 @@ def color_mask(
     tolerance_deg: float = 10.0,
     shade: tuple[float, float] = (0.15, 2.0),
 ) -> BoolArray:
-    """Return which colours are color_rgb in some light, shape (n,).
+    """Return which colours match color_rgb under some illumination, shape (n,).
 
     The angle between two colours as vectors (r, g, b) does not change when light or shadow scales one of them.
 
     Arguments:
         colors: red, green, blue in [0, 1], shape (n, 3).
-        color_rgb: the colour looked for, shape (3,).
+        color_rgb: the colour to match, shape (3,).
         tolerance_deg: largest angle [deg]; 10 separates saturated colours, a grey robot needs less.
         shade: smallest and largest brightness as a multiple of that of color_rgb.
     Raises:
@@ -124,7 +124,7 @@ def color_mask(
 
 @njit(cache=True)
 def _in_colour(rgb, wanted, dark, bright, cosine, mask):  # type: ignore[no-untyped-def]
-    """Write which colours are within an angle of a unit vector, and neither too dark nor too bright."""
+    """Write a mask of the colours within an angle of a unit vector that are neither too dark nor too bright."""
     for i in range(len(rgb)):
         length = np.sqrt(rgb[i, 0] ** 2 + rgb[i, 1] ** 2 + rgb[i, 2] ** 2)
         along = rgb[i, 0] * wanted[0] + rgb[i, 1] * wanted[1] + rgb[i, 2] * wanted[2]
@@ -145,8 +145,8 @@ def segment_robot(
         cloud: with colours.
         color_rgb: the robot's colour in [0, 1], shape (3,).
         tolerance_deg, shade: see `color_mask`.
-        vote_radius_m: where given, each point takes the side of the majority within this radius [m], itself included;
-            that removes speckle, dark points and glints. Keep it below the size of the smallest object that may touch the robot.
+        vote_radius_m: if given, each point takes the label of the majority within this radius [m], itself included, which removes speckle,
+            dark points and glints. Keep it below the size of the smallest touching object.
     Raises:
         InputError: a cloud without colours, or a colour that cannot be used.
     """
@@ -172,12 +172,11 @@ def segment_by_model(
 ) -> tuple[PointCloud, PointCloud]:
     """Return (robot, surroundings) by the predicted surface: points near it are robot.
 
-    The distance is taken to the tangent plane of the nearest surface point; sideways the spacing of the surface points counts
-    as well, so that a coarse surface has no holes. Colour helps where there is some: near points whose colour is not
-    color_rgb, or, without it, is more like the far points than like the near ones, are surroundings. Without colours,
-    objects closer than distance_m count as robot: search contacts with a radius above distance_m.
-    Of a floor or wall that goes on beyond that, plane_m says how far its points scatter:
-    then those near the robot are surroundings as well.
+    The distance is that to the tangent plane of the nearest surface point; the tangential distance may exceed it by the spacing of the
+    surface points, so that a coarse surface has no holes. Near points with a colour other than color_rgb belong to the surroundings;
+    without color_rgb, near points whose colour is more similar to the far points than to the near ones. Without colours, objects closer
+    than distance_m count as robot: search contacts with a radius above distance_m. With plane_m, near points in the plane of a floor or
+    wall belong to the surroundings too.
 
     Arguments:
         surface_points: predicted surface [m], shape (s, 3).
@@ -185,8 +184,7 @@ def segment_by_model(
         distance_m: largest distance from the surface [m]; above the expected error of the prediction.
         color_rgb, tolerance_deg: see `color_mask`; optional.
         learn_colors: without color_rgb, learn both sides' colours from this cloud.
-        plane_m: without colours, points so near to the plane that holds most of the far points are surroundings [m]; None:
-            they are not.
+        plane_m: without colours, maximum distance of surroundings from the plane that contains most of the far points [m]; None: no plane.
     Raises:
         InputError: wrong shapes, no surface, a distance that is not positive.
     """
@@ -215,7 +213,7 @@ def segment_by_model(
 def surface_pair(
     points: npt.ArrayLike, normals: npt.ArrayLike, points_name: str, normals_name: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Return points (n, 3) and unit normals (n, 3) after checking that they belong together. Raises InputError."""
+    """Return points (n, 3) and unit normals (n, 3) after a check of their shapes. Raises InputError."""
     positions, directions = as_points(points, points_name), as_points(normals, normals_name)
     if len(positions) != len(directions):
         raise InputError(
@@ -258,8 +256,7 @@ def _spacing(tree: object) -> float:
 
 
 def _off_the_plane(points: FloatArray, near: BoolArray, width: float) -> BoolArray:
-    """Return the near points that do not lie in the plane of the far ones (RANSAC, as Open3D has it),
-    if a good part of these lie in one."""
+    """Return the near points outside of the plane of the far ones (Open3D's RANSAC), if enough of the far ones lie in one."""
     import open3d as o3d
 
     far = points[~near]
@@ -271,13 +268,13 @@ def _off_the_plane(points: FloatArray, near: BoolArray, width: float) -> BoolArr
         return near
     away = np.abs(points @ plane[:3] + plane[3]) / np.linalg.norm(plane[:3])
     left = near & (away > width)
-    return left if left.sum() > _LEFT * near.sum() else near  # a robot that lies flush in a plane is not told from it so
+    return left if left.sum() > _LEFT * near.sum() else near  # a robot that lies flush in a plane cannot be separated in this way
 
 
 def _like_the_near(features: FloatArray, near: BoolArray, sure: BoolArray) -> BoolArray:
-    """Return the near points whose colour is more likely that of the surely near points than that of the far ones.
+    """Return the near points whose colour is more likely under the distribution of the nearest points than under that of the far ones.
 
-    Both are normal distributions; where they overlap too much (or one has under 30 points) colour decides nothing.
+    Both are normal distributions. If they overlap too much, or one has fewer than 30 points, colour is not used.
     """
     inner, outer = features[near & sure], features[~near]
     if min(len(inner), len(outer)) < 30:

@@ -1,19 +1,19 @@
 # mypy: allow-untyped-decorators
-"""Measured surfaces as smooth functions: how far any point near by lies outside of one.
+"""Measured surfaces as smooth functions: the signed distance of any nearby point.
 
 A surface is covered with quadratic height fields. In the frame (t₁, t₂, n) at a centre o, n the normal of the points around it,
 
     h(u, v) = c₀ + c₁ u + c₂ v + c₃ u² + c₄ u v + c₅ v²
 
-is fitted to these points with weights (1 − (u² + v²) / r²)², which fall to nothing at the radius r. A point z = (u, v, w) lies
+is fitted to these points with weights (1 − (u² + v²) / r²)², which vanish at the radius r. A point z = (u, v, w) lies
 
     dᵢ(z) = (w − h(u, v)) / √(1 + |∇h(u, v)|²)
 
-outside of field i, which goes on as a plane beyond its radius, and d = Σ wᵢ dᵢ / Σ wᵢ outside of the surface,
-with wᵢ falling off with the distance of z from the field's centre. Nothing in d depends on a model, and it is smooth: whoever
-moves z has derivatives, and two models are compared on the same function, wherever they have the surface.
+outside of field i, which is continued as a plane beyond its radius, and d = Σ wᵢ dᵢ / Σ wᵢ outside of the surface, with wᵢ decreasing with
+the distance of z from the centre of the field. d is smooth and independent of the model, so that it can be differentiated by z and two
+models are compared on the same function.
 
-Source: height fields that are blended like this are those of Ohtake et al., "Multi-level partition of unity implicits" (2003).
+Source: blended height fields of Ohtake et al., "Multi-level partition of unity implicits" (2003).
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from femsense.pointcloud.grid import build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 
 FEWEST = 8
-"""Points that a height field needs."""
+"""Minimum number of points of a height field."""
 ACROSS = 0.5
 """Standard deviation of the weights that fields are blended with, in radii."""
 ALONG = 0.5
-"""What a distance along the normal counts beside one across it there."""
+"""Weight of a distance along the normal relative to a tangential one."""
 SAME_SIDE = 0.3
-"""Cosine between a field's normal and that of the side in question below which the field is of another side of the body."""
+"""Minimum cosine between the normal of a field and that of the side in question; below it the field belongs to another side of the body."""
 FARTHEST = 9.0
-"""Exponent of the nearest field's weight beside that of the farthest that counts; weights are less by that of the farthest, so
-that they begin at nothing."""
+"""Maximum difference between the exponent of a field's weight and that of the nearest field. The weight at that difference is subtracted from
+all, so that weights are continuous."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sheets:
-    """Measured surfaces, all in one kind of frame, one after the other."""
+    """Measured surfaces, concatenated."""
 
     centres: FloatArray
-    """Of the height fields [m], shape (f, 3)."""
+    """Centres of the height fields [m], shape (f, 3)."""
     axes: FloatArray
-    """Rows t₁, t₂, n, shape (f, 3, 3)."""
+    """Axes t₁, t₂, n as rows, shape (f, 3, 3)."""
     heights: FloatArray
     """c₀ [m], c₁, c₂ [1], c₃, c₄, c₅ [1/m], shape (f, 6)."""
     weights: FloatArray
@@ -57,7 +57,7 @@ class Sheets:
     starts: IntArray
     """First field of each surface, and the number of fields, shape (s + 1,)."""
     radius: float
-    """Of a height field [m]."""
+    """Radius of a height field [m]."""
 
     def fields_of(self, sheet: int) -> tuple[FloatArray, FloatArray]:
         """Return centres [m] and normals of the height fields of one surface, shape (c, 3) each."""
@@ -65,15 +65,15 @@ class Sheets:
         return self.centres[own], self.axes[own, 2]
 
     def distance(self, points: FloatArray, sheet: IntArray, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far points lie outside of surfaces, and the normals of these there.
+        """Return the signed distances of points from surfaces, and the surface normals there.
 
         Arguments:
             points: [m], shape (k, 3).
             sheet: the surface of each, shape (k,).
-            sides: unit normals of the side of the body that each one belongs to, shape (k, 3).
+            sides: unit normals of the side of the body that each point belongs to, shape (k, 3).
 
         Returns:
-            distances [m], shape (k,), NaN where the surface has nothing of that side; outward unit normals, shape (k, 3).
+            distances [m], shape (k,), NaN if the surface has no field on that side; outward unit normals, shape (k, 3).
         """
         distances, normals = np.full(len(points), np.nan), np.zeros((len(points), 3))
         _blend(
@@ -93,13 +93,13 @@ class Sheets:
 
 
 def fit_sheet(points: npt.ArrayLike, centres: npt.ArrayLike, normals: npt.ArrayLike, radius: float) -> Sheets:
-    """Return one measured surface: height fields at some centres; where too few points are around, there is none.
+    """Return one measured surface: height fields at some centres, except those with too few points around.
 
     Arguments:
         points: of the surface [m], shape (n, 3).
         centres: [m], shape (c, 3).
         normals: of the surface there, about, outward, shape (c, 3).
-        radius: of the points that count [m].
+        radius: radius of the height fields [m].
 
     Raises:
         InputError: wrong shapes, a radius that is not positive.
@@ -123,7 +123,7 @@ def joined(sheets: Sequence[Sheets]) -> Sheets:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Crossings:
-    """Where normals of a model cross measured surfaces, one a row."""
+    """Intersections of model normals with measured surfaces, one per row."""
 
     sheets: Sheets
     sheet: IntArray
@@ -131,9 +131,9 @@ class Crossings:
     sides: FloatArray
     """Normals of the model there, shape (k, 3)."""
     rounded: FloatArray
-    """Distance that the model itself has there, from its own surface as it would be measured [m], shape (k,)."""
+    """Distance of the model from its own surface as it would be measured: the error of the height fields [m], shape (k,)."""
     feet: FloatArray
-    """Where the measured surfaces cross the normals [m], shape (k, 3)."""
+    """Intersection points [m], shape (k, 3)."""
     normals: FloatArray
     """Outward unit normals of the measured surfaces there, shape (k, 3)."""
 
@@ -141,11 +141,11 @@ class Crossings:
         return len(self.sheet)
 
     def pick(self, rows: npt.NDArray[np.bool_] | IntArray) -> Crossings:
-        """Return some of the rows."""
+        """Return a selection of the rows."""
         return Crossings(self.sheets, *(getattr(self, f.name)[rows] for f in fields(self)[1:]))
 
     def distance(self, points: FloatArray) -> FloatArray:
-        """Return how far points (k, 3) [m], one a row, lie outside of the measured surface [m], shape (k,)."""
+        """Return the signed distances of points (k, 3) [m], one per row, from the measured surface [m], shape (k,)."""
         return self.sheets.distance(points, self.sheet, self.sides)[0] - self.rounded
 
 
@@ -207,7 +207,7 @@ def _alike(a: FloatArray, b: FloatArray) -> float:
 
 @njit(cache=True)
 def _outside(local: FloatArray, c: FloatArray, radius: float) -> tuple[float, float, float]:
-    """Return how far a point (u, v, w) lies outside of a height field, and the slopes of the field there."""
+    """Return the signed distance of a point (u, v, w) from a height field, and the slopes of the field there."""
     across = np.sqrt(local[0] ** 2 + local[1] ** 2)
     share = min(1.0, radius / across) if across > 0.0 else 1.0
     a, b = share * local[0], share * local[1]
@@ -228,7 +228,7 @@ def _fit_all(
     directions: FloatArray,
     radius: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return per centre: six coefficients and the sum of weights, 0 where there is no field; and its axes."""
+    """Return for each centre six coefficients, the sum of weights (0: no field), and the axes."""
     numbers, axes = np.zeros((len(places), 7)), np.zeros((len(places), 3, 3))
     starts, ends = np.zeros(9, dtype=np.int64), np.zeros(9, dtype=np.int64)
     for e in range(len(places)):
@@ -264,7 +264,7 @@ def _axes(normal: FloatArray, out: FloatArray) -> None:
 
 @njit(cache=True)
 def _height_field(local: FloatArray, radius: float, out: FloatArray) -> None:
-    """Write coefficients and sum of weights of a quadratic height field; a second fit counts points off the first one less."""
+    """Write coefficients and sum of weights of a quadratic height field; a second fit downweights points far from the first one."""
     u, v, w = local[:, 0] / radius, local[:, 1] / radius, local[:, 2].copy()
     rows = np.ones((len(local), 6))
     rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 4], rows[:, 5] = u, v, u * u, u * v, v * v

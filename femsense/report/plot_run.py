@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 
 def plot_run(run: Run) -> Any:
-    """Return a matplotlib figure: the size of each force over time with bands of one and two standard deviations, hollow
-    where the frame is not ok, or the residual of a run without contacts."""
+    """Plot the contact forces of a run over time, and return the matplotlib figure.
+
+    Bands show one and two standard deviations; hollow marks are frames that are not ok. A run without contacts shows its residual.
+    """
     contacts = [c for c in run.contacts if np.isfinite(c.force_n)]
     if contacts:
         return forces_figure(contacts, run.frames)

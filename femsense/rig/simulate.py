@@ -47,18 +47,20 @@ def simulate(
     A frame that does not converge is left out of the recording, with a warning that names it.
 
     Arguments:
-        robot: the declared robot. The simulated one is finer, neo-Hookean, and has the effects of the script.
+        robot: the declared robot, with which an estimate would be made. The recording is simulated with another model (a finer mesh, the
+            neo-Hookean law, and the effects of the script), so that an estimate meets a realistic model error.
         script: a script, its plain tables, or the path of a TOML file (docs/formats/scripts.md).
         out_folder: the recording; an earlier simulated one is replaced when the new one is complete.
         progress: called with (frames done, number of frames).
-        keep: a checkpoint file and the inputs that it must match: an interrupted simulation resumes with the same result, and a file with
-                    other inputs is ignored. It is removed at the end.
+        keep: (path, inputs) of a checkpoint. An interrupted simulation resumes from it if the stored inputs are the same. It is removed at the
+            end.
 
     Returns:
-        the folder.
+        the folder of the recording.
 
     Raises:
-        InputError: the script does not fit the robot, or `out_folder` contains other files. DataError: no frame has an equilibrium.
+        InputError: the script does not fit the robot, or `out_folder` contains other files.
+        DataError: no frame has an equilibrium.
 
     Example:
         >>> import tempfile

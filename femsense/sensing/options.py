@@ -20,19 +20,19 @@ class SensingMethod(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SensingOptions:
-    """Assumptions that the data cannot replace."""
+    """Options of `estimate`: method, and assumptions on contacts, noise and smoothness."""
 
     method: Annotated[
         SensingMethod,
         Flag("--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."),
     ] = SensingMethod.rays
     friction: Annotated[float | None, Flag("--friction", "MU", "Coefficient of the friction cone of contact forces.")] = 1.0
-    """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
+    """Coulomb coefficient of contacts: a force lies within the friction cone about the inward normal. None: no cone."""
     push: Annotated[
         bool, Flag("--push", help="Forces at the points of --at push, within the friction cone; otherwise they may pull too.")
     ] = False
     smooth_s: Annotated[float, Flag("--smooth", "SECONDS", "Time over which forces are averaged; they lag by as much.")] = 0.0
-    """Time constant over which the forces of one track are averaged [s]. 0: each frame speaks for itself."""
+    """Time constant of the low-pass filter of the forces of a track [s]. 0: frames are independent."""
     modulus_std: float = 0.03
     """Prior standard deviation of the modulus, relative."""
     marker_std_m: float | None = None
@@ -42,4 +42,4 @@ class SensingOptions:
     correct: Annotated[
         bool, Flag("--correct", help="Use the empirical correction of femsense improve --correct, which applies to markers.")
     ] = False
-    """Its standard deviation is used too."""
+    """Subtract the empirical correction of the robot from the markers, and add its variance to theirs."""

@@ -70,15 +70,16 @@ def estimate(
         at: known contact points at rest [m], shape (g, 3); required for markers only.
         options: assumptions on contacts, noise and smoothness.
         progress: called with (frames done, number of frames).
-        keep: a checkpoint file and the inputs that it must match: an interrupted estimate resumes with the same result, and a file with
-            other inputs is ignored. It is removed at the end.
+        keep: (path, inputs) of a checkpoint. An interrupted estimate resumes from it if the stored inputs are the same. It is removed at the
+            end.
         keep_every_s: interval between checkpoints [s].
 
     Returns:
         contacts with forces and their standard deviations, the status of each frame, and the deformed states.
 
     Raises:
-        InputError: neither clouds nor `at`. DataError: no frame has a result.
+        InputError: neither clouds nor `at`.
+        DataError: no frame has a result.
 
     Example:
         >>> robot = fs.load_robot("finger")

@@ -33,6 +33,7 @@ class ContactForce:
     frame: int
     """Number of the frame as in frames.csv."""
     time_s: float
+    """Time of the frame [s]."""
     contact: int
     """Number of the contact in its frame, from 0."""
     position_m: FloatArray
@@ -62,7 +63,9 @@ class FrameReport:
     """Status, residuals and times of one frame."""
 
     frame: int
+    """Number of the frame, as in frames.csv."""
     time_s: float
+    """Time of the frame [s]."""
     status: str
     """"ok", or the reason why the result is not to be trusted or missing (docs/guides/statuses.md)."""
     contacts: int  # number of contacts with a significant force
@@ -71,7 +74,9 @@ class FrameReport:
     rms_before_m: float
     """Residual of the model without contact forces [m]: along the normal for clouds, in 3-D for markers."""
     rms_after_m: float
+    """Residual with the contact forces [m], as above."""
     ms: float
+    """Run time of the frame [ms]."""
     tension_n: dict[str, float]
     pressure_pa: dict[str, float] = field(default_factory=dict)
     stages_ms: dict[str, float] = field(default_factory=dict)
@@ -87,6 +92,7 @@ class States:
     nodes_m: npt.NDArray[np.float32]
     """shape (F, n, 3)."""
     tets: npt.NDArray[np.int64]
+    """Node indices of the tetrahedra, shape (m, 4) or (m, 10)."""
     rest_nodes_m: FloatArray
     """shape (n, 3)."""
 
@@ -113,10 +119,15 @@ class Run:
     """
 
     contacts: tuple[ContactForce, ...]
+    """Contacts of all frames, in order of frames."""
     frames: tuple[FrameReport, ...]
+    """Status, residuals and times of each frame."""
     states: States
+    """The deformed body in each frame."""
     robot: Robot
+    """The robot of the estimate."""
     recording_folder: Path | None
+    """Folder of the recording; None: made in Python."""
     known_loads: tuple[LoadComparison, ...] = ()
     """Declared loads at the given contact points, and their estimates."""
 

@@ -85,7 +85,12 @@ class ArmatureOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Armature:
-    """A chain of points with bones on the curve through them. Call it with points to get the poses of the bones."""
+    """Bones along the backbone of a body: poses on a cubic spline through measured points.
+
+    `make_armature` places the bones at rest; a call `armature(points)` with the measured points [m], shape (m, 3), returns their poses. The z axis of
+    a bone is the tangent of the spline; its x axis is given by `normal` and transported along the curve without rotation about the tangent
+    (rotation-minimising frame). The poses animate a skinned mesh (`export_glb`, `femsense stream`).
+    """
 
     rest_points: FloatArray
     """The points at rest, in the order of the chain [m], shape (m, 3)."""
@@ -94,11 +99,13 @@ class Armature:
     at: FloatArray
     """Arc length of each bone at rest [m], shape (b,)."""
     normal: FloatArray
-    """The x axis at the first point at rest, or the plane's normal; unit, shape (3,)."""
+    """Unit vector, shape (3,): x axis at the first point at rest; if `planar`, the normal of the plane."""
     tangent: FloatArray
     """Along the chain at the first point at rest; unit, shape (3,)."""
     planar: bool
+    """Whether the curve lies in a plane; then the x axis is the tangent, turned by 90° in that plane."""
     inextensible: bool
+    """Whether the curve keeps its length at rest; then only the directions are taken from the points."""
 
     def __len__(self) -> int:
         return len(self.at)

@@ -39,13 +39,13 @@ class Shown:
 
 
 def show_run(run: Run, *, height: int = 480, page: Path = PAGE) -> Shown:
-    """Return the page of a run, for the last line of a notebook's cell.
+    """Show a run in a notebook: the viewer page, as the last expression of a cell.
 
     The page is served on 127.0.0.1: the browser has to run on the same machine as the notebook's kernel.
 
     Arguments:
-        run: of `estimate`.
-        height: of the frame [pixels].
+        run: result of `estimate`.
+        height: height of the view [px].
         page: folder of the built page.
 
     Raises:

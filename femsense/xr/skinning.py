@@ -155,7 +155,9 @@ def skin_rms(skin: Skin, poses: FloatArray, states: FloatArray) -> float:
 
 
 def fit_skin(rest: npt.ArrayLike, states: npt.ArrayLike, *, bones: int | None = None) -> Skin:
-    """Compute bones and weights for a moving surface.
+    """Fit linear blend skinning to a moving surface: bone poses, and weights of at most four bones per vertex.
+
+    Weights and poses are fitted alternately (skinning decomposition with rigid bones, Le & Deng 2012).
 
     Arguments:
         rest: vertices at rest, robot frame [m], shape (V, 3).

@@ -51,7 +51,7 @@ def read_skin(path: str | Path, *, unit: str | None = None, T_robot_skin: Any = 
         path: the file.
         unit: of its coordinates, "m", "cm" or "mm"; glTF is always in metres with Y up.
         T_robot_skin: maps its coordinates [m] to the robot frame, shape (4, 4).
-        budget: vertices at most; a texture that is beyond it becomes colours of vertices.
+        budget: maximum number of vertices. Beyond it the surface is simplified, and a texture becomes vertex colours.
 
     Raises:
         InputError: no such file, no surface, or no unit.

@@ -221,7 +221,7 @@ def direct_bytes(pattern: Pattern) -> int:
 
 
 def available_memory() -> float:
-    """Return the memory for factors [bytes]: FEMSENSE_MEMORY_GB, else the free memory of the machine; inf if unknown.
+    """Return the memory available for factorised matrices [bytes]: FEMSENSE_MEMORY_GB, else the free memory of the machine; inf if unknown.
 
     Raises:
         InputError: FEMSENSE_MEMORY_GB is not a number ≥ 0.

@@ -107,7 +107,8 @@ def prepare(
         measured: which measurements are fitted, see `Measured`.
 
     Raises:
-        InputError: bad arguments; DataError: the data do not allow a fit.
+        InputError: invalid arguments.
+        DataError: the data do not allow a fit.
     """
     if not recordings:
         raise InputError("no recording", where="recordings", expected="at least one recording")

@@ -108,7 +108,8 @@ def read_clouds(
         poses: of the cameras.
 
     Raises:
-        InputError: a malformed file; DataError: no camera sees the robot in any of the frames.
+        InputError: a malformed file.
+        DataError: no camera sees the robot in any of the frames.
     """
     size = diagonal(robot.body.mesh.nodes)
     voxel = VOXEL * size

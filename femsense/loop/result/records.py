@@ -247,9 +247,11 @@ class Left:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ModelError:
-    """The parts of the held-out error. The squared model error is the squared residual minus those of noise, marker placement and discretisation.
+    """Decomposition of the held-out error.
 
-    Root mean squares [m] over all axes of a marker; with clouds only, along their normals.
+        model error² = residual² − noise² − placement² − discretisation²
+
+    All are root mean squares [m]: of the 3-D distances of markers, or, with clouds only, of the distances along the surface normal.
     """
 
     fitted_m: Number = NAN
@@ -257,9 +259,9 @@ class ModelError:
     held_out_m: Number = NAN
     """Model error of the returned model on held-out data."""
     noise_m: Number = NAN
-    """Repeatability of a point."""
+    """Standard deviation of repeated measurements of a point [m]."""
     noise_is_measured: bool = True
-    """Whether it is declared or measured, and not assumed."""
+    """True if the noise is declared or measured from repetitions; False if it is an assumption."""
     noise_source: str = ""
     """Where the noise is taken from, in words."""
     placement_m: Number = NAN

@@ -32,16 +32,29 @@ def acceptance_test(
     record: RefitRecord,
     noise: Noise,
 ) -> Refit:
-    """Return a refit with its evidence and its verdict: PASSES, or the first criterion that fails.
+    """Decide whether an effect is accepted, from its refit: PASSES, or the first criterion that fails.
 
-    With g the evidence (decrease of χ², `refit.evidence`), c the BIC penalty, π the prior cost and h the decrease of held-out χ², an effect passes if
+    With Δχ² the decrease of χ² in the fitted data, Δχ²_held that in the held-out data, k the BIC penalty and p the prior cost (−2 log prior density):
 
-        g − c − π > evidence,    its parameters are identifiable and inside their bounds,
-        h ≥ min(held_gain · g · n_held / n_fitted,  s − 2 z √s),    g − c − π + h > evidence,
-        and the unweighted rms does not grow (`plainly_worse`).
+    1. Evidence: Δχ² − k − p > `evidence`.
+    2. Parameters: identifiable, and inside their bounds.
+    3. Prediction: Δχ²_held ≥ `held_gain` · Δχ² · n_held / n_fitted. A true effect has a Δχ²_held with mean s (`held_shift`) and variance 4 s; if its values
+       are plausible, Δχ²_held ≥ s − 2 z √s suffices, with z = `significant`.
+    4. Evidence in all data: Δχ² − k − p + Δχ²_held > `evidence`.
+    5. Unweighted residual: its root mean square does not grow (`plainly_worse`).
 
-    For a true effect h has mean s = `held_shift` and variance 4 s; z is `significant`. An effect with implausible values is not given this allowance for
-    chance. Names in code style are fields of `Thresholds`.
+    Names in code style are fields of `Thresholds`.
+
+    Arguments:
+        data: fitted and held-out data.
+        fitted: the model without the effect.
+        candidate: the effect, with its BIC penalty.
+        made: the refitted model with the effect.
+        record: the record of the refit, to be completed.
+        noise: the noise of the measurements.
+
+    Returns:
+        the refit with its evidence and its verdict.
     """
     thresholds = data.thresholds
     gain = evidence(fitted.fit, made.fit)

@@ -70,7 +70,7 @@ def map_to_features(positions: npt.ArrayLike, feature_points: npt.ArrayLike) -> 
 
     Arguments:
         positions: contact points [m], shape (k, 3).
-        feature_points: feature points of the robot [m], shape (e, 3); the first one wins a tie.
+        feature_points: points on the robot at which forces are estimated [m], shape (e, 3); the first one wins a tie.
     Raises:
         InputError: wrong shapes, or no feature points.
     """

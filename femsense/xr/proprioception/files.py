@@ -58,9 +58,14 @@ def read_labelled(
 
 
 def camera_poses(markers: Path, calibration: str | Path | None) -> dict[str, FloatArray]:
-    """Return T_robot_camera, shape (4, 4), by camera name: of a calibration, else of a recording.toml next to the markers.
+    """Return the pose T_robot_camera, shape (4, 4), of each camera by name; empty if a pose is missing.
 
-    Empty if neither declares one. Raises InputError.
+    Arguments:
+        markers: path of markers.csv.
+        calibration: path of a calibration. None: the poses declared in recording.toml, in the folder of `markers`.
+
+    Raises:
+        InputError: the calibration or recording.toml is invalid.
     """
     if calibration is not None:
         found = read_calibration(calibration)

@@ -58,9 +58,11 @@ class LearnOptions:
     end_to_end: bool = False
     """Whether a second network predicts the bones directly from the readings, as in the paper."""
     bones: ArmatureOptions = field(default_factory=ArmatureOptions)
+    """Placement of the bones along the markers."""
     rest_row: int = 0
     """Row in which the robot is at rest: its bones are the skin's."""
     seed: int = 0
+    """Seed of the random numbers of training."""
 
 
 def learn(

@@ -31,12 +31,17 @@ def step_memory(memory: FloatArray, before: FloatArray, row: FloatArray, dt: flo
 
 
 def with_memory(time_s: FloatArray, values: FloatArray, taus: tuple[float, ...]) -> FloatArray:
-    """Return readings and their filters, shape (n, (1 + k) c).
+    """Append low-pass filtered copies of readings, one first-order filter per time constant.
+
+    They give a model without states access to the past, so that it can represent creep and slowly filling tubes.
 
     Arguments:
-        time_s: when each row was read [s], shape (n,); filters start at the first row.
+        time_s: time of each row [s], shape (n,). The filters start in equilibrium with the first row.
         values: readings, shape (n, c).
-        taus: time constants [s], k of them.
+        taus: k time constants [s].
+
+    Returns:
+        shape (n, (1 + k) c): the readings, then the filtered readings of each time constant.
     """
     if not taus:
         return values

@@ -25,6 +25,7 @@ class ProprioceptiveModel:
     channels: tuple[str, ...]
     """Names of the readings, in the order of a row."""
     marker_names: tuple[str, ...]
+    """Names of the predicted markers."""
     network: Network
     """From readings and their filters to the coordinates of the markers [m]."""
     memory_s: tuple[float, ...]

@@ -65,10 +65,18 @@ def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
 
 
 def load_model(path: str | Path) -> ProprioceptiveModel:
-    """Return the model of an ONNX file that `save_model` or `femsense learn` wrote; needs no runtime.
+    """Load a proprioceptive model: a network that predicts markers and bones from sensors in the body.
+
+    Loading and prediction need neither onnx nor onnxruntime.
+
+    Arguments:
+        path: an ONNX file that `save_model` or `femsense learn` wrote.
+
+    Returns:
+        the model: `model.markers(readings)` for marker positions [m], `model.armature(readings)` for bone poses.
 
     Raises:
-        InputError: no such file, or one of another kind.
+        InputError: the file is missing or of another kind.
     """
     numbers, text = read_onnx(path)
     document = json.loads(text.get(KEY, "{}"))
