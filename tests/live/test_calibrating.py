@@ -7,7 +7,6 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.live.calibrating import Coverage, CoverageLimits, MovingInput, insufficiency
 
-
 A, B = MovingInput("cable_a", 10.0), MovingInput("cable_b")
 
 

@@ -10,10 +10,10 @@ import pytest
 from live_block import notices, write_watched_block
 
 from femsense.core.errors import FemsenseError
+from femsense.live.events import Notice
 from femsense.live.feed import CameraFeed, FeedOptions
 from femsense.live.frames import StampedFrame
 from femsense.live.link import LinkLimits, LinkState
-from femsense.live.events import Notice
 
 LIMITS = LinkLimits(warm_up_s=8.0, time_out_s=0.5, restart_s=0.5, first_retry_s=0.1, longest_retry_s=0.2)
 PATIENCE_S = 18.0

@@ -15,18 +15,17 @@ from rich.console import Console
 from femsense.core.arrays import freeze
 from femsense.io.robot_toml import load_robot
 from femsense.live.dashboard import draw, lines
+from femsense.live.events import Notice, SessionEvent
 from femsense.live.feed import FeedCounts
 from femsense.live.figures import Latency, Snapshot, Stopwatch
 from femsense.live.link import LinkState, LinkStatus
 from femsense.live.mcap_sink import McapSink
 from femsense.live.outlet import Outlet, live_document, wrench_bytes
 from femsense.live.senser import Answer
-from femsense.live.events import Notice, SessionEvent
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import read_pose
-
 
 SLOW = SessionEvent(Notice.SLOW_LINK, "use a USB 3 port", 92.0, float("inf"))
 JUMPS = SessionEvent(Notice.STAMPS_JUMP, "by 100.0 s", 93.0, 96.0, count=2)
