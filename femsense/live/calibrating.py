@@ -89,7 +89,7 @@ class Coverage:
         """What is still missing, in words; empty if nothing is."""
         parts = [f"{self.wanted - self.count} of {self.wanted} frames missing"] if self.count < self.wanted else []
         if unmoved := self._unmoved():
-            parts.append(f"not moved enough: {', '.join(unmoved)}")
+            parts.append(f"still to be moved: {', '.join(unmoved)}")
         return "; ".join(parts)
 
     def _spans(self, *more: FloatArray) -> FloatArray:
@@ -101,13 +101,13 @@ class Coverage:
         return all((np.abs(values - one) > apart).any() for one in self._taken)
 
     def _unmoved(self) -> list[str]:
-        """Return the inputs that have not moved enough, with their range so far and the required one."""
-        found = [] if self._are_fixed else zip(self.inputs, self._spans(), self._needed)
-        return [
-            f"{one.column} ({span:.3g} of {needed:.3g} {one.unit})" if needed else one.column
-            for one, span, needed in found
-            if span < max(needed, TINY)
-        ]
+        """Return the inputs that have not moved enough, with the required range and that so far."""
+        found = []
+        for one, span, needed in zip(self.inputs, self._spans(), self._needed):
+            if not self._are_fixed and span < max(needed, TINY):
+                far = f" by {needed:.3g} {one.unit}" if needed else ""
+                found.append(f"{one.column}{far}" + (f" (so far {span:.3g})" if span > TINY else ""))
+        return found
 
 
 def insufficiency(calibration: Calibration, limits: CoverageLimits | None = None) -> str:

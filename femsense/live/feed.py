@@ -233,11 +233,14 @@ class CameraFeed:
     def _log_link(self) -> None:
         """Log the state of the link, except that frames arrive."""
         status = self._link.status
-        if status.state is not self._logged:
+        text, is_new = status.reason or ADVICE[status.state] or str(status.state), status.state is not self._logged
+        if is_new:
             self.log.lasts(self._logged, "")
             self._logged = status.state
-        if status.state is not LinkState.STREAMING:
-            self.log.lasts(status.state, status.reason or ADVICE[status.state] or str(status.state))
+        if status.state in FINAL and is_new:
+            self.log.happened(status.state, text)
+        elif status.state not in (LinkState.STREAMING, *FINAL):
+            self.log.lasts(status.state, text)
 
     def _send(self, message: object) -> None:
         pipe = self._pipe

@@ -23,9 +23,9 @@ def test_frames_with_other_inputs_are_kept_and_the_same_ones_wait() -> None:
 def test_what_is_missing_is_said_until_it_suffices() -> None:
     coverage = Coverage([A, B], CoverageLimits(frames=2, wait_s=0.0))
     coverage.offer(0.0, np.array([0.0, 0.0]))
-    assert coverage.missing == "1 of 2 frames missing; not moved enough: cable_a (0 of 1 N), cable_b"
+    assert coverage.missing == "1 of 2 frames missing; still to be moved: cable_a by 1 N, cable_b"
     coverage.offer(1.0, np.array([0.5, 1.0]))
-    assert coverage.missing == "not moved enough: cable_a (0.5 of 1 N)" and not coverage.suffices
+    assert coverage.missing == "still to be moved: cable_a by 1 N (so far 0.5)" and not coverage.suffices
     coverage.offer(2.0, np.array([1.5, 1.0]))
     assert coverage.suffices and coverage.missing == ""
 
@@ -33,7 +33,7 @@ def test_what_is_missing_is_said_until_it_suffices() -> None:
 def test_inputs_that_do_not_move_are_waited_for_and_cost_no_frames() -> None:
     coverage = Coverage([A], CoverageLimits(frames=2, wait_s=0.0))
     assert offered(coverage, *[(0.0,)] * 50).count(True) == coverage.count == coverage.wanted == 2
-    assert not coverage.suffices and coverage.missing == "not moved enough: cable_a (0 of 1 N)"
+    assert not coverage.suffices and coverage.missing == "still to be moved: cable_a by 1 N"
     coverage.want_more()
     offered(coverage, *[(0.0,)] * 50)
     assert coverage.count == coverage.wanted == 8

@@ -188,7 +188,7 @@ def test_constant_inputs_need_not_move_and_others_are_waited_for(block: tuple[Pa
     )
     loose = SessionOptions(coverage=replace(WAITS, frames=4, position_m=1.0, rotation_rad=1.0))
     answers, last = run_session(block[0], str(still), loose)
-    assert not answers and "not moved enough: cable_top" in last.todo
+    assert not answers and "still to be moved: cable_top" in last.todo
     accepted, _ = run_session(block[0], str(still), loose, act=lambda session: session.accept_fixed())
     assert accepted[0].report.frame == 4
 
