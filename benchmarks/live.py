@@ -123,7 +123,7 @@ def _recording(robot: Path, work: Path) -> Path:
         ],
         "contacts": [{"sweep": "touch", "point_m": point.tolist(), "force_n": push, "object": "ball"}],
         "objects": [{"name": "ball", "kind": "ball", "radius_m": 0.05 * size}],
-        "truth": {"refinements": 0, "element": "tet4", "law": "corotational"},
+        "truth": {"refinements": 0, "element": "tet10" if body.mesh.is_quadratic else "tet4", "law": "corotational"},
         "clouds": {"kind": "depth"},
         "markers": {"names": []},
         "camera": {

@@ -27,6 +27,7 @@ from femsense.live.feed import CameraFeed
 from femsense.live.figures import Snapshot, Stopwatch
 from femsense.live.frames import StampedFrame
 from femsense.live.growing import GrowingRecording, empty_recording
+from femsense.live.link import LOST
 from femsense.live.recorder import CALIBRATION, Lost, Recorder
 from femsense.live.senser import Answer, Senser
 from femsense.live.sources.source import SourceInfo
@@ -201,6 +202,9 @@ class Session:
         """Process the newest frame according to the phase; return the result if it was sensed."""
         frame = self.feed.take(timeout_s)
         self.watch()
+        is_asked = self._tare.is_set() or self._tare_anyway.is_set()
+        if is_asked and (frame is not None or self.feed.status.state in LOST):
+            self._asked_to_tare(frame)
         if frame is None or not (frame.raw.images or frame.raw.markers):
             return None
         if self._growing is None:
@@ -210,8 +214,6 @@ class Session:
             self._todo = "waiting for the first inputs of the robot"
             self.skipped(frame)
             return None
-        if self._tare.is_set() or self._tare_anyway.is_set():
-            self._asked_to_tare(frame)
         if self._phase is Phase.SENSING:
             return self._sense(frame, values)
         self._collect(frame, values)
@@ -341,18 +343,21 @@ class Session:
             self._record(self._senser.sense(growing.recording, k))
         self._phase = Phase.SENSING
 
-    def _asked_to_tare(self, frame: StampedFrame) -> None:
+    def _asked_to_tare(self, frame: StampedFrame | None) -> None:
         """Begin a new part with the present state as reference, unless there is a contact: the reference would hide its force."""
-        anyway = self._tare_anyway.is_set()
+        anyway, hidden = self._tare_anyway.is_set(), ""
         self._tare.clear()
         self._tare_anyway.clear()
-        if self._phase is not Phase.SENSING or self._answer is None:
-            self.log.happened(Notice.NOT_ZEROED, "nothing is sensed yet: press t again once forces are shown")
-            return
-        hidden = self._recent_contact(self._answer, frame)
-        if hidden and not anyway:
-            text = f"{hidden}: the reference would hide it. Let go of the robot and press t again; T zeroes all the same"
-            self.log.happened(Notice.NOT_ZEROED, text)
+        if frame is None:
+            refusal = "the camera is lost: press t again when its frames arrive"
+        elif self._phase is not Phase.SENSING or self._answer is None:
+            refusal = "nothing is sensed yet: press t again once forces are shown"
+        else:
+            hidden = self._recent_contact(self._answer, frame)
+            advice = "the reference would hide it. Let go of the robot and press t again; T zeroes all the same"
+            refusal = f"{hidden}: {advice}" if hidden and not anyway else ""
+        if frame is None or refusal:
+            self.log.happened(Notice.NOT_ZEROED, refusal)
             return
         self._tares += 1
         self.log.lasts(Notice.DRIFT, "")

@@ -23,11 +23,13 @@ from femsense.calib.files import read_calibration, write_calibration
 from femsense.core.errors import DataError, InputError
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
+from femsense.live.actuation import make_actuation
 from femsense.live.calibrating import CoverageLimits
 from femsense.live.events import Notice
 from femsense.live.feed import CameraFeed, FeedOptions
 from femsense.live.figures import Snapshot
 from femsense.live.growing import make_scratch, remove_scratch
+from femsense.live.link import LinkLimits, LinkState
 from femsense.live.recorder import session_run
 from femsense.live.senser import Answer
 from femsense.live.session import Phase, Session, SessionOptions
@@ -50,13 +52,19 @@ def calibration(block: tuple[Path, Path]) -> Path:
     return write_calibration(found, block[0].parent / "calibration.json")
 
 
-def run_session(robot: Path, camera: str, options: SessionOptions, feed: FeedOptions = FAST, act=lambda _session: None):
+def run_session(
+    robot: Path, camera: str, options: SessionOptions, feed: FeedOptions = FAST, act=lambda _session: None, inputs: str = ""
+):
     """Run a session to its end; `act(session)` is called before each step. Return its answers and its last snapshot."""
     answers: list[Answer] = []
     scratch = make_scratch()
     try:
         with CameraFeed(camera, feed) as source:
-            session = Session(load_robot(robot), source, scratch, options=options, on_answer=lambda a, _taken: answers.append(a))
+            body = load_robot(robot)
+            actuation = make_actuation(inputs, body) if inputs else None
+            session = Session(
+                body, source, scratch, actuation=actuation, options=options, on_answer=lambda a, _taken: answers.append(a)
+            )
             try:
                 while not source.is_over:
                     act(session)
@@ -156,6 +164,24 @@ def test_a_zero_during_a_contact_is_refused_unless_it_is_asked_for_all_the_same(
     assert zeros[1]["text"].startswith("reference 1, which hides a contact of 0.") and float(zeros[1]["time_s"]) > 0.0
 
 
+def test_a_zero_is_refused_while_the_camera_is_lost(block: tuple[Path, Path], calibration: Path, tmp_path: Path) -> None:
+    asked: list[LinkState] = []
+
+    def act(session: Session) -> None:
+        snapshot = session.snapshot()
+        if snapshot.answer is not None and snapshot.link.state is LinkState.UNPLUGGED:
+            asked.append(snapshot.link.state)
+            if len(asked) == 3:  # the last frame has been processed
+                session.tare()
+
+    options = SessionOptions(calibration=calibration, folder=tmp_path / "session", contact_free_frames=2)
+    feed = FeedOptions(link=LinkLimits(first_retry_s=0.1, longest_retry_s=0.2, retries=3))
+    run_session(block[0], f"software:{block[1]}?unplug=150+600", options, feed, act)
+    events = {row["kind"]: row for row in events_of(tmp_path / "session")}
+    assert asked and events["not zeroed"]["text"] == "the camera is lost: press t again when its frames arrive"
+    assert float(events["unplugged"]["duration_s"]) > 0.0 and events["gave up"]["duration_s"] == "0.000"
+
+
 def with_free(recording: Path, folder: Path, free: set[int]) -> Path:
     """Return a copy of a recording that declares these frames contact-free."""
     shutil.copytree(recording, folder)
@@ -191,6 +217,8 @@ def test_constant_inputs_need_not_move_and_others_are_waited_for(block: tuple[Pa
     assert not answers and "still to be moved: cable_top" in last.todo
     accepted, _ = run_session(block[0], str(still), loose, act=lambda session: session.accept_fixed())
     assert accepted[0].report.frame == 4
+    constant, _ = run_session(block[0], str(still), loose, inputs="fixed:top=1,side=0.5")
+    assert constant[0].report.frame == 4
 
 
 def test_a_calibration_that_never_suffices_says_what_is_known(block: tuple[Path, Path]) -> None:
