@@ -16,7 +16,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.live.clock import ClockMap
-from femsense.live.watch import Notice
+from femsense.live.events import Notice
 from femsense.model.robot import Robot
 from femsense.xr.stream.readings import Readings, readings_of
 

@@ -11,6 +11,7 @@ from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray
 
 DEGREE = np.pi / 180.0
+TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,42 +20,47 @@ class CoverageLimits:
 
     frames: int = 12
     """The number of frames that calibration uses of clouds; the model error needs at least four of them."""
+    more: int = 6
+    """Number of further frames after a calibration that was not accurate enough."""
     apart: float = 0.1
-    """Two frames are different if an input differs by this share of its range so far."""
+    """Each input has to move by this share of its largest value; frames are different if an input differs by this share of its range."""
     wait_s: float = 0.5
     """Time after which a frame with unchanged inputs is kept too: repetitions show the noise."""
-    patience: float = 2.0
-    """After this multiple of `frames`, inputs that never moved are accepted as fixed."""
     position_m: float = 5e-4
     rotation_rad: float = 0.3 * DEGREE
     """Largest standard deviations of the camera pose."""
 
 
+@dataclass(frozen=True, slots=True)
+class MovingInput:
+    """An input that has to move before a calibration."""
+
+    column: str
+    largest: float = float("inf")
+    """Its largest value [unit]; inf: not declared, any change counts as a movement."""
+    unit: str = "N"
+
+
 class Coverage:
-    """Selects contact-free frames by their inputs, and states which are missing."""
+    """Selects contact-free frames by their inputs, and states which are missing.
 
-    def __init__(self, columns: Sequence[str], largest: Sequence[float], limits: CoverageLimits | None = None) -> None:
-        """Begin without frames.
+    Two requirements are independent: the number of frames, and the range of each input in them. While only ranges are missing, a frame is
+    kept only if its inputs are new, so that waiting for a movement costs no frames.
+    """
 
-        Arguments:
-            columns: names of the inputs.
-            largest: the largest value of each input that the robot declares; inf: not declared.
-            limits: the requirements.
-        """
-        self.limits = limits or CoverageLimits()
-        self.columns, self._largest = tuple(columns), np.asarray(largest, dtype=np.float64)
+    def __init__(self, inputs: Sequence[MovingInput], limits: CoverageLimits | None = None) -> None:
+        """Begin without frames; `inputs` are those that have to move."""
+        self.limits, self.inputs = limits or CoverageLimits(), tuple(inputs)
+        largest = np.array([one.largest for one in self.inputs])
+        self._needed = np.where(np.isfinite(largest), self.limits.apart * largest, 0.0)
         self._taken: list[FloatArray] = []
-        self._low = np.full(len(self.columns), np.inf)
-        self._high = np.full(len(self.columns), -np.inf)
         self._last_s = float("-inf")
+        self._are_fixed = False
         self.wanted = self.limits.frames
 
     def offer(self, time_s: float, values: FloatArray) -> bool:
-        """Return whether to keep a contact-free frame with these inputs."""
-        self._low, self._high = np.minimum(self._low, values), np.maximum(self._high, values)
-        span = np.maximum(self._high - self._low, 1e-12)
-        differs = all((np.abs(values - one) > self.limits.apart * span).any() for one in self._taken)
-        if self._taken and not differs and time_s - self._last_s < self.limits.wait_s:
+        """Return whether to keep a contact-free frame with these inputs, shape (inputs,)."""
+        if self._taken and not self._is_new(values) and (self.count >= self.wanted or time_s - self._last_s < self.limits.wait_s):
             return False
         self._taken.append(values)
         self._last_s = time_s
@@ -66,33 +72,42 @@ class Coverage:
         return len(self._taken)
 
     @property
-    def unmoved(self) -> tuple[str, ...]:
-        """Inputs that have moved by less than `apart` of their largest value, or not at all."""
-        if not self._taken:
-            return self.columns
-        span = self._high - self._low
-        needed = np.where(np.isfinite(self._largest), self.limits.apart * self._largest, 0.0)
-        return tuple(name for name, s, n in zip(self.columns, span, needed) if s <= max(n, 1e-12))
-
-    @property
     def suffices(self) -> bool:
-        """Whether to try a calibration: enough frames, and every input has moved or is accepted as fixed."""
-        given_up = self.count >= self.limits.patience * self.wanted
-        return self.count >= self.wanted and (not self.unmoved or given_up)
+        """Whether to try a calibration: enough frames, in which every input has moved or is accepted as fixed."""
+        return self.count >= self.wanted and not self._unmoved()
 
-    def want_more(self, frames: int) -> None:
+    def want_more(self) -> None:
         """Require more frames, after a calibration that was not accurate enough."""
-        self.wanted = self.count + frames
+        self.wanted = self.count + self.limits.more
+
+    def accept_fixed(self) -> None:
+        """Accept the inputs that have not moved as fixed."""
+        self._are_fixed = True
 
     @property
     def missing(self) -> str:
         """What is still missing, in words; empty if nothing is."""
-        if self.suffices:
-            return ""
-        parts = [f"{max(0, self.wanted - self.count)} of {self.wanted} frames missing"] if self.count < self.wanted else []
-        if self.unmoved:
-            parts.append(f"not moved yet: {', '.join(self.unmoved)}")
+        parts = [f"{self.wanted - self.count} of {self.wanted} frames missing"] if self.count < self.wanted else []
+        if unmoved := self._unmoved():
+            parts.append(f"still to be moved: {', '.join(unmoved)}")
         return "; ".join(parts)
+
+    def _spans(self, *more: FloatArray) -> FloatArray:
+        values = [*self._taken, *more]
+        return np.ptp(values, axis=0) if values else np.zeros(len(self.inputs))
+
+    def _is_new(self, values: FloatArray) -> bool:
+        apart = self.limits.apart * np.maximum(self._spans(values), np.maximum(self._needed, TINY))
+        return all((np.abs(values - one) > apart).any() for one in self._taken)
+
+    def _unmoved(self) -> list[str]:
+        """Return the inputs that have not moved enough, with the required range and that so far."""
+        found = []
+        for one, span, needed in zip(self.inputs, self._spans(), self._needed):
+            if not self._are_fixed and span < max(needed, TINY):
+                far = f" by {needed:.3g} {one.unit}" if needed else ""
+                found.append(f"{one.column}{far}" + (f" (so far {span:.3g})" if span > TINY else ""))
+        return found
 
 
 def insufficiency(calibration: Calibration, limits: CoverageLimits | None = None) -> str:

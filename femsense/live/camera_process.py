@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import signal
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from multiprocessing.connection import Connection
 
@@ -52,8 +53,8 @@ class Failed:
     error: FemsenseError
 
 
-Report = SourceInfo | int | Lost | Failed
-"""Messages of the process: opened, the ticket of a frame, lost, failed."""
+Report = Opening | SourceInfo | int | Lost | Failed
+"""Messages of the process: about to open, opened, the ticket of a frame, lost, failed."""
 
 
 def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: Opening) -> None:
@@ -66,6 +67,9 @@ def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: 
         pipe.send(Failed(error))
         return
     try:
+        if math.isnan(opening.begun_s):
+            opening = replace(opening, begun_s=time.monotonic())
+        pipe.send(opening)  # before it can fail: the next process goes on from the same beginning
         pipe.send(source.open(opening))
         answer = pipe.recv()
         if isinstance(answer, RingPlace):
@@ -82,21 +86,20 @@ def run_camera(pipe: Connection, text: str, as_fast_as_possible: bool, opening: 
 
 def _stream(source: FrameSource, pipe: Connection, ring: Ring, *, asked: bool) -> None:
     """Write frames until a stop request; with `asked` one per request."""
+    ready = 0.0
     try:
         while True:
             if pipe.poll(None if asked else 0) and pipe.recv() is Request.STOP:
                 return
-            _once(source, lambda data: pipe.send(ring.write(data)), until_one=asked)
+            ready = ready or time.monotonic()
+            frame = source.newest(POLL_S)
+            while frame is None and asked:
+                frame = source.newest(POLL_S)
+            if frame is not None:
+                pipe.send(ring.write(frame_bytes(replace(frame, ready_s=ready))))
+                ready = 0.0
     finally:
         ring.close()
-
-
-def _once(source: FrameSource, put: Callable[[bytes], None], *, until_one: bool) -> None:
-    frame = source.newest(POLL_S)
-    while frame is None and until_one:
-        frame = source.newest(POLL_S)
-    if frame is not None:
-        put(frame_bytes(frame))
 
 
 def _end_with_parent() -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from femsense.live.events import SessionEvent
 from femsense.live.figures import Snapshot
 from femsense.live.link import LinkState
 
@@ -21,7 +22,13 @@ INTERVAL = 1.96
 """Half width of a 95 % interval in standard deviations."""
 REDRAWN_HZ = 8.0
 FRESH_S = 0.5
-KEYS = {"t": "zero: use the present state as contact-free reference", "q": "end"}
+KEYS = {
+    "t": "zero: use the present state as contact-free reference",
+    "T": "the same during a contact",
+    "c": "calibrate with the inputs that have moved so far",
+    "q": "end",
+}
+SENSING_KEYS, OTHER_KEYS = "tTq", "cq"
 
 
 def draw(snapshot: Snapshot, now_s: float, url: str = "") -> RenderableType:
@@ -39,12 +46,20 @@ def draw(snapshot: Snapshot, now_s: float, url: str = "") -> RenderableType:
     latency, counts = snapshot.latency, snapshot.counts
     times = " / ".join(_number(1e3 * v) for v in (latency.p50_s, latency.p95_s, latency.p99_s))
     head.add_row("latency", Text(f"{times} ms (p50 / p95 / p99)"), Text(f"{_number(latency.rate_hz, 1)} frames/s"))
-    frames = f"{snapshot.used} sensed, {counts.skipped} skipped, {counts.dropped} dropped by the device"
+    frames = f"{snapshot.used} sensed, {counts.skipped} skipped, {counts.missed} missed, {counts.dropped} not delivered"
     head.add_row("frames", Text(frames), Text(f"recorded in {snapshot.recording}" if snapshot.recording else "not recorded"))
     parts: list[RenderableType] = [head, _contacts(snapshot, now_s)]
-    parts += [Text(f"! {kind.value}: {text}", style="yellow") for kind, text in snapshot.notices.items()]
-    keys = "   ".join(f"{key} {what}" for key, what in KEYS.items())
+    parts += [Text(f"! {notice_text(event, now_s)}", style="yellow") for event in snapshot.notices]
+    keys = "   ".join(f"{key} {KEYS[key]}" for key in (OTHER_KEYS if snapshot.answer is None else SENSING_KEYS))
     return Panel(Group(*parts, Text(f"{keys}   {url}".rstrip(), style="dim")), title="femsense live")
+
+
+def notice_text(event: SessionEvent, now_s: float) -> str:
+    """Return a problem with its time relative to now [s, monotonic clock], and how often it occurred."""
+    lasts = event.ended_s > now_s
+    when = f"for {now_s - event.begun_s:.0f} s" if lasts else f"{now_s - event.ended_s:.0f} s ago"
+    often = f", {event.count} times" if event.count > 1 else ""
+    return f"{event.kind.value} ({when}{often}): {event.text}"
 
 
 def _contacts(snapshot: Snapshot, now_s: float) -> RenderableType:
@@ -78,12 +93,13 @@ def lines(before: Snapshot | None, now: Snapshot, now_s: float) -> Iterator[str]
         yield now.todo
     if before is not None and before.link.state is not now.link.state:
         yield f"camera: {now.link.text(now_s)}"
-    for kind, text in now.notices.items():
-        if before is None or kind not in before.notices:
-            yield f"{kind.value}: {text}"
-    for kind in before.notices if before is not None else ():
-        if kind not in now.notices:
-            yield f"{kind.value}: over"
+    known = {} if before is None else {(event.kind, event.begun_s): event for event in before.notices}
+    for event in now.notices:
+        old = known.get((event.kind, event.begun_s))
+        if old is None:
+            yield f"{event.begun_s - now.begun_s:.1f} s: {event.kind.value}: {event.text}"
+        elif old.ended_s == float("inf") > event.ended_s:
+            yield f"{event.ended_s - now.begun_s:.1f} s: {event.kind.value}: over after {event.duration_s(now_s):.1f} s"
 
 
 @contextmanager

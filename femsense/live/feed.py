@@ -14,12 +14,13 @@ from threading import Condition, Event, Thread
 
 from femsense.core.errors import FemsenseError
 from femsense.live.camera_process import Failed, Lost, Report, Request, RingPlace, run_camera
+from femsense.live.events import EventLog, Notice
 from femsense.live.frames import StampedFrame, read_frame
 from femsense.live.growing import PREFIX
-from femsense.live.link import FINAL, Link, LinkEvent, LinkLimits, LinkStatus
+from femsense.live.link import ADVICE, FINAL, Link, LinkEvent, LinkLimits, LinkState, LinkStatus
 from femsense.live.ring import Ring
 from femsense.live.sources.source import Loss, Opening, SourceInfo
-from femsense.live.watch import FrameWatch, Notice, WatchLimits
+from femsense.live.watch import FrameWatch, WatchLimits
 
 TICK_S = 0.05
 EVENT_OF = {Loss.UNPLUGGED: LinkEvent.UNPLUGGED, Loss.REFUSED: LinkEvent.REFUSED, Loss.ENDED: LinkEvent.ENDED}
@@ -43,8 +44,10 @@ class FeedCounts:
     received: int = 0
     skipped: int = 0
     """Received and replaced by a newer one before they were used."""
+    missed: int = 0
+    """Delivered by the device while this machine was too busy to receive them."""
     dropped: int = 0
-    """Counted by the device and never delivered."""
+    """Counted by the device, and not delivered by it or its link."""
 
 
 class CameraFeed:
@@ -61,14 +64,18 @@ class CameraFeed:
             on_skipped: called in the feed's thread with every frame that was not used.
         """
         self.text, self.options = text, options or FeedOptions()
-        self.begun_s = time.monotonic()
+        self.log = EventLog(time.monotonic())
+        """Events since the start: states of the link and problems of the frames."""
         self.info: SourceInfo | None = None
         self.error: FemsenseError | None = None
         """Why the source is unusable."""
         self._on_skipped = on_skipped
         self._counts = FeedCounts()
-        self._watch = FrameWatch(self.begun_s, self.options.watch, by_stamps=self.options.as_fast_as_possible)
-        self._link = Link(self.begun_s, self.options.link)
+        self._watch = FrameWatch(self.log, self.options.watch, by_stamps=self.options.as_fast_as_possible)
+        self._link = Link(self.log.begun_s, self.options.link)
+        self._logged = LinkState.STREAMING
+        self._opened_s = float("nan")
+        """When the source was first opened [s]."""
         self._newest: StampedFrame | None = None
         self._changed = Condition()
         self._stop = Event()
@@ -96,12 +103,7 @@ class CameraFeed:
     @property
     def counts(self) -> FeedCounts:
         """Number of frames so far."""
-        return replace(self._counts, dropped=self._watch.dropped)
-
-    @property
-    def notices(self) -> dict[Notice, str]:
-        """Current problems of the frames."""
-        return dict(self._watch.notices)
+        return replace(self._counts, missed=self._watch.missed, dropped=self._watch.dropped)
 
     @property
     def is_over(self) -> bool:
@@ -144,7 +146,9 @@ class CameraFeed:
             self._read()
             if self.options.as_fast_as_possible and self._ring is not None and not self._asked:
                 self._link.rest(time.monotonic())
-            if self._link.tick(time.monotonic()):
+            is_due = self._link.tick(time.monotonic())
+            self._log_link()
+            if is_due:
                 self._end_process(patience_s=0.0)
                 self._start(self._link.status.attempts)
             if self.is_over:
@@ -159,6 +163,7 @@ class CameraFeed:
         try:
             while pipe.poll(TICK_S) and not self._stop.is_set():
                 self._take_in(pipe.recv())
+                self._log_link()
                 if self._pipe is not pipe:
                     return
         except (EOFError, OSError):
@@ -168,7 +173,9 @@ class CameraFeed:
 
     def _take_in(self, report: Report) -> None:
         now = time.monotonic()
-        if isinstance(report, SourceInfo):
+        if isinstance(report, Opening):
+            self._opened_s = report.begun_s
+        elif isinstance(report, SourceInfo):
             self._opened(report)
             self._link.feed(LinkEvent.OPENED, now)
         elif isinstance(report, int):
@@ -181,10 +188,9 @@ class CameraFeed:
 
     def _opened(self, info: SourceInfo) -> None:
         self.info = info
-        if info.is_slow_link:
-            self._watch.notices[Notice.SLOW_LINK] = f"{info.link}: use a USB 3 port and the cable that came with the camera"
-        else:
-            self._watch.notices.pop(Notice.SLOW_LINK, None)
+        self._link.longest_wait_s = info.longest_wait_s
+        slow = f"{info.link}: use a USB 3 port and the cable that came with the camera"
+        self.log.lasts(Notice.SLOW_LINK, slow if info.is_slow_link else "")
         if self._ring is None or self._ring.slot_bytes < info.largest_frame:
             if self._ring is not None:
                 self._ring.close()
@@ -199,6 +205,7 @@ class CameraFeed:
         self._link.feed(LinkEvent.FRAME, time.monotonic())
         self._asked = False
         if data is None:
+            self._watch.unread()
             self._counts = replace(self._counts, received=self._counts.received + 1, skipped=self._counts.skipped + 1)
             return
         raw = read_frame(data)
@@ -215,14 +222,25 @@ class CameraFeed:
     def _start(self, attempt: int) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        begun_s = float("nan") if self.info is None else self.info.begun_s
-        opening = Opening(begun_s, attempt, self._last_number)
+        opening = Opening(self._opened_s, attempt, self._last_number)
         arguments = (other, self.text, self.options.as_fast_as_possible, opening)
         self._process = context.Process(target=run_camera, args=arguments, daemon=True, name="femsense-camera")
         self._process.start()
         other.close()
         self._watch.reconnected()
         self._asked = False
+
+    def _log_link(self) -> None:
+        """Log the state of the link, except that frames arrive."""
+        status = self._link.status
+        text, is_new = status.reason or ADVICE[status.state] or str(status.state), status.state is not self._logged
+        if is_new:
+            self.log.lasts(self._logged, "")
+            self._logged = status.state
+        if status.state in FINAL and is_new:
+            self.log.happened(status.state, text)
+        elif status.state not in (LinkState.STREAMING, *FINAL):
+            self.log.lasts(status.state, text)
 
     def _send(self, message: object) -> None:
         pipe = self._pipe

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from femsense.live.events import SessionEvent
 from femsense.live.feed import FeedCounts
 from femsense.live.link import LinkStatus
 from femsense.live.recorder import Lost
 from femsense.live.senser import Answer
-from femsense.live.watch import Notice
 
 NAN = float("nan")
 WINDOW_S = 10.0
@@ -70,6 +70,11 @@ class Snapshot:
     counts: FeedCounts = field(default_factory=FeedCounts)
     used: int = 0
     lost: Lost = field(default_factory=Lost)
-    notices: dict[Notice, str] = field(default_factory=dict)
+    notices: tuple[SessionEvent, ...] = ()
+    """Problems that last or have just ended."""
+    begun_s: float = 0.0
+    """Start of the session [s, monotonic clock]."""
     recording: str = ""
     """Folder of the recording; empty: not recorded."""
+    parts: tuple[str, ...] = ()
+    """Folders of the parts after each zero."""

@@ -61,6 +61,8 @@ class RawFrame:
     markers: tuple[Marker, ...] = ()
     arrived_s: float = NAN
     """Arrival on this machine [s, monotonic clock]."""
+    ready_s: float = NAN
+    """Since when its reader waited for it [s, monotonic clock]; nan: unknown."""
     view_stamps_s: tuple[float, ...] = ()
     """Exposure time of each camera if there are several [s]."""
     exposure_s: float = NAN

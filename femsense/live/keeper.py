@@ -31,9 +31,11 @@ def main(words: list[str]) -> None:
             pass
     from femsense.core.errors import FemsenseError
     from femsense.live.growing import remove_scratch
-    from femsense.live.recorder import finish_session
+    from femsense.live.recorder import LIVE, finish_session
 
     remove_scratch(Path(words[0]))
+    for session in words[1:]:
+        Path(session, LIVE).unlink(missing_ok=True)  # its page is gone
     with suppress(FemsenseError, OSError, ValueError):  # a session without a frame, or on a disk that is gone
         for session in words[1:]:
             finish_session(Path(session))

@@ -96,6 +96,8 @@ class Link:
         self.status = LinkStatus(LinkState.WARMING_UP, now_s)
         self.losses = 0
         """Number of times that a stream was lost."""
+        self.longest_wait_s = 0.0
+        """Longest planned time between two frames [s]; time-out and warm-up are longer by it."""
         self._last_frame_s = now_s
         self._started_s = now_s
         self._next_try_s = float("inf")
@@ -128,15 +130,16 @@ class Link:
     def tick(self, now_s: float) -> bool:
         """Advance the time; return whether to restart the camera now."""
         status, limits = self.status, self.limits
-        if status.state is LinkState.STREAMING and now_s - self._last_frame_s > limits.time_out_s:
+        time_out_s, warm_up_s = (one + self.longest_wait_s for one in (limits.time_out_s, limits.warm_up_s))
+        if status.state is LinkState.STREAMING and now_s - self._last_frame_s > time_out_s:
             self._count_loss()
-            self._enter(LinkState.TIMED_OUT, now_s, f"no frame for {limits.time_out_s:g} s")
+            self._enter(LinkState.TIMED_OUT, now_s, f"no frame for {time_out_s:g} s")
         elif status.state is LinkState.TIMED_OUT and now_s - status.since_s > limits.restart_s:
             return self._retry(now_s, LinkState.RECONNECTING, "no more frames arrived")
         elif now_s >= self._next_try_s:
             return self._retry(now_s, status.state, status.reason)
-        elif self._is_starting and now_s - self._started_s > limits.warm_up_s:
-            return self._retry(now_s, LinkState.RECONNECTING, f"no frame in {limits.warm_up_s:g} s of warm-up")
+        elif self._is_starting and now_s - self._started_s > warm_up_s:
+            return self._retry(now_s, LinkState.RECONNECTING, f"no frame in {warm_up_s:g} s of warm-up")
         return False
 
     @property

@@ -14,6 +14,7 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import surface_triangles
+from femsense.live.events import SessionEvent
 from femsense.live.figures import Snapshot
 from femsense.live.senser import Answer
 from femsense.model.robot import Robot, spread_features
@@ -125,12 +126,26 @@ def live_document(snapshot: Snapshot, now_s: float) -> dict[str, object]:
         "frames_received": counts.received,
         "frames_used": snapshot.used,
         "frames_skipped": counts.skipped,
+        "frames_missed": counts.missed,
         "frames_dropped": counts.dropped,
         "recording_lost": snapshot.lost.count,
-        "notices": [{"kind": kind.value, "text": text} for kind, text in snapshot.notices.items()],
+        "notices": [event_document(event, snapshot.begun_s, now_s) for event in snapshot.notices],
         "recording": snapshot.recording,
+        "parts": list(snapshot.parts),
     }
     return {key: value for key, value in values.items() if not (isinstance(value, float) and not np.isfinite(value))}
+
+
+def event_document(event: SessionEvent, begun_s: float, now_s: float) -> dict[str, object]:
+    """Return an event as plain values, with times since the start of the session, `begun_s`."""
+    return {
+        "kind": event.kind.value,
+        "text": event.text,
+        "time_s": round(event.begun_s - begun_s, 3),
+        "duration_s": round(event.duration_s(now_s), 3),
+        "lasts": event.ended_s > now_s,
+        "count": event.count,
+    }
 
 
 def live_bytes(snapshot: Snapshot, now_s: float) -> bytes:

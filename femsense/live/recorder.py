@@ -28,6 +28,7 @@ from femsense.io.files import write_json, write_toml
 from femsense.io.recording_folder import load_recording
 from femsense.io.recording_toml import recording_document
 from femsense.io.robot_toml import load_robot
+from femsense.live.events import SessionEvent
 from femsense.live.frames import StampedFrame
 from femsense.live.growing import image_file
 from femsense.live.senser import Answer
@@ -35,7 +36,8 @@ from femsense.model.recording import Recording
 
 SESSION_FORMAT = "femsense-session-1"
 SKIPPED, RUN, JOURNAL, STATES, EVENTS = "skipped", "run", "journal.jsonl", "states.f32", "events.csv"
-CALIBRATION, DESCRIPTION = "calibration.json", "session.json"
+CALIBRATION, DESCRIPTION, LIVE = "calibration.json", "session.json", "live.json"
+EVENT_COLUMNS = ("time_s", "kind", "text", "duration_s", "count")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ class Recorder:
         self._files: dict[str, BinaryIO] = {}
         self._document = recording_document(empty)
         self._begin(folder, "free")
-        self._append(folder / EVENTS, ["time_s", "kind", "text"])
+        self._append(folder / EVENTS, EVENT_COLUMNS)
         write_json(folder / DESCRIPTION, {"format": SESSION_FORMAT, **about})
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = Thread(target=self._work, daemon=True, name="femsense-recorder")
@@ -153,9 +155,12 @@ class Recorder:
         states = answer.positions.astype("<f4").tobytes()
         self._put(_Job(lambda: self._answer(line, states), False), self._most)
 
-    def event(self, time_s: float, kind: str, text: str) -> None:
-        """Record an event at a time of the session [s]."""
-        self._put(_Job(lambda: self._append(self.folder / EVENTS, [time_s, kind, text]), False), self._most)
+    def event(self, event: SessionEvent, begun_s: float) -> None:
+        """Record an event that begins or is over; `begun_s`: start of the session [s, monotonic clock]."""
+        lasts = event.ended_s == float("inf")
+        duration = "" if lasts else f"{event.ended_s - event.begun_s:.3f}"
+        row = [f"{event.begun_s - begun_s:.3f}", event.kind.value, event.text, duration, event.count]
+        self._put(_Job(lambda: self._append(self.folder / EVENTS, row), False), self._most)
 
     def copy(self, file: Path, name: str) -> None:
         """Copy a file into the session, synchronously."""
@@ -240,6 +245,7 @@ def finish_session(folder: Path) -> bool:
 
     for part in sorted(folder.glob("tare-*")):
         finish_session(part)
+    _merge_events(folder / EVENTS)
     journal, states = folder / RUN / JOURNAL, folder / RUN / STATES
     if not journal.is_file() or not states.is_file():
         return False
@@ -269,6 +275,18 @@ def finish_session(folder: Path) -> bool:
         with suppress(OSError):
             file.unlink()
     return True
+
+
+def _merge_events(file: Path) -> None:
+    """Keep the last row of each event: it was written when it began, and again with duration and count when it was over."""
+    if not file.is_file():
+        return
+    with file.open(newline="", encoding="utf-8") as stream:
+        header, *rows = csv.reader(stream)
+    last = {(row[0], row[1]): row for row in rows if len(row) == len(header)}
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *sorted(last.values(), key=lambda row: float(row[0]))])
+    write_whole(file, text.getvalue().encode())
 
 
 def session_run(folder: str | Path) -> Path:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from threading import Event
+from threading import Event, Lock
 
 import numpy as np
 
@@ -16,26 +16,31 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.files import read_calibration, write_calibration
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
+from femsense.core.text import numbers_text
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.recording_tables import GRAVITY_COLUMNS
-from femsense.live.actuation import Actuation, FrameActuation, columns_of
-from femsense.live.calibrating import Coverage, CoverageLimits, insufficiency
+from femsense.live.actuation import Actuation, FixedActuation, FrameActuation, columns_of
+from femsense.live.calibrating import Coverage, CoverageLimits, MovingInput, insufficiency
 from femsense.live.drift import DriftLimits, DriftWatch
+from femsense.live.events import EventLog, Milestone, Notice
 from femsense.live.feed import CameraFeed
 from femsense.live.figures import Snapshot, Stopwatch
 from femsense.live.frames import StampedFrame
 from femsense.live.growing import GrowingRecording, empty_recording
-from femsense.live.link import LinkState
-from femsense.live.recorder import CALIBRATION, Recorder
+from femsense.live.link import LOST
+from femsense.live.recorder import CALIBRATION, Lost, Recorder
 from femsense.live.senser import Answer, Senser
 from femsense.live.sources.source import SourceInfo
-from femsense.live.watch import Notice
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
 POLL_S = 0.1
-MORE_FRAMES, MOST_CALIBRATIONS = 6, 4
-"""Number of further frames after a calibration that was not accurate enough, and maximum number of calibrations."""
+MOST_CALIBRATIONS = 4
+RECENT_S = 1.0
+"""A state in which there was a contact this long ago is no contact-free reference [s]."""
+STROKE = 0.1
+"""Assumed largest displacement of a cable, as a share of the body's diagonal."""
+ACTUATION = (Notice.ACTUATION_LATE, Notice.ACTUATION_FROZEN, Notice.ACTUATION_AWAY)
 
 
 class Phase(StrEnum):
@@ -94,8 +99,9 @@ class Session:
         self.robot, self.feed, self.options = robot, feed, options or SessionOptions()
         self._scratch, self._on_answer = scratch, on_answer
         self._actuation: Actuation | FrameActuation = actuation or FrameActuation(columns_of(robot))
-        self._stop, self._tare = Event(), Event()
-        self._phase, self._todo, self._notices = Phase.CONNECTING, "", dict[Notice, str]()
+        self.log: EventLog = feed.log
+        self._stop, self._tare, self._tare_anyway, self._accept = Event(), Event(), Event(), Event()
+        self._phase, self._todo = Phase.CONNECTING, ""
         self._columns: tuple[str, ...] = ()
         self._coverage: Coverage | None = None
         self._calibration: Calibration | None = None
@@ -103,14 +109,17 @@ class Session:
         self._lacks = ""
         self._growing: GrowingRecording | None = None
         self._recorder: Recorder | None = None
+        self._recorders: list[Recorder] = []
         self._senser: Senser | None = None
         self._drift = DriftWatch(robot.body.mesh, self.options.drift)
-        self._watch = Stopwatch()
+        self._ages = Stopwatch()
         self._answer: Answer | None = None
         self._taken_s = float("nan")
+        self._touched_s = float("-inf")
+        """Exposure time of the last frame that was not contact-free [s, monotonic clock]."""
         self._used = 0
-        self._folder = self.options.folder
-        self._said: dict[str, str] = {}
+        self._lost_logged = 0
+        self._watching = Lock()
 
     # For other threads
 
@@ -118,16 +127,13 @@ class Session:
         """End the session after the current frame."""
         self._stop.set()
 
-    def tare(self) -> None:
-        """Use the state from the next frame on as contact-free reference."""
-        self._tare.set()
+    def tare(self, *, anyway: bool = False) -> None:
+        """Use the state from the next frame on as contact-free reference; refused during a contact, unless `anyway`."""
+        (self._tare_anyway if anyway else self._tare).set()
 
-    def note(self, notice: Notice, text: str) -> None:
-        """Show a problem outside of the session; an empty text removes it."""
-        if text:
-            self._notices[notice] = text
-        else:
-            self._notices.pop(notice, None)
+    def accept_fixed(self) -> None:
+        """Calibrate although not all inputs have moved."""
+        self._accept.set()
 
     def skipped(self, frame: StampedFrame) -> None:
         """Record a frame that was not used; called by the feed."""
@@ -135,32 +141,48 @@ class Session:
         if recorder is not None:
             recorder.skip(frame, None if not self._columns else self._values(frame))
 
+    def watch(self) -> None:
+        """Log problems of inputs and recording."""
+        with self._watching:
+            found = self._actuation.notices()
+            for kind in ACTUATION:
+                self.log.lasts(kind, found.get(kind, ""))
+            lost, error = self.lost, "" if self._recorder is None else self._recorder.error
+            text = f"{lost.count} frames so far: {error or 'the disk is too slow'}" + (
+                f"; {lost.sensed} of them were processed: a replay differs from there on" if lost.sensed else ""
+            )
+            if error:
+                self.log.lasts(Notice.RECORDING_LOST, text)
+            elif lost.count > self._lost_logged:
+                self.log.happened(Notice.RECORDING_LOST, text, lost.count - self._lost_logged)
+            self._lost_logged = lost.count
+            self.log.tick()
+
+    @property
+    def lost(self) -> Lost:
+        """Number of frames that were not recorded, in all parts."""
+        return Lost(sum(one.lost.sensed for one in self._recorders), sum(one.lost.skipped for one in self._recorders))
+
     def snapshot(self) -> Snapshot:
         """Return the displayed state of the session."""
-        feed, recorder = self.feed, self._recorder
-        notices = {**feed.notices, **self._actuation.notices(), **self._notices}
-        lost = None if recorder is None else recorder.lost
-        if recorder is not None and (recorder.lost.count or recorder.error):
-            text = recorder.error or f"{recorder.lost.count} frames: the disk is too slow"
-            sensed = (
-                f"; {recorder.lost.sensed} of them were processed: a replay differs from there on" if recorder.lost.sensed else ""
-            )
-            notices[Notice.RECORDING_LOST] = text + sensed
-        shown = Snapshot(
+        info, folder = self.feed.info, self.options.folder
+        return Snapshot(
             phase=self._phase,
             todo=self._todo,
-            link=feed.status,
-            camera="" if feed.info is None else feed.info.name,
-            link_speed="" if feed.info is None else feed.info.link,
+            link=self.feed.status,
+            camera="" if info is None else info.name,
+            link_speed="" if info is None else info.link,
             answer=self._answer,
             taken_s=self._taken_s,
-            latency=self._watch.latency(),
-            counts=feed.counts,
+            latency=self._ages.latency(),
+            counts=self.feed.counts,
             used=self._used,
-            notices=notices,
-            recording="" if self._folder is None else str(self._folder),
+            lost=self.lost,
+            notices=tuple(event for event in self.log.recent() if isinstance(event.kind, Notice)),
+            begun_s=self.log.begun_s,
+            recording="" if folder is None else str(folder),
+            parts=tuple(str(one.folder) for one in self._recorders[1:]),
         )
-        return shown if lost is None else replace(shown, lost=lost)
 
     # In the thread of the session
 
@@ -179,7 +201,10 @@ class Session:
     def step(self, timeout_s: float) -> Answer | None:
         """Process the newest frame according to the phase; return the result if it was sensed."""
         frame = self.feed.take(timeout_s)
-        self._log()
+        self.watch()
+        is_asked = self._tare.is_set() or self._tare_anyway.is_set()
+        if is_asked and (frame is not None or self.feed.status.state in LOST):
+            self._asked_to_tare(frame)
         if frame is None or not (frame.raw.images or frame.raw.markers):
             return None
         if self._growing is None:
@@ -189,8 +214,6 @@ class Session:
             self._todo = "waiting for the first inputs of the robot"
             self.skipped(frame)
             return None
-        if self._tare.is_set() and self._phase is Phase.SENSING:
-            self._begin_tare(frame)
         if self._phase is Phase.SENSING:
             return self._sense(frame, values)
         self._collect(frame, values)
@@ -200,8 +223,9 @@ class Session:
         """Stop camera and actuation, and finish what was recorded."""
         self.feed.close()
         self._actuation.close()
+        self.watch()
+        self.log.end()
         if self._recorder is not None:
-            self._log()
             self._recorder.close()
             self._recorder = None
         self._phase, self._todo = Phase.ENDED, "" if self._used else self._todo
@@ -225,36 +249,58 @@ class Session:
         gravity = GRAVITY_COLUMNS[0] in dict(frame.raw.inputs)
         self._columns = (*self._actuation.columns, *(GRAVITY_COLUMNS if gravity else ()))
         kind, zero = _actuation_of(info, options, own=isinstance(self._actuation, FrameActuation))
-        place = self._folder or Path(self._scratch.name)
-        empty = empty_recording(self.robot, info, actuation=kind, actuation_zero=zero, folder=place, gravity=gravity)
+        folder = options.folder if options.folder is None or not self._tares else options.folder / f"tare-{self._tares}"
+        empty = empty_recording(
+            self.robot, info, actuation=kind, actuation_zero=zero, folder=folder or Path(self._scratch.name), gravity=gravity
+        )
         self._growing = GrowingRecording(empty, self._scratch)
-        if self._folder is not None:
+        if folder is None:
+            self.log.write_to(lambda _: None)
+        else:
             about = {"robot": str(self.robot.folder), "camera": self.feed.text, "device": info.name, "link": info.link}
-            self._recorder = Recorder(self._folder, empty, self._columns, about, most_waiting=options.most_waiting)
+            self._recorder = Recorder(folder, empty, self._columns, about, most_waiting=options.most_waiting)
+            self._recorders.append(self._recorder)
+            begun_s, recorder = self.log.begun_s, self._recorder
+            self.log.write_to(lambda event: recorder.event(event, begun_s))
         if self._calibration is None and options.calibration is not None:
             self._calibration = read_calibration(options.calibration)
-        limits = options.coverage
-        if self._calibration is not None:
-            limits = replace(limits, frames=max(1, options.contact_free_frames), wait_s=0.0)
-        moving = () if self._calibration is not None else self._actuation.columns  # with a calibration the inputs need not move
-        self._coverage = Coverage(moving, _largest(self.robot)[: len(moving)], limits)
+        limits, moving = options.coverage, self._moving_inputs(kind)
+        if self._calibration is not None:  # the inputs need not move
+            limits, moving = replace(limits, frames=max(1, options.contact_free_frames), wait_s=0.0), []
+        self._coverage = Coverage(moving, limits)
         self._phase = Phase.COLLECTING
+        self.log.lasts(Notice.CONTACT_FREE, info.contact_free)
+
+    def _moving_inputs(self, kind: str) -> list[MovingInput]:
+        """Return the inputs that have to move before a calibration; constants cannot."""
+        body = self.robot.body
+        if isinstance(self._actuation, FixedActuation):
+            return []
+        stroke_m = STROKE * float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0)))
+        cables = [c.max_tension for c in body.cables] if kind == "tension" else [stroke_m] * len(body.cables)
+        unit = "N" if kind == "tension" else "m"
+        found = [MovingInput(f"cable_{name}", largest, unit) for name, largest in zip(body.cable_names, cables)]
+        return found + [MovingInput(f"chamber_{c.name}", c.max_pressure, "Pa") for c in body.chambers]
 
     def _collect(self, frame: StampedFrame, values: FloatArray) -> None:
         """Keep a frame that adds coverage, and continue when the coverage suffices."""
         coverage, growing = self._coverage, self._growing
         assert coverage is not None and growing is not None
         known = self._calibration is not None
-        told = frame.raw.contact_free is not False and coverage.offer(frame.time_s, values[: len(coverage.columns)])
-        if told:
+        if self._accept.is_set():
+            coverage.accept_fixed()
+        is_kept = frame.raw.contact_free is not False and coverage.offer(frame.time_s, values[: len(coverage.inputs)])
+        if is_kept:
             self._keep(frame, values, contact_free=True)
         else:
             self.skipped(frame)
+        if coverage.suffices:
+            if known or self._calibrate(growing.recording, coverage):
+                self._learn(growing)
+            return
         doing = "touch nothing" if known else "move the cables, touch nothing"
         after = f" (the last calibration did not suffice: {self._lacks})" if self._lacks else ""
-        self._todo = f"{doing}: {coverage.missing}{after}" if coverage.missing else ""
-        if told and coverage.suffices and (known or self._calibrate(growing.recording, coverage)):
-            self._learn(growing)
+        self._todo = f"{doing}: {coverage.missing}{after}"
 
     def _calibrate(self, recording: Recording, coverage: Coverage) -> bool:
         """Calibrate with the frames so far; return whether the result is accurate enough, and require more frames if not.
@@ -271,19 +317,24 @@ class Session:
         if found is not None and not lacks:
             file = write_calibration(found, self._scratch / CALIBRATION)
             self._calibration = read_calibration(file)  # with the digits that a replay reads
-            self._note("calibration", repr(found))
+            frames = numbers_text(recording.frame_numbers.tolist())
+            self.log.happened(Milestone.CALIBRATION, f"from frames {frames}: {found!r}")
             return True
         if self._calibrations >= MOST_CALIBRATIONS:
-            raise DataError(f"no sufficient calibration after {coverage.count} contact-free frames: {lacks}")
+            raise DataError(
+                f"no sufficient calibration after {coverage.count} contact-free frames: {lacks}\n"
+                "  try:      larger movements of all inputs, a camera closer to the robot, or -c with a calibration"
+            )
         self._lacks = lacks
-        self._note("calibration", f"not sufficient: {lacks}")
-        coverage.want_more(MORE_FRAMES)
+        self.log.happened(Milestone.CALIBRATION, f"not sufficient: {lacks}")
+        coverage.want_more()
         self._phase = Phase.COLLECTING
         return False
 
     def _learn(self, growing: GrowingRecording) -> None:
         """Estimate noise and model error from the contact-free frames, and process these frames, as a replay does."""
         self._phase, self._todo = Phase.LEARNING, ""
+        self.log.lasts(Notice.CONTACT_FREE, "")
         assert self._calibration is not None
         if self._recorder is not None:
             self._recorder.copy(write_calibration(self._calibration, self._scratch / CALIBRATION), CALIBRATION)
@@ -292,17 +343,38 @@ class Session:
             self._record(self._senser.sense(growing.recording, k))
         self._phase = Phase.SENSING
 
-    def _begin_tare(self, frame: StampedFrame) -> None:
-        """Begin a new part of the session, with the present state as reference."""
+    def _asked_to_tare(self, frame: StampedFrame | None) -> None:
+        """Begin a new part with the present state as reference, unless there is a contact: the reference would hide its force."""
+        anyway, hidden = self._tare_anyway.is_set(), ""
         self._tare.clear()
+        self._tare_anyway.clear()
+        if frame is None:
+            refusal = "the camera is lost: press t again when its frames arrive"
+        elif self._phase is not Phase.SENSING or self._answer is None:
+            refusal = "nothing is sensed yet: press t again once forces are shown"
+        else:
+            hidden = self._recent_contact(self._answer, frame)
+            advice = "the reference would hide it. Let go of the robot and press t again; T zeroes all the same"
+            refusal = f"{hidden}: {advice}" if hidden and not anyway else ""
+        if frame is None or refusal:
+            self.log.happened(Notice.NOT_ZEROED, refusal)
+            return
         self._tares += 1
-        self._note("tare", f"reference {self._tares}")
-        if self._recorder is not None and self.options.folder is not None:
+        self.log.lasts(Notice.DRIFT, "")
+        self.log.happened(Milestone.ZERO, f"reference {self._tares}" + (f", which hides {hidden}" if hidden else ""))
+        self.log.leave()
+        if self._recorder is not None:
             self._recorder.close()
-            self._folder = self.options.folder / f"tare-{self._tares}"
         self._drift = DriftWatch(self.robot.body.mesh, self.options.drift)
-        self._notices.pop(Notice.DRIFT, None)
         self._begin_part(frame)
+
+    def _recent_contact(self, last: Answer, frame: StampedFrame) -> str:
+        """Return why the last results are not contact-free, in words; empty if they are."""
+        if last.contacts:
+            return f"a contact of {sum(contact.force_n for contact in last.contacts):.2f} N in frame {last.report.frame}"
+        if not last.is_ok:
+            return f"frame {last.report.frame} is not ok ({last.report.status})"
+        return f"a contact less than {RECENT_S:g} s ago" if frame.taken_s - self._touched_s < RECENT_S else ""
 
     # Sensing
 
@@ -319,7 +391,9 @@ class Session:
         answer = self._senser.sense(recording, k)
         now = time.monotonic()
         self._answer, self._taken_s = answer, frame.taken_s
-        self._watch.add(now, now - frame.taken_s)
+        if not answer.is_contact_free:
+            self._touched_s = frame.taken_s
+        self._ages.add(now, now - frame.taken_s)
         self._on_answer(answer, frame.taken_s)
         self._record(answer)
         if answer.is_contact_free and self._drift.is_due(frame.time_s):
@@ -340,25 +414,7 @@ class Session:
             points += [] if cloud is None else [cloud.points @ T[:3, :3].T + T[:3, 3]]
         drift = self._drift.measure(time_s, np.vstack(points), answer.positions) if points else None
         if drift is not None:
-            self.note(Notice.DRIFT, drift.text)
-
-    # Events
-
-    def _note(self, kind: str, text: str) -> None:
-        if self._recorder is not None:
-            self._recorder.event(time.monotonic() - self.feed.begun_s, kind, text)
-
-    def _log(self) -> None:
-        """Record changes of the link and of the problems."""
-        status = self.feed.status
-        reason = f": {status.reason}" if status.reason and status.state is not LinkState.STREAMING else ""
-        now = {"link": f"{status.state.value}{reason}", **{kind.value: text for kind, text in self.snapshot().notices.items()}}
-        for kind, text in now.items():
-            if self._said.get(kind) is None or (kind == "link" and self._said[kind] != text):
-                self._note(kind, text)
-        for kind in self._said.keys() - now.keys():
-            self._note(kind, "over")
-        self._said = now
+            self.log.lasts(Notice.DRIFT, drift.text)
 
 
 def _actuation_of(info: SourceInfo, options: SessionOptions, *, own: bool) -> tuple[str, str]:
@@ -366,9 +422,3 @@ def _actuation_of(info: SourceInfo, options: SessionOptions, *, own: bool) -> tu
     if own and info.actuation is not None:
         return info.actuation, info.actuation_zero
     return options.actuation, options.actuation_zero
-
-
-def _largest(robot: Robot) -> Sequence[float]:
-    """Return the largest value of each input [N] or [Pa]; inf if none is declared."""
-    cables = [cable.max_tension for cable in robot.body.cables]
-    return [*cables, *(getattr(chamber, "max_pressure", np.inf) for chamber in robot.body.chambers)]

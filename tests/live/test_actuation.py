@@ -16,7 +16,7 @@ from streams import within
 from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot
 from femsense.live.actuation import Actuation, ActuationLimits, FrameActuation, ReadActuation, columns_of, make_actuation
-from femsense.live.watch import Notice
+from femsense.live.events import Notice
 from femsense.model.robot import Robot
 from femsense.xr.stream.readings import Reading, Readings
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from live_block import write_watched_block
+from streams import within
 
 from femsense.app.cli import run
 from femsense.app.doctor_cameras import camera_checks
+from femsense.app.live_command import page_of_session, summary_text
+from femsense.core.errors import InputError
 from femsense.live.sources.source import FoundCamera
 from femsense.sensing.run_files import read_run
 
@@ -45,7 +50,8 @@ def test_a_recording_is_replayed_into_a_session_that_every_command_takes(block: 
     done = femsense(*words)
     document = json.loads(done.stdout)
     assert done.returncode == 0 and document["frames_received"] == 15 and document["link"] == "ended", done.stderr
-    assert "broker away" in [notice["kind"] for notice in document["notices"]]
+    assert "broker away" in [event["kind"] for event in document["events"]]
+    assert any("linear tetrahedra make this body too stiff" in text for text in document["warnings"])
     assert "calibrating" in done.stderr and "time-out" not in done.stderr
     assert len(read_run(session / "run").frames) == document["frames_used"]
     assert run(["export", str(session), "-o", str(tmp_path / "robot.glb")]) == 0 and (tmp_path / "robot.glb").is_file()
@@ -64,6 +70,57 @@ def test_wrong_words_are_refused_with_what_to_try(
     assert "the robot has no such input" in capsys.readouterr().err
     assert run(["view", "--live", str(tmp_path)]) == 2
     assert "no session runs there" in capsys.readouterr().err
+
+
+def test_a_session_that_was_killed_is_said_to_have_ended_and_when(block: tuple[Path, Path], tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    words = ["live", str(block[0]), "--camera", f"software:{block[1]}", "-o", str(session)]
+    process = subprocess.Popen([sys.executable, "-m", "femsense", *words], stderr=subprocess.DEVNULL)
+    try:
+        assert within(60.0, (session / "live.json").is_file)
+        url = json.loads((session / "live.json").read_text())["url"]
+        assert page_of_session(session) == url
+    finally:
+        process.kill()
+        process.wait()
+    assert within(60.0, lambda: not (session / "live.json").exists())
+    (session / "live.json").write_text(json.dumps({"url": url}))  # as after a power failure
+    long_ago = datetime.datetime(2024, 3, 1, 12, 30, 5).timestamp()
+    for table in session.rglob("*"):
+        os.utime(table, (long_ago, long_ago))
+    with pytest.raises(InputError) as ended:
+        page_of_session(session)
+    said = str(ended.value)
+    assert "the session has ended" in said and "its last frame at 2024-03-01 12:30:05" in said
+    assert f"femsense view {session} shows what was recorded" in said
+
+
+def test_the_summary_names_every_part_and_every_kind_of_event() -> None:
+    event = {"kind": "stamps jump", "text": "by 100 s", "time_s": 4.0, "duration_s": 1.5, "lasts": False, "count": 3}
+    document = {
+        "frames_received": 90,
+        "frames_used": 60,
+        "frames_skipped": 30,
+        "frames_missed": 4,
+        "frames_dropped": 2,
+        "todo": "",
+        "recording": "here",
+        "parts": ["here/tare-1", "here/tare-2"],
+        "events": [event, event | {"kind": "warm-up", "count": 1}],
+    }
+    assert summary_text(document).splitlines() == [
+        "60 of 90 received frames sensed, 30 skipped",
+        "4 frames missed: this machine was too busy to receive them",
+        "2 frames not delivered by the device or its link",
+        "stamps jump (3 times, last at 4.0 s for 1.5 s): by 100 s",
+        "",
+        "recorded: here",
+        "recorded: here/tare-1",
+        "recorded: here/tare-2",
+        "look at it: femsense view here",
+        "look at it: femsense view here/tare-1",
+        "look at it: femsense view here/tare-2",
+    ]
 
 
 def test_doctor_lists_cameras_their_links_and_what_the_bus_carries() -> None:

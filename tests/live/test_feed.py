@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 
 import pytest
-from live_block import write_watched_block
+from live_block import notices, write_watched_block
 
 from femsense.core.errors import FemsenseError
+from femsense.live.events import Notice
 from femsense.live.feed import CameraFeed, FeedOptions
 from femsense.live.frames import StampedFrame
 from femsense.live.link import LinkLimits, LinkState
-from femsense.live.watch import Notice
 
 LIMITS = LinkLimits(warm_up_s=8.0, time_out_s=0.5, restart_s=0.5, first_retry_s=0.1, longest_retry_s=0.2)
 PATIENCE_S = 18.0
@@ -82,6 +83,26 @@ def test_a_camera_that_is_lost_comes_back_by_itself(recording: Path, fault: str,
     assert numbers == sorted(set(numbers)) and times == sorted(set(times))
 
 
+@pytest.mark.parametrize(("fault", "state"), [("refuse=0+4", LinkState.REFUSED), ("unplug=0+4", LinkState.UNPLUGGED)])
+def test_a_camera_that_fails_from_the_first_attempt_on_recovers_too(recording: Path, fault: str, state: LinkState) -> None:
+    with CameraFeed(f"software:{recording}?{fault}", FeedOptions(link=LIMITS)) as feed:
+        frames, states, _ = watched(feed, lambda frames, _states: len(frames) > 1)
+    assert state in states and states[-1] is LinkState.STREAMING and frames, states
+    assert state in [event.kind for event in feed.log.totals()]
+
+
+def test_a_recording_with_long_pauses_is_no_failing_camera(recording: Path, tmp_path: Path) -> None:
+    slow = tmp_path / "slow"
+    shutil.copytree(recording, slow)
+    head, *rows = (slow / "frames.csv").read_text().splitlines()
+    times = [0.0, 1.9, 3.8, 3.9, 4.0, 4.1, 4.2, 4.3]
+    slower = [",".join([row.split(",")[0], str(time_s), *row.split(",")[2:]]) for row, time_s in zip(rows, times)]
+    (slow / "frames.csv").write_text("\n".join([head, *slower, ""]))
+    with CameraFeed(str(slow), FeedOptions(link=LIMITS)) as feed:
+        frames, states, _ = watched(feed, lambda frames, _states: len(frames) == 3)
+    assert [frame.number for frame in frames] == [0, 1, 2] and LinkState.TIMED_OUT not in states, states
+
+
 def test_a_driver_that_hangs_for_good_is_ended_and_started_anew(recording: Path) -> None:
     limits = LinkLimits(warm_up_s=4.0, time_out_s=0.3, restart_s=0.2, retries=1)
     with CameraFeed(f"software:{recording}?hang=2+600", FeedOptions(link=limits)) as feed:
@@ -105,7 +126,7 @@ def test_a_camera_without_a_first_frame_is_restarted(recording: Path) -> None:
         ("back=3+600", Notice.STAMPS_BACK, "the time mapping restarts"),
         ("jump=3+600", Notice.STAMPS_JUMP, "by 100"),
         ("apart=0+30", Notice.OUT_OF_STEP, "80 ms of a period of 100 ms"),
-        ("drop=3+0.4", Notice.DROPPED, "the device lost"),
+        ("drop=3+0.4", Notice.DROPPED, "not delivered by the device or its link"),
         ("flicker=0+600", Notice.FLICKER, "between 4.0 and 12.0 ms"),
     ],
 )
@@ -115,7 +136,7 @@ def test_what_is_wrong_with_frames_is_said(recording: Path, fault: str, notice: 
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end and not said:
             feed.take(0.05)
-            said = feed.notices.get(notice, "")
+            said = notices(feed.log).get(notice, "")
     assert words in said
 
 

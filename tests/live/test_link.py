@@ -90,6 +90,13 @@ def test_time_in_which_nobody_wants_a_frame_counts_for_nothing() -> None:
     assert not link.tick(51.1) and link.status.state is LinkState.TIMED_OUT
 
 
+def test_a_planned_pause_is_no_loss() -> None:
+    link = streaming()
+    link.longest_wait_s = 5.0
+    assert not link.tick(6.9) and link.status.state is LinkState.STREAMING
+    assert not link.tick(7.1) and link.status.text(7.2).startswith("time-out for 0 s; no frame for 6 s")
+
+
 def test_a_recording_that_is_over_is_no_loss() -> None:
     link = streaming()
     link.feed(LinkEvent.ENDED, 2.0, "over")

@@ -15,17 +15,20 @@ from rich.console import Console
 from femsense.core.arrays import freeze
 from femsense.io.robot_toml import load_robot
 from femsense.live.dashboard import draw, lines
+from femsense.live.events import Notice, SessionEvent
 from femsense.live.feed import FeedCounts
 from femsense.live.figures import Latency, Snapshot, Stopwatch
 from femsense.live.link import LinkState, LinkStatus
 from femsense.live.mcap_sink import McapSink
 from femsense.live.outlet import Outlet, live_document, wrench_bytes
 from femsense.live.senser import Answer
-from femsense.live.watch import Notice
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import read_pose
+
+SLOW = SessionEvent(Notice.SLOW_LINK, "use a USB 3 port", 92.0, float("inf"))
+JUMPS = SessionEvent(Notice.STAMPS_JUMP, "by 100.0 s", 93.0, 96.0, count=2)
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +53,10 @@ def snapshot_of(robot: Robot, state: LinkState = LinkState.STREAMING, reason: st
         answer=answer_of(robot),
         taken_s=99.9,
         latency=Latency(0.05, 0.08, 0.09, 14.2),
-        counts=FeedCounts(100, 40, 3),
+        counts=FeedCounts(100, 40, 2, 3),
         used=57,
-        notices={Notice.SLOW_LINK: "use a USB 3 port"},
+        notices=(SLOW, JUMPS),
+        begun_s=90.0,
         recording="here",
     )
 
@@ -72,9 +76,10 @@ def test_the_terminal_shows_force_interval_age_rates_drops_and_keys(robot: Robot
         "ok, 100 ms ago",
         "50 / 80 / 90 ms",
         "14.2 frames/s",
-        "57 sensed, 40 skipped, 3 dropped",
+        "57 sensed, 40 skipped, 2 missed, 3 not delivered",
         "recorded in here",
-        "slow link: use a USB 3 port",
+        "! slow link (for 8 s): use a USB 3 port",
+        "! stamps jump (4 s ago, 2 times): by 100.0 s",
         "t zero",
         "http://x",
     ):
@@ -88,10 +93,14 @@ def test_a_lost_camera_leaves_the_last_answer_with_its_age(robot: Robot) -> None
 
 def test_lines_say_what_has_changed_once(robot: Robot) -> None:
     before, lost = snapshot_of(robot), snapshot_of(robot, LinkState.UNPLUGGED, "gone")
-    assert list(lines(None, before, 100.0)) == ["sensing", "slow link: use a USB 3 port"]
+    assert list(lines(None, before, 100.0)) == [
+        "sensing",
+        "2.0 s: slow link: use a USB 3 port",
+        "3.0 s: stamps jump: by 100.0 s",
+    ]
     assert list(lines(before, before, 100.0)) == []
-    said = list(lines(before, replace(lost, notices={}), 100.0))
-    assert said[0].startswith("camera: unplugged for 2 s") and said[1] == "slow link: over"
+    said = list(lines(before, replace(lost, notices=(replace(SLOW, ended_s=99.0),)), 100.0))
+    assert said[0].startswith("camera: unplugged for 2 s") and said[1:] == ["9.0 s: slow link: over after 7.0 s"]
 
 
 def test_latencies_are_percentiles_of_the_last_seconds() -> None:
@@ -117,7 +126,8 @@ def test_a_wrench_is_the_sum_of_the_forces_and_their_torque_about_the_origin(rob
 def test_what_is_not_known_is_left_out_of_the_state(robot: Robot) -> None:
     document = live_document(replace(snapshot_of(robot), latency=Latency()), 100.0)
     assert "rate_hz" not in document and document["answer_age_s"] == pytest.approx(0.1)
-    assert document["notices"] == [{"kind": "slow link", "text": "use a USB 3 port"}] and json.dumps(document)
+    slow = {"kind": "slow link", "text": "use a USB 3 port", "time_s": 2.0, "duration_s": 8.0, "lasts": True, "count": 1}
+    assert document["notices"][0] == slow and document["notices"][1]["duration_s"] == 3.0 and json.dumps(document)
 
 
 def test_a_session_streams_poses_forces_and_its_state_and_never_an_old_force_as_new(robot: Robot) -> None:

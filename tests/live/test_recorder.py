@@ -14,8 +14,10 @@ from streams import within
 from femsense.core.errors import InputError
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
+from femsense.live.events import EventLog, Notice
 from femsense.live.frames import Image, ImageKind, Marker, RawFrame, StampedFrame
 from femsense.live.growing import empty_recording
+from femsense.live.link import LinkState
 from femsense.live.recorder import Recorder, write_whole
 from femsense.live.sources.source import SourceInfo
 
@@ -89,12 +91,28 @@ def test_a_disk_that_is_full_ends_the_recording_and_not_the_session(recorder_of)
     recorder.close()
 
 
-def test_events_are_kept_with_their_times(recorder_of) -> None:
+def test_events_are_kept_with_time_duration_and_count_in_one_row_each(recorder_of) -> None:
     recorder = recorder_of()
-    recorder.event(1.5, "link", 'unplugged: "gone", again')
+    log = EventLog(100.0, clock=lambda: 101.5)
+    log.write_to(lambda event: recorder.event(event, log.begun_s))
+    log.lasts(LinkState.UNPLUGGED, 'the device is "gone", again')
+    log.happened(Notice.DROPPED, "2 so far", 2)
+    file = recorder.folder / "events.csv"
+    assert within(5.0, lambda: file.read_text().count("\n") == 3)
+    running = read_rows(file)
+    log.end()
     recorder.close()
-    with (recorder.folder / "events.csv").open(newline="") as stream:
-        assert list(csv.reader(stream)) == [["time_s", "kind", "text"], ["1.5", "link", 'unplugged: "gone", again']]
+    assert running[:2] == [
+        ["time_s", "kind", "text", "duration_s", "count"],
+        ["1.500", "unplugged", 'the device is "gone", again', "", "1"],
+    ]
+    over = ["1.500", "unplugged", 'the device is "gone", again', "0.000", "1"]
+    assert read_rows(file)[1:] == [over, ["1.500", "frames dropped", "2 so far", "0.000", "2"]]
+
+
+def read_rows(file: Path) -> list[list[str]]:
+    with file.open(newline="") as stream:
+        return list(csv.reader(stream))
 
 
 def test_a_session_replaces_nothing(recorder_of) -> None:

@@ -44,6 +44,10 @@ def frame_within(source: FrameSource, seconds: float) -> RawFrame:
 
 
 def test_every_source_of_the_registry_can_be_made(tmp_path: Path) -> None:
+    (tmp_path / "recording.toml").write_text(
+        'format = "femsense-recording-1"\nactuation = "tension"\nactuation_zero = "absolute"\n'
+    )
+    (tmp_path / "frames.csv").write_text("frame,time_s\n0,0.0\n")
     for word in SOURCES:
         assert hasattr(make_source(f"{word}:{tmp_path}"), "newest"), word
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.robot_toml import load_robot
+from femsense.live.events import EventLog
 from femsense.live.frames import Image, ImageKind, RawFrame
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
@@ -67,3 +69,8 @@ def _cloud(robot: Robot, x: np.ndarray, rng: np.random.Generator) -> PointCloud:
 def raw(number: int, stamp_s: float, arrived_s: float, **more: object) -> RawFrame:
     """Return a frame with an image of a few bytes."""
     return RawFrame(number, stamp_s, (Image(ImageKind.DEPTH, b"depth"),), arrived_s=arrived_s, **more)  # type: ignore[arg-type]
+
+
+def notices(log: EventLog) -> dict[StrEnum, str]:
+    """Return the text of each event that is shown."""
+    return {event.kind: event.text for event in log.recent()}

@@ -137,7 +137,7 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
 
     try:
         seen = said(browser)
-        assert "Contact 1" in seen["text"] and "bar-2" in seen["text"] and "live" in seen["text"]
+        assert "Track 0" in seen["text"] and "bar-2" in seen["text"] and "live" in seen["text"]
         within, length = (float(word) for word in seen["clock"].removesuffix(" s").split(" / "))
         assert length == 2.0 and 0.0 <= within <= length  # though it plays over and over
         frame = list(frames_of(run, rate_hz=23 / 2.0, loop=False))[11]
@@ -233,6 +233,12 @@ console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.e
     const day = new Date();
     return [12.34, 86938.2, 125, day.getTime() / 1000].map(clock).concat(day.toLocaleTimeString());
   }),
+  gaps: await page.evaluate(() => {                            // nothing came for three seconds
+    const robot = femsense.shown.robots.get('mute'), first = robot.history[0] ?? robot.newest;
+    robot.history.splice(0, robot.history.length, ...[...Array(41).keys()].filter((k) => k < 11 || k > 30).map((k) => ({ ...first, time_s: 0.1 * k })));
+    femsense.shown.timeline(robot, 4, 4);
+    return [...document.querySelectorAll('#curve .edge')].map((path) => path.getAttribute('d').slice(1).split('L').map((xy) => Number(xy.split(',')[0])));
+  }),
   edges: await page.evaluate(async () => {                     // the picture is pushed aside until the label would be cut
     const { stage, robots } = femsense.shown, { body } = robots.get('bar'), { camera } = stage;
     const arrow = body.arrows.arrows[0], { sprite, canvas } = arrow.label, found = [];
@@ -275,7 +281,7 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
         assert within(5.0, lambda: source.publishers[0].sent > 0)
         source.flowing.clear()
         time.sleep(0.2)
-        source.hub.publish([Message("femsense/bar/status", status_bytes("stale", since_s=time.time() - 100.0))])
+        source.hub.publish([Message("femsense/bar/status", status_bytes("stale", "unplugged for 9 s; reconnect the camera", time.time() - 100.0))])
         known = source.hub.newest()
         mute = {kind: known[f"femsense/bar/{kind}"].payload for kind in ("glb", "model", "pose")}
         mute["model"] = mute["model"].replace(b'"name":"bar"', b'"name":"mute"')
@@ -284,6 +290,8 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
     finally:
         source.close()
     age = float(told["badge"].removeprefix("stale, ").removesuffix(" s old"))
+    assert told["about"] == "unplugged for 9 s; reconnect the camera"
+    assert [(line[0], line[-1]) for line in told["gaps"]] == [(0.0, 250.0), (775.0, 1000.0)]
     assert told["state"] == "stale" and 100.0 <= age < 200.0 and told["live"] == "live"
     assert 40 < float(told["rate"].removeprefix("live, ").removesuffix(" Hz")) < 110  # what is sent: ten times what arrives
     assert told["late"] == pytest.approx([60.0, 60.0], rel=0.05)

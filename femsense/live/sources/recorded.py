@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.core.text import numbers_text
 from femsense.io.recording_folder import load_recording
 from femsense.io.recording_tables import GRAVITY_COLUMNS
 from femsense.live.frames import Image, ImageKind, Marker, RawFrame
 from femsense.live.sources.source import FoundCamera, Loss, Opening, SourceInfo, SourceLost
-from femsense.model.recording import Recording
 
 LARGEST = 1.2
 """Size of a ring slot relative to the largest frame of the recording."""
@@ -27,13 +27,13 @@ class Recorded:
         """Arguments: folder; whether frames are returned on request instead of at their times; whether the recording repeats."""
         self.folder = Path(folder).expanduser()
         self.as_fast_as_possible, self.is_endless = as_fast_as_possible, is_endless
-        self._recording: Recording | None = None
+        self.recording = load_recording(self.folder)
         self._begun_s = 0.0
         self._next = 0
 
     def open(self, opening: Opening) -> SourceInfo:
         """Start the replay at the time since the first opening, or after the last frame received."""
-        recording = self._recording = load_recording(self.folder)
+        recording = self.recording
         if not recording.has_clouds and not recording.has_markers:
             raise InputError("nothing to replay", where=self.folder, found="no clouds and no markers", expected="either")
         self._begun_s = time.monotonic() if math.isnan(opening.begun_s) else opening.begun_s
@@ -48,7 +48,8 @@ class Recorded:
             actuation=recording.actuation,
             actuation_zero=recording.actuation_zero,
             marker_noise_m=recording.marker_noise_m,
-            begun_s=self._begun_s,
+            longest_wait_s=float(steps.max(initial=0.0)),
+            contact_free=self._contact_free(),
             largest_frame=int(LARGEST * max(map(self._size, range(recording.frame_count)))) + (1 << 16),
         )
 
@@ -74,12 +75,6 @@ class Recorded:
         times = self.recording.time_s
         period = float(times[-1] - times[0]) * (1.0 + 1.0 / max(1, len(times) - 1))
         return self._begun_s + float(times[number % len(times)] - times[0]) + number // len(times) * period
-
-    @property
-    def recording(self) -> Recording:
-        """The replayed recording."""
-        assert self._recording is not None, "not open"
-        return self._recording
 
     def frame(self, k: int) -> RawFrame:
         """Return frame k of the recording, 0 … F − 1, as a frame of a camera."""
@@ -110,12 +105,25 @@ class Recorded:
         )
 
     def close(self) -> None:
-        """Release the recording."""
-        self._recording = None
+        """Do nothing: no resources are held."""
 
     def list_devices(self) -> list[FoundCamera]:
         """Return none: recordings are not devices."""
         return []
+
+    def _contact_free(self) -> str:
+        """Return which frames may calibrate, in words. Raises InputError if none may."""
+        free = self.recording.free
+        if free is None:
+            return "the recording has no column `free`: until the calibration, all its frames are taken as contact-free"
+        if not free.any():
+            raise InputError(
+                "no frame is declared contact-free, and a session begins with such frames",
+                where=self.folder / "frames.csv",
+                found="0 in every row of the column `free`",
+                expected="1 where nothing touches the robot",
+            )
+        return f"only frames {numbers_text(self.recording.frame_numbers[free].tolist())}, by the column `free` of the recording"
 
     def _size(self, k: int) -> int:
         files = [*self.recording.cloud_files[k], *self.recording.color_files[k]]

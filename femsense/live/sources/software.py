@@ -63,8 +63,8 @@ class SoftwareCamera:
     def __init__(self, text: str) -> None:
         folder, _, faults = text.partition("?")
         words = parse_qsl(faults, keep_blank_values=True)
-        self._camera = Recorded(folder, is_endless=(ONCE, "") not in words)
         self.faults = tuple(_planned(word, value, text) for word, value in words if word != ONCE)
+        self._camera = Recorded(folder, is_endless=(ONCE, "") not in words)
 
     def open(self, opening: Opening) -> SourceInfo:
         """Start. Raises SourceLost while it is unplugged or refused."""

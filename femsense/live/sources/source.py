@@ -39,7 +39,7 @@ class Opening:
     """Arguments of opening a source."""
 
     begun_s: float = float("nan")
-    """`SourceInfo.begun_s` of the first opening [s]; nan at the first opening."""
+    """Time of the first attempt to open it [s, monotonic clock], from which a replay counts; nan: now."""
     attempt: int = 0
     """0 at the first opening; at later ones a source may reset its device."""
     last_number: int = -1
@@ -68,8 +68,10 @@ class SourceInfo:
     """Kind of the inputs that arrive with frames, "tension" or "displacement"; None: without inputs."""
     actuation_zero: str = "absolute"
     marker_noise_m: float | None = None
-    begun_s: float = float("nan")
-    """Start time of the replay of a recording [s, monotonic clock], kept when it is reopened."""
+    longest_wait_s: float = 0.0
+    """Longest planned time between two frames, as of a recording with pauses [s]; 0: that of a camera."""
+    contact_free: str = ""
+    """Which frames of a recording may calibrate, in words; empty for cameras."""
     largest_frame: int = 1 << 23
     """Maximum size of an encoded frame [bytes]."""
 

@@ -70,6 +70,19 @@ export function frameAt(frames: { time_s: number }[], time: number): number {
   return high >= 0 && Math.abs(frames[high]!.time_s - time) < Math.abs(frames[low]!.time_s - time) ? high : low;
 }
 
+const OUTAGE_S = 0.5;
+const OUTAGE_STEPS = 4;
+
+/** Splits frames at outages: steps longer than OUTAGE_S and OUTAGE_STEPS median steps. */
+export function pieces<T extends { time_s: number }>(frames: T[]): T[][] {
+  const steps = frames.slice(1).map((frame, i) => frame.time_s - frames[i]!.time_s);
+  const median = [...steps].sort((a, b) => a - b)[steps.length >> 1] ?? 0;
+  const longest = Math.max(OUTAGE_S, OUTAGE_STEPS * median);
+  const found: T[][] = [];
+  frames.forEach((frame, i) => (i && steps[i - 1]! <= longest ? found[found.length - 1]!.push(frame) : found.push([frame])));
+  return found;
+}
+
 /** Whether the frame may be wrong, by its status. */
 export function isDoubtful(frame: Frame): boolean {
   return Boolean(frame.status) && frame.status !== "ok";

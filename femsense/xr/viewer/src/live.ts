@@ -203,7 +203,7 @@ class Streams {
 
   /** Updates the panel and the time line. */
   private describe(robot: Robot, state: string): void {
-    element("about").textContent = robot.about();
+    element("about").textContent = robot.reason(state) || robot.about();
     element<HTMLOptionElement>("paint-stress").hidden = !robot.model.field;
     this.legend(element<HTMLSelectElement>("paint").value as Paint);
     element("cloud").hidden = !robot.body?.hasCloud;
@@ -381,6 +381,11 @@ class Robot {
     if (silent || age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
     const hz = this.pace.hz();
     return ["live", hz === null ? "live" : `live, ${Math.round(hz)} Hz`];
+  }
+
+  /** Why it is stale, as far as the sender states it. */
+  reason(state: string): string {
+    return state === "stale" ? this.told.detail : "";
   }
 
   about(): string {

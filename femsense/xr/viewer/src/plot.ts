@@ -1,6 +1,6 @@
 // Forces over time: one line per tracked contact, with a band of ± one standard deviation.
 
-import { timeText, type Frame } from "./data";
+import { pieces, timeText, type Frame } from "./data";
 
 const COLORS = ["#ffb454", "#5fd3c6", "#c69bff", "#ff8a8a", "#9fd35f", "#6db3ff"];
 const LEFT = 54;
@@ -89,17 +89,19 @@ export class Plot {
   }
 }
 
-/** Returns the time intervals in which a contact exists. */
+/** Returns the time intervals in which a contact exists; an outage of the frames ends one. */
 function runsOf(frames: Frame[], track: number): { t: number; n: number; std: number }[][] {
   const runs: { t: number; n: number; std: number }[][] = [];
-  let open = false;
-  for (const frame of frames) {
-    const contact = frame.contacts.find((c) => c.track === track);
-    if (contact) {
-      if (!open) runs.push([]);
-      runs[runs.length - 1]!.push({ t: frame.time_s, n: contact.force_n ?? 0, std: contact.std_n ?? 0 });
+  for (const piece of pieces(frames)) {
+    let open = false;
+    for (const frame of piece) {
+      const contact = frame.contacts.find((c) => c.track === track);
+      if (contact) {
+        if (!open) runs.push([]);
+        runs[runs.length - 1]!.push({ t: frame.time_s, n: contact.force_n ?? 0, std: contact.std_n ?? 0 });
+      }
+      open = contact !== undefined;
     }
-    open = contact !== undefined;
   }
   return runs;
 }

@@ -1,6 +1,6 @@
 // The panel beside the robot: contacts, inputs, and properties of the frame.
 
-import { amount, isDoubtful, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
+import { amount, isDoubtful, newtons, pieces, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
 import { trackColor } from "./plot";
 
 export function element<T extends Element = HTMLElement>(id: string): T {
@@ -28,25 +28,22 @@ export function showFrame(frame: Frame, inputs: Input[], largest: number): void 
   }, "div");
 }
 
-/** Draws the sum of forces over time above the time line. */
+/** Draws the sum of forces over time above the time line, with a gap where frames are missing. */
 export function drawCurve(frames: Frame[], from: number, to: number): void {
-  const total = frames.map(totalForce);
-  const largest = Math.max(...total, 1e-12);
-  const x = (time: number): string => ((1000 * (time - from)) / (to - from || 1)).toFixed(1);
-  const points = frames.map((f, i) => `${x(f.time_s)},${(96 - (92 * total[i]!) / largest).toFixed(1)}`);
-  const svg = element("curve");
-  if (points.length < 2) {
-    svg.replaceChildren();
-    return;
-  }
-  const line = `M${points.join("L")}`;
-  const ends = `L${x(frames[frames.length - 1]!.time_s)},100L${x(frames[0]!.time_s)},100Z`;
-  svg.innerHTML = `<path class="area" d="${line}${ends}"/><path class="edge" d="${line}"/>`;
+  const largest = Math.max(...frames.map(totalForce), 1e-12);
+  const x = (f: Frame): string => ((1000 * (f.time_s - from)) / (to - from || 1)).toFixed(1);
+  const paths = pieces(frames)
+    .filter((piece) => piece.length > 1)
+    .map((piece) => {
+      const line = `M${piece.map((f) => `${x(f)},${(96 - (92 * totalForce(f)) / largest).toFixed(1)}`).join("L")}`;
+      return `<path class="area" d="${line}L${x(piece[piece.length - 1]!)},100L${x(piece[0]!)},100Z"/><path class="edge" d="${line}"/>`;
+    });
+  element("curve").innerHTML = paths.join("");
 }
 
 function showContact(contact: Contact, row: HTMLElement, largest: number): void {
   const name = part(row, "span", "name");
-  name.textContent = `Contact ${contact.contact}`;
+  name.textContent = `Track ${contact.track}`; // the number of a contact in the terminal and in contacts.csv
   name.style.setProperty("--track", trackColor(contact.track)); // as in the plot
   part(row, "span", "value").textContent = newtons(contact.force_n, contact.std_n);
   const share = (value: number): string => `${Math.min(100, (100 * Math.max(0, value)) / largest).toFixed(1)}%`;
