@@ -217,7 +217,7 @@ def _require_memory(pattern: Pattern) -> None:
 def direct_bytes(pattern: Pattern) -> int:
     """Return the memory that the direct factor takes while it is made [bytes]."""
     analysis = pattern.analysis()
-    return 8 * (int(analysis.offset[-1]) + analysis.stack)
+    return 8 * (analysis.factor_entries + analysis.tree.stack)
 
 
 def available_memory() -> float:

@@ -79,7 +79,7 @@ class Expansion:
         self.is_series = body.material.law == "corotational"
         self._lanes = _lanes(body) if self.is_series else None
         self._blocks = np.zeros((len(body.stencil.block_columns), 9), np.float32 if single else np.float64)
-        self._source = np.asarray(body.free_map.source[body.free_map.pattern.analysis().source], dtype=np.int32)
+        self._source = np.asarray(body.free_map.source[body.free_map.pattern.analysis().tree.source], dtype=np.int32)
         self.positions = body.mesh.nodes
         self.factor: Cholesky | None = None
         self.unbalanced = np.zeros_like(self.positions)
