@@ -11,6 +11,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 from femsense.fem.cables import segments
 from femsense.fem.chambers import chamber_volume
+from femsense.fem.newton_equations import NewtonEquations
 from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, kinematic_rows, travel_of
 from femsense.fem.rotated_step import rotated_step
 
@@ -19,22 +20,22 @@ def line_search(
     body: BodyModel,
     loads: Loads,
     state: State,
-    held: npt.NDArray[np.intp],
     here: Internal,
+    equations: NewtonEquations,
     du: FloatArray,
     dT: FloatArray,
-    gap: FloatArray,
-    force: FloatArray,
 ) -> Internal | None:
-    """Backtrack along a Newton step until the potential decreases sufficiently (Armijo); return the internal state there, or None.
+    """Move `state` along a Newton step until the potential decreases sufficiently (Armijo); return the internal forces there,
+    or None where no step length does, and `state` stays.
 
     Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
     """
+    held, gap, force = equations.held, equations.gap, equations.force
     free = body.free_map.dofs
     x0, T0 = state.x, state.T
     step = np.zeros(x0.shape)
     step.reshape(-1)[free] = du
-    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
+    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / equations.lever
     lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: the friction at its bends is a given force
     rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
     lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
@@ -50,7 +51,7 @@ def line_search(
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0 and not state.serves)
+        there = internal(body, state.x, tangent=trial == 0 and not state.borrowed)
         if np.isfinite(there.energy):
             merit = _merit(body, loads, state, held, there, penalty, lost)
             if merit <= base + 1e-4 * length * slope + noise:
