@@ -16,7 +16,7 @@ from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points
 from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil, reshaped
 
 FLAT = 1e-12
-"""Tetrahedra smaller than this times the median one are flat but for rounding."""
+"""A tetrahedron is flat, up to rounding, if its volume is below this share of the median volume."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

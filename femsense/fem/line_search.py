@@ -1,4 +1,4 @@
-"""How far a Newton step may go: as long as the potential falls (Armijo), along elements that turn where the step is long."""
+"""Line search of Newton's method on the potential (Armijo). Long steps are first tried with elements that rotate (`rotated_step`)."""
 
 from __future__ import annotations
 

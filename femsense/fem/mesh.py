@@ -317,12 +317,12 @@ def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatAr
 
 
 ROUNDING = 1e-12
-"""Weights below this are rounding. Their products, in the stiffness of cables,
-would be numbers so small that processors take many times as long for them: factors in single precision took twice the time."""
+"""Smaller weights are rounding errors and become 0. Products of such weights in the stiffness of cables would be denormal numbers, which
+processors handle slowly: factors in single precision took twice the time."""
 ONE_BY_ONE = 16
-"""Up to this number of points, a comparison with every centre is faster than importing SciPy's tree."""
+"""Number of points up to which a comparison with every centre of an element is faster than importing SciPy's tree."""
 AT_ONCE = 4096
-"""Points that are looked for together."""
+"""Number of points that are located together, which limits memory."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,10 @@ def holds_itself(body: BodyModel, state: State) -> bool:
 
 
 def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
-    """Return whether the current stiffness leaves the stability of a balanced state undecided.
+    """Return whether the last factor leaves the stability of a balanced state undecided.
 
-    It does where it was not positive definite, and where it was factorised far from the end. A path from one state to the next is
-    spared the latter (`follows_path`): the next step, which starts with the stiffness of this state, sees it.
+    The factor does so if the stiffness was not positive definite, or if the factor was made far from the final state. The second reason
+    does not count on a path of states (`follows_path`): the solve of the next state begins with the stiffness of this one.
     """
     return state.shifted or (not follows_path and state.factored_at > FAR * loads.tolerance)
 
@@ -39,7 +39,7 @@ def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
 def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:
     """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
 
-    The curvature along it is a difference of forces, so that a false alarm needs more than a factor's perturbed pivot.
+    The curvature along that motion is a difference of forces: a perturbed pivot of a factor alone cannot raise a false alarm.
     """
     here, free = internal(body, state.x), body.free_map.dofs
     equations = equations_at(body, loads, state, here)

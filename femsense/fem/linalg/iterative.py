@@ -37,11 +37,11 @@ from femsense.fem.linalg.symbolic import Analysis, analyse
 TOLERANCE = 1e-10
 """Relative tolerance of the preconditioned residual √(rᵀM⁻¹r)."""
 PROBE = 1e-5
-"""The same of the random right-hand side with which a matrix is tested for being definite."""
+"""Relative tolerance for the random right-hand side by which a matrix is tested for being positive definite."""
 MOST = 300
-"""Iterations for a right-hand side; a matrix that needs more is one for the direct solver."""
+"""Largest number of iterations for a right-hand side; a matrix that needs more goes to the direct solver."""
 RESTARTS = 4
-"""Times that a solution is improved from its true residual, where rounding stopped it before."""
+"""Largest number of restarts from the true residual, after rounding errors have stopped the iteration."""
 
 
 class UnsettledError(Exception):

@@ -29,11 +29,11 @@ from femsense.fem.linalg.simd_code import (
 )
 
 WIDE = 6
-"""Columns of a tile: two nodes."""
+"""Number of columns of a tile: two nodes."""
 REGISTERS = 3 if BYTES == 64 else 2
-"""Registers of rows in a tile."""
+"""Number of registers that hold the rows of a tile."""
 PADDING = 4 * BYTES
-"""Entries beyond the end of a matrix that may be read, and written again as they are."""
+"""Number of entries beyond the end of a matrix that kernels may read, and write back unchanged."""
 
 
 @intrinsic

@@ -1,14 +1,16 @@
 """Follow a body from frame to frame while its inputs move: an equilibrium with a checked error, and its compliance,
 at camera rate.
 
-A frame follows from a state at which the stiffness was factorised some frames ago, as a power series of up to three terms
-(`femsense.fem.realtime.power_series`): two or three solves, no assembly, no factor. Where a series of terms x₁, x₂,
-x₃ is cut off, what is left is below its last term, and that is what is reported; where two terms do, it is what the third is
-expected to be, from the frame before. Where that will soon be more than a small share of the motion, or where the compliance has
-changed too much, a new start is made a little ahead on the way. Where a series fails at once, its sum becomes the start, and the
-first term from there is how far the old series has missed. That is compared with what was reported: where it was more, reports
-grow (`trust`). The compliance is known at the starts, and carried on from them. Where no series settles,
-`solve_equilibrium` takes over.
+The state of a frame is the sum of a power series of up to three terms (`femsense.fem.realtime.power_series`) about an expansion point,
+a state at which the stiffness was factorised some frames ago: two or three solves, no assembly, no factor.
+
+Error. The error of a series that is cut off after x₃ is below |x₃|, which is reported. If two terms are enough, the reported error is the
+expected |x₃|, extrapolated from earlier frames. If a series fails, its sum becomes the new expansion point, and the first term of the new
+series is the true error of the old one. If that exceeds the reported error, later reports grow by a factor (`trust`).
+
+Expansion points. A new expansion point is made a little ahead on the path if the error would soon exceed a small share of the motion, or
+if the compliance has changed too much. The compliance is computed at the expansion points and interpolated between them. If no series
+converges, `solve_equilibrium` takes over.
 """
 
 from __future__ import annotations
@@ -31,29 +33,32 @@ from femsense.fem.mesh import embed_points
 from femsense.fem.realtime.power_series import Expansion, combination
 
 GUESS = 4.0
-"""Where the third term is only expected, from how it grew in frames before, the reported error is so many times that …"""
+"""An error that is extrapolated, because the third term was not computed, is multiplied by this safety factor."""
 FADES = 0.9
-"""… and how it grew counts by so much less with every third term that was seen since."""
+"""Factor by which the remembered growth (third term over the product of the first two) fades with every third term that is computed."""
 SHRINK = 0.5
-"""A term that is more than this share of the one before settles nothing."""
+"""A series has failed if a term is larger than this share of the term before."""
 NEAR = 0.005
-"""The last frames carried on are a start where they missed by less than this share of the motion in the frame before."""
+"""For laws without a series: the extrapolated last frames are the expansion point if the extrapolation missed the last frame by less than
+this share of the motion."""
 CLOSE = 0.03
-"""A start that is made for a frame is this share of the motion from its equilibrium at most."""
-LOOK, AHEAD = 0.25, 0.5
-"""A new start is made where the series would fail this share of a motion farther on, and so much of one ahead on the way."""
+"""Largest distance of an expansion point that is made for a frame from the equilibrium, as a share of the motion."""
+LOOK = 0.25
+"""A new expansion point is made if the series would fail after this share of a further motion."""
+AHEAD = 0.5
+"""Distance of a new expansion point ahead on the path, as a share of the motion."""
 DRIFT = 0.0165
-"""Share by which the compliance may be off where it is carried on from other states."""
+"""Largest relative error of an interpolated compliance."""
 LIBRARY = 16
-"""States at most whose compliance is kept."""
+"""Largest number of states whose compliance is kept."""
 EXPLORED = 0.02
-"""How far a body is bent by each cable, as a share of its size, to learn how the compliance changes."""
+"""Displacement, as a share of the body's size, to which each cable bends it to learn how the compliance changes."""
 SOUND = 1e-5
-"""The stretches of a state are learnt where its error is below this share of the body's size."""
+"""Largest error of a state whose stretches are learnt, as a share of the body's size."""
 MOST = 5
-"""Factorisations a frame, before the full solver takes over."""
+"""Largest number of factorisations in a frame, before the full solver takes over."""
 SINGLE_FROM = 10_000
-"""Unknowns from which on the factor is kept in single precision: the terms forgive its errors."""
+"""Number of unknowns from which on the factor is in single precision: each term corrects the error of the term before."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,9 +68,9 @@ class Tracked:
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     error_m: float
-    """How far any node may be from its equilibrium [m], estimated from how fast the terms shrink."""
+    """Largest distance of a node from its equilibrium [m], estimated from how fast the terms shrink."""
     motion_m: float
-    """How far the farthest node has moved since the frame before [m]."""
+    """Largest displacement of a node since the frame before [m]."""
     residual_n: float
     """Largest unbalanced nodal force before the last term [N]."""
     factorisations: int
@@ -88,14 +93,14 @@ class Tracker:
         """Prepare to track.
 
         Arguments:
-            body: with its weight; cables with friction, chambers and a clamp that gives are for `solve_equilibrium`.
+            body: with its weight; without chambers, friction and a compliant clamp, which only `solve_equilibrium` can treat.
             tolerance: largest error of a frame, as a share of its motion.
-            floor_m: an error that is always small enough, and never undercut by what is reported [m].
+            floor_m: an error that is always small enough; the reported error is at least this [m].
             single: keep the factor in single precision; by default from SINGLE_FROM unknowns on.
-            most_factorisations: so many a frame, before the full solver takes over.
+            most_factorisations: largest number in a frame, before the full solver takes over.
 
         Raises:
-            InputError: the body has what a tracker does not know.
+            InputError: the body has chambers, friction or a compliant clamp.
         """
         if body.chambers or not body.clamp_is_rigid or any(c.friction > 0 for c in body.cables):
             raise InputError(
@@ -116,8 +121,8 @@ class Tracker:
         self._loads = np.zeros_like(body.mesh.nodes)
         self._terms: list[FloatArray] = []  # of the last series
         self._growth = 0.0  # largest recent ratio of the third term to second and first [1/m]
-        self._grown = False  # whether one is known from the start at hand
-        self._learns = False  # whether the next sound state is to be learnt
+        self._grown = False  # whether that ratio is known at the present expansion point
+        self._learns = False  # whether the next state with a small error is to be learnt
         self._columns: dict[bytes, sp.csc_matrix] = {}
         self._known = Known(self.expansion.length)
 
@@ -140,10 +145,9 @@ class Tracker:
         return tracked
 
     def compliance(self, *, points: npt.ArrayLike = (), directions: npt.ArrayLike = ()) -> FloatArray:
-        """Return W as `femsense.compliance` does [m/N], carried on from the states at which it is known.
+        """Return W as `femsense.compliance` does [m/N], interpolated between the expansion points.
 
-        The first call with other points takes longer:
-        the compliance is learnt there with a little more tension in each cable too.
+        The first call with new points takes longer: W is computed with a little more tension in each cable as well.
         """
         if not self._past:
             raise FemsenseError("nothing is tracked yet: call step first")
@@ -165,8 +169,8 @@ class Tracker:
         return np.concatenate([columns, rows[:, 3 * k :]], axis=1)
 
     def _explore(self) -> None:
-        """Learn the compliance at the state at hand and, for each cable, at one with a little more tension:
-        inputs may jitter all ways."""
+        """Learn the compliance at the present state and, for each cable, at a state with a little more tension:
+        inputs may vary in any direction."""
         start, here, T = self.expansion, self._past[-1], self._tension
         self._known = Known(start.length)
         if not start.move(here, T):
@@ -189,7 +193,7 @@ class Tracker:
             raise FemsenseError("the state is unstable: reduce the load")
 
     def _know(self) -> None:
-        """Add the compliance at the start at hand to what is known, unless it is."""
+        """Add the compliance at the expansion point to the known ones, unless it is the newest."""
         start = self.expansion
         if self._known.newest is start.positions:
             return
@@ -199,7 +203,7 @@ class Tracker:
         self._known.add(start.positions, start.sample(start.positions), W, judge=len(self._known.states) > len(self._tension))
 
     def _follow(self, T: FloatArray, loads: FloatArray) -> Tracked | None:
-        """Return the state, None where no series gets there."""
+        """Return the state; None if no series converges."""
         if self.expansion.factor is None:
             return None
         last, carried, anew = self._past[-1], self._carried(), not self.expansion.is_series
@@ -230,7 +234,7 @@ class Tracker:
         return self.expansion.move(x, tension)
 
     def _look_ahead(self, T: FloatArray, motion: float) -> bool:
-        """Begin anew a little ahead on the way, where the series at hand will soon not do; return whether it was so."""
+        """Make a new expansion point a little ahead on the path if the present series will soon fail; return whether it did."""
         start, terms = self.expansion, self._terms
         sizes, x = [_largest(term) for term in terms], start.positions
         if len(terms) < 2:
@@ -249,8 +253,8 @@ class Tracker:
         return max(self._tolerance * motion, self._floor)
 
     def _summed(self, T: FloatArray, loads: FloatArray, last: FloatArray, most: int) -> tuple[FloatArray, float, float]:
-        """Return the sum of a series of so many terms at most, its first term and its error [m],
-        inf where the terms do not shrink."""
+        """Return the sum of a series of up to `most` terms, the size of its first term [m], and its error [m],
+        inf if the terms do not shrink."""
         x, sizes, error, self._terms = self.expansion.positions, list[float](), np.inf, list[FloatArray]()
         for term in islice(self.expansion.terms(T, loads), most):
             sizes.append(_largest(term))
@@ -269,7 +273,7 @@ class Tracker:
         return x, sizes[0], error
 
     def _carried(self) -> FloatArray | None:
-        """Return the last three states carried on as a parabola, None where there are fewer."""
+        """Return the last three states extrapolated by a parabola; None with fewer states."""
         return 3.0 * self._past[2] - 3.0 * self._past[1] + self._past[0] if len(self._past) == 3 else None
 
     def _solve_anew(self, tension: Mapping[str, float], extra: FloatArray) -> Tracked:
@@ -286,17 +290,16 @@ class Tracker:
 
 
 class Known:
-    """The compliance at some states, carried on to others (`combination`), and by how much that may be off."""
+    """The compliance at some states, interpolated at others (`combination`), and the error of the interpolation."""
 
     def __init__(self, length: float) -> None:
-        """Know nothing; `length` [m] is that of `combination`."""
+        """Begin without any state; `length` [m] is the correlation length of `combination`."""
         self.states: list[FloatArray] = []  # samples of positions
         self.newest: FloatArray | None = None
         self._length, self._scale, self._stack = length, 1.0, np.zeros((LIBRARY, 0, 0))
 
     def add(self, x: FloatArray, state: FloatArray, W: FloatArray, *, judge: bool) -> None:
-        """Keep the compliance W at positions x with a sample `state`; with `judge`,
-        learn from it how far the others have missed."""
+        """Keep the compliance W at positions x with a sample `state`; with `judge`, compare W with its interpolation first."""
         if judge:
             weights, doubt = combination(state, self.states, self._length)
             missed = _norm(W - np.tensordot(weights, self._stack[: len(weights)], 1)) / max(_norm(W), 1e-300)
@@ -316,7 +319,7 @@ class Known:
         return np.asarray(np.tensordot(weights, self._stack[: len(weights)], 1))
 
     def doubt(self, state: FloatArray) -> float:
-        """Return by which share W may be off at a state; 0 where nothing is known, since nobody has asked."""
+        """Return the relative error of W at a state; 0 if no compliance is known, because then the caller has not asked for any."""
         return self._scale * combination(state, self.states, self._length)[1] if self.states else 0.0
 
 
