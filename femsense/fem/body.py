@@ -38,16 +38,16 @@ class BodyModel:
     """Dead nodal forces in addition to the weight [N], shape (n, 3)."""
     stencil: Stencil
     cable_slots: tuple[IntArray, ...]
-    """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
+    """Blocks to which the geometric stiffness of each segment is added, one array (s, 2k, 2k) per cable."""
     free_map: FreeMap
     clamp_turn_stiffness: float = np.inf
     """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
     released: list[FreeMap] = field(default_factory=list)
-    """The free map without the clamp, once it has been needed; bodies of one mesh share it."""
+    """The free map without the clamp, after the first use; bodies with the same mesh share this list."""
 
     @property
     def clamp_is_rigid(self) -> bool:
-        """Whether clamped nodes stay where they are."""
+        """Whether clamped nodes cannot move."""
         return bool(np.isinf(self.clamp_stiffness) and np.isinf(self.clamp_turn_stiffness))
 
     @property
@@ -122,7 +122,7 @@ class BodyModel:
         return replace(self, material=material)
 
     def with_stiffness_scale(self, scale: npt.ArrayLike) -> BodyModel:
-        """Return the body with its modulus scaled, by one number or one an element (m,)."""
+        """Return the body with its modulus scaled, by a number or an array (m,)."""
         return replace(
             self, material=replace(self.material, young_modulus=freeze(self.material.young_modulus * np.asarray(scale)))
         )
@@ -210,8 +210,8 @@ def make_body(
 
     Arguments:
         mesh: tet4 or tet10 mesh.
-        young_modulus: [Pa], one or one an element.
-        poisson_ratio: [1], one or one an element.
+        young_modulus: [Pa], a number or an array (m,).
+        poisson_ratio: [1], a number or an array (m,).
         density: [kg/m³].
         law: "corotational", "neo_hookean" or "gent".
         clamped: indices of the clamped nodes, or a mask (n,); see also `BodyModel.with_clamp_nodes`.

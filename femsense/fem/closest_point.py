@@ -159,7 +159,7 @@ def may_hold(corners: FloatArray, points: FloatArray, point: IntArray, candidate
 
 @njit(cache=True, nogil=True)
 def keep_deepest(point: IntArray, candidate: IntArray, depth: FloatArray, best: FloatArray, element: IntArray) -> None:
-    """Write the element that a point is deepest in, of those that hold it, and how deep."""
+    """Write the element in which each point lies deepest, and that depth."""
     for i in range(len(point)):
         if depth[i] >= -1e-9 and depth[i] > best[point[i]]:
             best[point[i]], element[point[i]] = depth[i], candidate[i]
@@ -177,7 +177,7 @@ def carry(
     carrier: IntArray,
     outside: FloatArray,
 ) -> None:
-    """Write `_carriers_of_outsiders`: those of each point are in `candidate` from `start` on."""
+    """Write the result of `_carriers_of_outsiders`. The candidates of point i are candidate[start[i] : start[i + 1]]."""
     off, distance = np.empty(len(candidate)), np.empty(len(candidate))
     for i in range(len(points)):
         p = _vector(points, i)

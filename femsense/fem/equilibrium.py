@@ -100,7 +100,7 @@ class Equilibrium:
     nodal_forces: FloatArray
     """Nodal forces in addition to the body's own dead load [N], shape (n, 3)."""
     factor: Factorization | None
-    """The last factorised stiffness (of the last Newton step but one); a start for nearby solves."""
+    """The last factor of the stiffness, at this state or an earlier iterate; a start for nearby solves."""
 
     def __repr__(self) -> str:
         return (
@@ -216,7 +216,8 @@ class _Attempt(NamedTuple):
 
 
 def _solve(body: BodyModel, loads: Loads, start: Equilibrium | None, options: SolveOptions) -> _Attempt:
-    """Try three ways to the loads, from the fastest to the most robust one, until one leads there. A trial state takes the first only."""
+    """Solve directly; if that fails, in load steps from the start; if that fails, in load steps from rest. A trial state is only solved
+    directly."""
     attempt = _directly(body, loads, start, options)
     if (options.rough and start is not None) or attempt.is_final or not body.is_held():
         return attempt
@@ -235,7 +236,7 @@ def _directly(body: BodyModel, loads: Loads, start: Equilibrium | None, options:
 
 
 def _in_steps_from_start(body: BodyModel, loads: Loads, start: Equilibrium, options: SolveOptions, failed: State) -> _Attempt:
-    """Go from the loads of the start to the wanted ones."""
+    """Go from the loads of the start to the wanted loads."""
     first = _loads_of(body, start, loads)
     state = _initial_state(body, first, start, False, options.along)
     return _step_loads(body, first, loads, state, failed, options.max_iterations)
@@ -244,7 +245,7 @@ def _in_steps_from_start(body: BodyModel, loads: Loads, start: Equilibrium, opti
 def _in_steps_from_rest(
     body: BodyModel, loads: Loads, start: Equilibrium | None, options: SolveOptions, failed: State
 ) -> _Attempt:
-    """Go from no loads at all to the wanted ones; of the start only the friction along its cables remains."""
+    """Go from no loads to the wanted loads. Only the friction along cables is taken from the start."""
     nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
     shares = _initial_state(body, loads, start, False, options.along).shares
     rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
@@ -292,8 +293,13 @@ def _collect_loads(
 def _tolerance(body: BodyModel, forces: FloatArray, pulls: FloatArray, travels: FloatArray, relative_tolerance: float) -> float:
     """Return the largest unbalanced nodal force of an equilibrium [N].
 
-    It is a share of the sum of all loads, plus rounding errors: nodal forces (n, 3) [N], forces of drives [N], and for held drives the
-    forces that their travels [m] cause in a body of typical stiffness.
+    The tolerance is a share of the sum of all loads, plus rounding errors of the internal forces.
+
+    Arguments:
+        forces: dead nodal forces [N], shape (n, 3).
+        pulls: forces of the drives with imposed efforts [N], shape (a + c,).
+        travels: imposed travels as lengths [m], shape (a + c,), which count as the forces that they cause in a body of typical stiffness.
+        relative_tolerance: the share [1].
     """
     size, modulus = body.reach, float(np.median(body.material.young_modulus))
     stiffness = SOFTNESS * modulus * size  # [N/m]
@@ -399,7 +405,7 @@ def _residual(body: BodyModel, loads: Loads, state: State) -> float:
 
 
 def _step_loads(body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int) -> _Attempt:
-    """Go from the first loads to the wanted ones in load steps, which shrink after a failure and grow after a success.
+    """Go from the first loads to the wanted loads in load steps, which shrink after a failure and grow after a success.
 
     Arguments:
         good: the state under the first loads, or near it.

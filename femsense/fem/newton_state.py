@@ -30,7 +30,7 @@ class SolveStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NewtonOptions:
-    """When Newton's method makes a new factor, uses rotated steps, and gives up a trial state. A trial state is one that a search tries."""
+    """When Newton's method makes a new factor, uses rotated steps, and gives up a trial state, which is a state that a search tries."""
 
     patience: int = 3
     """A factor is kept if this number of further steps is enough at the present rate; 0: every step has a new factor."""
@@ -102,9 +102,9 @@ class State:
     residual: float = np.inf
     """Largest unbalanced nodal force [N]."""
     shifted: bool = False
-    """Whether the stiffness was not positive definite where it was last factorised."""
+    """Whether the stiffness was not positive definite at the last factorisation."""
     shift: float = 0.0
-    """Shift that made the stiffness positive definite there [N/m]."""
+    """Shift that made the stiffness positive definite at the last factorisation [N/m]."""
     single: bool = False
     """Whether factors are made in single precision."""
     rough: bool = False
@@ -112,7 +112,7 @@ class State:
     indefinite_steps: int = 0
     """Stiffnesses that were not positive definite."""
     factored_at: float = 0.0
-    """Residual where the stiffness was last factorised [N]."""
+    """Residual at the last factorisation [N]."""
     here: Internal | None = None
     """Internal forces at x."""
     options: NewtonOptions = field(default_factory=NewtonOptions)

@@ -1,4 +1,4 @@
-"""The factor of the stiffness during Newton's method: when a new one is made, how, and what is learnt between two."""
+"""The factor of the stiffness in Newton's method: when and how a new factor is made, and quasi-Newton updates in between."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Secants:
 
 
 class FactorKeeper:
-    """Decides at each Newton step whether the last factor makes this step, or a new one does.
+    """Decides at each Newton step whether the last factor is kept or a new factor is made.
 
     With the residual r (largest unbalanced nodal force) and the length l of the last step (largest displacement), and their ratios q and p
     to those of the step before, a factor is kept if one of these rules holds:
@@ -78,7 +78,7 @@ class FactorKeeper:
         Arguments:
             here: internal forces of the state.
             equations: of the next step.
-            length: of the last step [m]; inf before the first one.
+            length: of the last step [m]; inf before the first step.
             follows: tensions along cables follow friction.
         """
         state, residual, tolerance = self._state, equations.residual, self._loads.tolerance

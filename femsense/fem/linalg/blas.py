@@ -80,8 +80,8 @@ def gemm(
     c: int,
     step_c: int,
 ) -> None:
-    """C (m, n) ← α A (m, k) B (k, n) + β C, with the transpose of what is stored at a or b where these are to turn.
-    `step` is the distance of two columns in memory."""
+    """C (m, n) ← α A (m, k) B (k, n) + β C. If `turn_a` is set, the matrix at `a` is Aᵀ, and likewise for B. `step` is the distance of two
+    columns in memory."""
     numbers, scalars = blas.numbers, blas.scalars
     numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5] = m, n, k, step_a, step_b, step_c
     scalars[0], scalars[1] = alpha, beta

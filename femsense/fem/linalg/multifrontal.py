@@ -40,7 +40,7 @@ def _factor_corner(L: FloatArray, at: int, height: int, columns: int, corner: Fl
 
 @njit(cache=True)
 def _factor_panel(L: FloatArray, start: int, height: int, first: int, last: int, corner: FloatArray) -> bool:
-    """Factorise columns first … last of a panel, those before being done with; False where a pivot is not positive."""
+    """Factorise columns first … last of a panel whose earlier columns are factorised; return False if a pivot is not positive."""
     width = L.itemsize
     for j in range(first, last, WIDE):
         columns, depth = min(WIDE, last - j), j - first

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Solves with a multifrontal factor: one side, a few side by side, many by BLAS, and sparse ones; compiled."""
+"""Solves with a multifrontal factor: for one right-hand side, a few side by side, many by BLAS, and for sparse ones; compiled."""
 
 from __future__ import annotations
 

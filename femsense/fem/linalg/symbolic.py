@@ -20,7 +20,8 @@ class Tree(NamedTuple):
 
     A node has `unit` unknowns (3: a point in space). A supernode is a run of nodes with the same rows below the diagonal. Its columns
     stand as one dense panel in the factor: first its own nodes, then the nodes below. A front is the panel with the update matrix, the
-    part that its elimination subtracts from the nodes below. Arrays called by the beginning of lists have one more entry for the end.
+    part that its elimination subtracts from the nodes below. Arrays of shape (s + 1,) hold the beginning of each supernode's list in another
+    array, and the end of the last list.
     """
 
     unit: int
@@ -88,7 +89,7 @@ def _postorder(parent: IntArray, by_weight: IntArray) -> IntArray:
 
 @njit(cache=True)
 def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
-    """Return the first column of each supernode and the end; small ones are merged with their parents where few zeros result."""
+    """Return the first column of each supernode and the end; a small supernode is merged with its parent if few zeros result."""
     n = len(parent)
     firsts = np.empty(n + 1, np.int64)
     zeros = np.zeros(n + 1, np.float64)
@@ -343,7 +344,7 @@ class Analysis:
 
 
 def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
-    """Analyse the pattern of a symmetric matrix in CSC with sorted indices; its order is taken as one of little fill."""
+    """Analyse the pattern of a symmetric matrix in CSC with sorted indices, whose unknowns are in an order of little fill."""
     unit = 3 if _has_blocks(indptr, indices) else 1
     heads, entries = np.asarray(indptr, np.int64), np.asarray(indices, np.int64)
     counts = np.diff(heads)[::unit] // unit
