@@ -24,11 +24,14 @@ def line_search(
     equations: NewtonEquations,
     du: FloatArray,
     dT: FloatArray,
+    *,
+    tangent: bool,
 ) -> Internal | None:
     """Move `state` along a Newton step until the potential decreases sufficiently (Armijo); return the internal forces there,
     or None where no step length does, and `state` stays.
 
-    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
+    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions. With `tangent`, the tangent stiffness is assembled
+    at the first trial as well, which mostly is the last.
     """
     held, gap, force = equations.held, equations.gap, equations.force
     free = body.free_map.dofs
@@ -51,7 +54,7 @@ def line_search(
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0 and not state.borrowed)
+        there = internal(body, state.x, tangent=trial == 0 and tangent)
         if np.isfinite(there.energy):
             merit = _merit(body, loads, state, held, there, penalty, lost)
             if merit <= base + 1e-4 * length * slope + noise:

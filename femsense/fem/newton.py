@@ -79,7 +79,7 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             return SolveStatus.STALLED
         state.iterations += 1
         length = float(np.abs(du).max(initial=0.0))
-        moved = line_search(body, loads, state, here, equations, du, dT)
+        moved = line_search(body, loads, state, here, equations, du, dT, tangent=keeper.expects_new_factor)
         if moved is not None:
             here = state.here = moved
         elif state.borrowed:  # the step of another state's factor may lead uphill: repeat it with a new factor

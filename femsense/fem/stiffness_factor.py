@@ -17,6 +17,8 @@ FOLLOWING = 0.1
 bends."""
 ARRIVED = 5e-7
 """A trial state has converged after a step shorter than this share of the body's size."""
+PROMISING = 0.1
+"""If the last step reduced the residual below this share, the next step will probably end at a state where the factor is kept."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`Secants`)."""
 
@@ -70,6 +72,9 @@ class FactorKeeper:
     def __init__(self, body: BodyModel, loads: Loads, state: State) -> None:
         self._body, self._loads, self._state = body, loads, state
         self._residual, self._length = float("inf"), float("inf")
+        self.expects_new_factor = True
+        """Whether the state behind the next step will probably need a new factor: its tangent is then assembled with its forces, which takes
+        less time than both apart."""
         self._updated: Secants | None = None
 
     def factor(self, here: Internal, equations: NewtonEquations, length: float, *, follows: bool) -> Secants | None:
@@ -93,6 +98,7 @@ class FactorKeeper:
         if state.factor is None or not any(keeps):
             state.factor, state.borrowed, state.factored_at = factor_here(self._body, here, state, equations), False, residual
             self._updated = None
+        self.expects_new_factor = not (state.borrowed or 0.0 < q <= PROMISING)
         if state.factor is None:
             return None
         updated = self._updated = self._updated or Secants(state.factor)
