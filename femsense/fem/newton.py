@@ -47,17 +47,19 @@ def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
 
 
 def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> SolveStatus:
-    """Find the equilibrium for a fixed set of taut cables, from `state`, which is moved there.
+    """Move `state` to the equilibrium for a fixed set of taut cables.
 
-    If no cable is held, tensions along cables with friction follow the bends in the first steps. They are fixed otherwise.
+    A step changes the node positions by du [m] and the efforts T of held drives by dT (`NewtonEquations`). Tensions along cables with
+    friction follow the bends in the first FOLLOW_FRICTION steps if no drive is held; otherwise they are fixed.
     """
     keeper, length = FactorKeeper(body, loads, state), np.inf
     here = state.here = internal(body, state.x, tangent=not state.borrowed)
     can_follow = any(c.friction > 0 for c in body.cables) and not state.taut.any()
     for iteration in range(max_iterations):
         follows = can_follow and iteration < FOLLOW_FRICTION
-        if follows and (iteration or state.borrowed):  # not at a cold start, where the bends are those of another state
+        if follows and (iteration or state.borrowed):  # at a cold start the bends are still those at rest
             update_friction(body, loads, state)
+        # residual
         equations = equations_at(body, loads, state, here)
         residual = state.residual = equations.residual
         if state.options.watch is not None:
@@ -67,6 +69,7 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
         is_short = state.rough and not follows and length <= ARRIVED * body.reach
         if equations.is_closed and (is_short or residual <= loads.tolerance):
             return SolveStatus.CONVERGED
+        # step
         factor = keeper.factor(here, equations, length, follows=follows)
         if factor is None:
             return SolveStatus.SINGULAR
@@ -79,13 +82,14 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             return SolveStatus.STALLED
         state.iterations += 1
         length = float(np.abs(du).max(initial=0.0))
+        # line search
         moved = line_search(body, loads, state, here, equations, du, dT, tangent=keeper.expects_new_factor)
         if moved is not None:
             here = state.here = moved
         elif state.borrowed:  # the step of another state's factor may lead uphill: repeat it with a new factor
             state.factor = None
+        elif equations.is_closed and residual <= ROUNDING * loads.tolerance:
+            return SolveStatus.CONVERGED
         else:
-            return (
-                SolveStatus.CONVERGED if equations.is_closed and residual <= ROUNDING * loads.tolerance else SolveStatus.STALLED
-            )
+            return SolveStatus.STALLED
     return SolveStatus.ITERATIONS
