@@ -412,8 +412,8 @@ def one_level(data: Path, level: int) -> None:
         least_ms(lambda: cholesky(analysis, values), count),
         least_ms(lambda: factor.solve(right), count),
     )
-    columns = analysis.unit * np.diff(analysis.firsts)
-    heights = columns + analysis.unit * np.diff(analysis.begin)
+    columns = analysis.tree.unit * np.diff(analysis.tree.firsts)
+    heights = columns + analysis.tree.unit * np.diff(analysis.tree.begin)
     work = sum(float((np.arange(h, h - c, -1.0) ** 2).sum()) for c, h in zip(columns, heights))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(

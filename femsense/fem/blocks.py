@@ -21,15 +21,15 @@ def block_mesh(
     keep: Callable[[FloatArray], BoolArray] | None = None,
     place: Callable[[FloatArray], FloatArray] | None = None,
 ) -> TetMesh:
-    """Return the tetrahedra of a grid of blocks, six a cell, always the same ones.
+    """Return the tetrahedra of a grid of blocks, six per cell; the same input gives the same mesh.
 
     Cells are split by Kuhn's rule, mirrored from each cell to the next, so that neighbours fit together and a grid with an even
     number of cells along an axis is its own mirror image across it (a symmetric body bends symmetrically).
 
     Arguments:
-        levels: where the cells begin and end along each of the three axes, rising, any unit.
-        keep: centres of the cells (c, 3) → which of them belong to the body, shape (c,); by default all.
-        place: grid points (n, 3) → where they are [m], (n, 3); by default as they are.
+        levels: coordinates of the cells' sides along each of the three axes, increasing, in any unit.
+        keep: function of the centres of the cells (c, 3); returns whether each cell belongs to the body, shape (c,). Default: all.
+        place: function of the grid points (n, 3); returns the node positions [m], shape (n, 3). Default: the grid points.
 
     Raises:
         InputError: levels that do not rise, or no cell left.

@@ -16,7 +16,7 @@ from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points
 from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil, reshaped
 
 FLAT = 1e-12
-"""Tetrahedra smaller than this times the median one are flat but for rounding."""
+"""A tetrahedron is flat, up to rounding, if its volume is below this share of the median volume."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,17 +42,17 @@ class BodyModel:
     stencil: Stencil
     """Sparsity pattern and shape functions of the elements."""
     cable_slots: tuple[IntArray, ...]
-    """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
+    """Blocks to which the geometric stiffness of each segment is added, one array (s, 2k, 2k) per cable."""
     free_map: FreeMap
     """Map from free to all degrees of freedom."""
     clamp_turn_stiffness: float = np.inf
     """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
     released: list[FreeMap] = field(default_factory=list)
-    """The free map without the clamp, once it has been needed; bodies of one mesh share it."""
+    """The free map without the clamp, after the first use; bodies with the same mesh share this list."""
 
     @property
     def clamp_is_rigid(self) -> bool:
-        """Whether clamped nodes stay where they are."""
+        """Whether clamped nodes cannot move."""
         return bool(np.isinf(self.clamp_stiffness) and np.isinf(self.clamp_turn_stiffness))
 
     @property
@@ -128,7 +128,7 @@ class BodyModel:
         return replace(self, material=material)
 
     def with_stiffness_scale(self, scale: npt.ArrayLike) -> BodyModel:
-        """Return the body with its modulus scaled, by one number or one an element (m,)."""
+        """Return the body with its modulus scaled, by a number or an array (m,)."""
         return replace(
             self, material=replace(self.material, young_modulus=freeze(self.material.young_modulus * np.asarray(scale)))
         )
@@ -216,8 +216,8 @@ def make_body(
 
     Arguments:
         mesh: tet4 or tet10 mesh.
-        young_modulus: [Pa], one or one an element.
-        poisson_ratio: [1], one or one an element.
+        young_modulus: [Pa], a number or an array (m,).
+        poisson_ratio: [1], a number or an array (m,).
         density: [kg/m³].
         law: "corotational", "neo_hookean" or "gent".
         clamped: indices of the clamped nodes, or a mask (n,); see also `BodyModel.with_clamp_nodes`.

@@ -10,10 +10,10 @@ from femsense.core.kernels import njit
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # outward where the volume is positive
 ALIKE, ALIKE_CENTRES = 1e-9, 1e-4
-"""Elements whose distances to a point differ by less, in units of the mesh, are as near, and so are centres of elements:
-the first of them carries it, so that neither rounding nor a step of a derivative by the body's size chooses."""
+"""Two elements (two centres of elements) are equally near to a point if their distances differ by less than this share of the mesh's size.
+The first element then carries the point, so that neither rounding nor a step of a derivative by the body's size decides."""
 NEARLY = 1e-6
-"""Elements outside of which a point is by more, in barycentric coordinates, do not hold it, whatever the rounding."""
+"""Rounding of barycentric coordinates: a point is outside of an element if one of its coordinates is below minus this."""
 Vector = tuple[float, float, float]
 
 
@@ -159,7 +159,7 @@ def may_hold(corners: FloatArray, points: FloatArray, point: IntArray, candidate
 
 @njit(cache=True, nogil=True)
 def keep_deepest(point: IntArray, candidate: IntArray, depth: FloatArray, best: FloatArray, element: IntArray) -> None:
-    """Write the element that a point is deepest in, of those that hold it, and how deep."""
+    """Write the element in which each point lies deepest, and that depth."""
     for i in range(len(point)):
         if depth[i] >= -1e-9 and depth[i] > best[point[i]]:
             best[point[i]], element[point[i]] = depth[i], candidate[i]
@@ -177,7 +177,7 @@ def carry(
     carrier: IntArray,
     outside: FloatArray,
 ) -> None:
-    """Write `_carriers_of_outsiders`: those of each point are in `candidate` from `start` on."""
+    """Write the result of `_carriers_of_outsiders`. The candidates of point i are candidate[start[i] : start[i + 1]]."""
     off, distance = np.empty(len(candidate)), np.empty(len(candidate))
     for i in range(len(points)):
         p = _vector(points, i)

@@ -80,7 +80,7 @@ def _four_rotations(F: FloatArray, R: FloatArray, flat_F: FloatArray, flat_R: Fl
 
 
 STEP = 112
-"""Numbers from one column of the product below to the next: 90 of nine a node, and the ten of the other side from 96 on."""
+"""Distance of two columns of the product in `_factors` [numbers]: nine for each of ten nodes, and ten of the other side from 96 on."""
 
 
 @njit(inline="always")

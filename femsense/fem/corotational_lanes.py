@@ -15,8 +15,8 @@ from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 DEFORMATION, VOLUME, TRACE, SHEAR, PULL, ROOM = (row * LANES for row in (9, 18, 19, 20, 21, 22))
-"""Where the rows of LANES numbers of a point begin, after nine of its rotations: one array,
-so that a compiler sees rows apart from each other."""
+"""Places of the rows of LANES numbers in a quadrature point's array, behind the nine rows of its rotation. With one array a compiler sees
+that rows do not overlap."""
 ROWS = 23
 
 

@@ -1,17 +1,19 @@
-"""Static equilibrium under dead loads, cables and pressures: Newton with the exact tangent, a line search,
-and load steps when needed.
+"""Static equilibrium under dead loads, cables and pressures: Newton's method with the exact tangent, a line search, and load steps
+when needed.
 
 The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the free nodes, where cables pull with given tensions t and
 chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
-chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless asked): it goes slack where T would be
-negative, and taut again where its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
-Friction changes the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they converge.
+chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless `bilateral`): it becomes slack when T would be
+negative, and taut again when its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
+Friction changes the tensions along a cable (`capstan.capstan_tensions`); these are updated in and between Newton solves until they
+converge. `Loads` and `State` (in `newton_state`) name the quantities of cables and chambers: effort, travel, target, lever, shares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +27,9 @@ from femsense.fem.chambers import volume_gradient
 from femsense.fem.linalg.factorization import Factorization
 from femsense.fem.newton import settle
 from femsense.fem.newton_state import (
-    CONVERGED,
     Loads,
     NewtonOptions,
+    SolveStatus,
     State,
     drive_compliance,
     drive_rows,
@@ -36,25 +38,31 @@ from femsense.fem.newton_state import (
 )
 from femsense.fem.stability import can_fall, holds_itself, is_doubtful
 
-SMALLEST_PART = 2e-3
-"""Load steps smaller than this share of the load are stopped early."""
+SMALLEST_STEP = 2e-3
+"""Smallest load step, as a share of the load: a path that needs smaller steps ends as `overload`."""
+SOFTNESS = 1e-2
+"""Stiffness of a body relative to its modulus times its size: the order of magnitude for slender bodies. It converts travels to forces."""
+LEAST_TRAVEL = 1e-6
+"""A load counts at least as the force that moves a body by this share of its size: a body without loads has a tolerance, too."""
+ROUNDING = 1e-13
+"""Rounding errors of the internal forces relative to modulus times size²."""
 ADVICE = {
-    CONVERGED: "the unbalanced force is below its tolerance",
-    "unstable": (
+    SolveStatus.CONVERGED: "the unbalanced force is below its tolerance",
+    SolveStatus.UNSTABLE: (
         "the forces balance, but the slightest disturbance makes the body buckle: (a) add a small force to the side to which "
         "it should go; (b) reduce the load"
     ),
-    "singular": "nothing holds the body: clamp more nodes (three that are not on a line at least)",
-    "stalled": (
+    SolveStatus.SINGULAR: "nothing holds the body: clamp more nodes (three that are not on a line at least)",
+    SolveStatus.STALLED: (
         "no step lowers the energy any further: (a) the load may be beyond buckling; (b) elements may be inverted; try "
         "smaller loads or a better mesh"
     ),
-    "iterations": "Newton did not settle in its iterations: try smaller steps of the inputs, or start from a nearby equilibrium",
-    "cables": (
+    SolveStatus.ITERATIONS: "Newton did not settle in its iterations: try smaller steps of the inputs, or start from a nearby equilibrium",
+    SolveStatus.CABLES: (
         "the held cables and chambers contradict each other, or could not agree on which cables are slack: try other "
         "displacements"
     ),
-    "overload": (
+    SolveStatus.OVERLOAD: (
         "load steps became too small: (a) the body collapses or buckles under this load; (b) a cable has drawn its point to "
         "the next one; reduce the load"
     ),
@@ -77,8 +85,8 @@ class Equilibrium:
     """How much each chamber has grown since rest [m³]."""
     residual_n: float
     """Largest unbalanced nodal force under the whole load [N]."""
-    status: str
-    """"converged", or the reason of the failure (a key of ADVICE)."""
+    status: SolveStatus
+    """`SolveStatus.CONVERGED`, or the reason of the failure; members equal their texts, such as "converged"."""
     iterations: int
     """Number of Newton steps."""
     reached: float
@@ -93,7 +101,7 @@ class Equilibrium:
     nodal_forces: FloatArray
     """Nodal forces in addition to the body's own dead load [N], shape (n, 3)."""
     factor: Factorization | None
-    """The last factorised stiffness (of the last Newton step but one); a start for nearby solves."""
+    """The last factor of the stiffness, at this state or an earlier iterate; a start for nearby solves."""
 
     def __repr__(self) -> str:
         return (
@@ -102,7 +110,7 @@ class Equilibrium:
 
     @property
     def converged(self) -> bool:
-        return self.status == CONVERGED
+        return self.status == SolveStatus.CONVERGED
 
     @property
     def advice(self) -> str:
@@ -115,23 +123,23 @@ class SolveOptions:
     """Options of the solver, and the history of friction."""
 
     before: tuple[FloatArray, ...] | None = None
-    """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
+    """Tensions along the cables before the motion [N], one array (s,) a cable, on which friction depends. None: the tensions of `start`,
+    or 0 without a start."""
     along: tuple[FloatArray, ...] | None = None
-    """Tension of each segment of each cable for a motor tension of 1 [1], kept constant: for user-defined friction laws. Cables with own
-    friction start from it. None: 1 without friction, else the values of the start."""
+    """Tension of each segment of each cable for a motor tension of 1 [1], one array (s,) a cable, kept constant: for user-defined
+    friction laws. A cable with own friction only starts from these values. None: the values of `start` for a cable with friction, else 1."""
     reuse_factor: bool = False
-    """Begin with the factor of the start, for changes so small that its stiffness still serves."""
+    """Begin with the factor of the start, for changes so small that its stiffness is nearly the new one."""
     max_iterations: int = 60
     """Newton steps at each load level."""
     relative_tolerance: float = 1e-9
-    """Of the unbalanced force against the sum of all loads [1]."""
+    """Largest unbalanced force relative to the sum of all loads [1]."""
     rough: bool = False
-    """The state is only tried: factors in single precision,
-    and no way to the loads bit by bit where Newton fails from the start."""
+    """The state is a trial of a search, near `start`: factors in single precision, and no load steps if Newton's method fails."""
     single: bool = False
-    """Factors in single precision wherever these are positive definite; the residual and its tolerance are as ever."""
+    """Factors in single precision if these are positive definite; the residual and its tolerance stay in double precision."""
     newton: NewtonOptions = field(default_factory=NewtonOptions)
-    """When Newton factorises a new stiffness, uses rotated steps, or gives up a trial state."""
+    """When Newton's method makes a new factor, uses rotated steps, or gives up a trial state."""
 
 
 def solve_equilibrium(
@@ -179,33 +187,70 @@ def solve_equilibrium(
     if start is not None:
         _check_start(body, start)
     loads = _collect_loads(body, given, nodal_forces, start, how.before, bilateral, how.relative_tolerance)
-    state = _initial_state(body, loads, start, how.reuse_factor, how.along)
-    rough = how.rough and start is not None
-    state.single, state.rough, state.options = rough or how.single, rough, how.newton
-    shares = [s.copy() for s in state.shares]
-    status, reached = (
-        settle(body, loads, state, min(how.max_iterations, how.newton.steps_tried) if rough else how.max_iterations),
-        1.0,
-    )
-    if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
-        first = _loads_of(body, start, loads)
-        state, status, reached = _step_loads(
-            body, first, loads, _initial_state(body, first, start, False, how.along), state, how.max_iterations
-        )
-    if not rough and status not in (CONVERGED, "singular") and body.is_held():
-        nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
-        rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
-        state, status, reached = _step_loads(body, nothing, loads, rest, state, how.max_iterations)
-    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has changed since the last residual of Newton
+    state, status, reached = _solve(body, loads, start, how)
+    has_friction = any(c.friction > 0 for c in body.cables)
+    if (
+        status is not SolveStatus.CONVERGED or has_friction
+    ):  # the tensions have changed since the last residual of Newton's method
         state.residual = _residual(body, loads, state)
-    if status != CONVERGED:
-        status = status if body.is_held() else "singular"
+    if status is not SolveStatus.CONVERGED:
+        status = status if body.is_held() else SolveStatus.SINGULAR
     elif not body.is_held() and not holds_itself(body, state):
-        status = "singular"
+        status = SolveStatus.SINGULAR
     elif is_doubtful(loads, state, start is not None and start.converged) and can_fall(body, loads, state):
-        status = "unstable"
+        status = SolveStatus.UNSTABLE
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
     return _result(body, state, status, reached, extra)
+
+
+class _Attempt(NamedTuple):
+    """How far an attempt came: a state, how its last Newton solve ended, and which share of the load the state balances."""
+
+    state: State
+    status: SolveStatus
+    reached: float
+
+    @property
+    def is_final(self) -> bool:
+        """Whether load steps would not help."""
+        return self.status in (SolveStatus.CONVERGED, SolveStatus.SINGULAR)
+
+
+def _solve(body: BodyModel, loads: Loads, start: Equilibrium | None, options: SolveOptions) -> _Attempt:
+    """Solve directly; if that fails, in load steps from the start; if that fails, in load steps from rest. A trial state is only solved
+    directly."""
+    attempt = _directly(body, loads, start, options)
+    if (options.rough and start is not None) or attempt.is_final or not body.is_held():
+        return attempt
+    if start is not None and start.converged:
+        attempt = _in_steps_from_start(body, loads, start, options, attempt.state)
+    return attempt if attempt.is_final else _in_steps_from_rest(body, loads, start, options, attempt.state)
+
+
+def _directly(body: BodyModel, loads: Loads, start: Equilibrium | None, options: SolveOptions) -> _Attempt:
+    """Apply all loads at once to the start, or to the body at rest."""
+    state, newton = _initial_state(body, loads, start, options.reuse_factor, options.along), options.newton
+    state.rough = options.rough and start is not None
+    state.single, state.options = state.rough or options.single, newton
+    most = min(options.max_iterations, newton.steps_tried) if state.rough else options.max_iterations
+    return _Attempt(state, settle(body, loads, state, most), 1.0)
+
+
+def _in_steps_from_start(body: BodyModel, loads: Loads, start: Equilibrium, options: SolveOptions, failed: State) -> _Attempt:
+    """Go from the loads of the start to the wanted loads."""
+    first = _loads_of(body, start, loads)
+    state = _initial_state(body, first, start, False, options.along)
+    return _step_loads(body, first, loads, state, failed, options.max_iterations)
+
+
+def _in_steps_from_rest(
+    body: BodyModel, loads: Loads, start: Equilibrium | None, options: SolveOptions, failed: State
+) -> _Attempt:
+    """Go from no loads to the wanted loads. Only the friction along cables is taken from the start."""
+    nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
+    shares = _initial_state(body, loads, start, False, options.along).shares
+    rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
+    return _step_loads(body, nothing, loads, rest, failed, options.max_iterations)
 
 
 def _collect_loads(
@@ -242,11 +287,25 @@ def _collect_loads(
     areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
     lever = np.concatenate([np.ones(len(T)), areas])
     effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
-    reach = body.reach
-    stiffness = float(np.median(body.material.young_modulus)) * reach
-    scale = np.linalg.norm(forces, axis=1).sum() + np.abs(effort) @ lever + (np.abs(target) / lever).sum() * stiffness * 1e-2
-    tolerance = relative_tolerance * max(scale, 1e-6 * stiffness * reach * 1e-2) + 1e-13 * stiffness * reach
-    return Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, float(tolerance))
+    tolerance = _tolerance(body, forces, np.abs(effort) * lever, np.abs(target) / lever, relative_tolerance)
+    return Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, tolerance)
+
+
+def _tolerance(body: BodyModel, forces: FloatArray, pulls: FloatArray, travels: FloatArray, relative_tolerance: float) -> float:
+    """Return the largest unbalanced nodal force of an equilibrium [N].
+
+    The tolerance is a share of the sum of all loads, plus rounding errors of the internal forces.
+
+    Arguments:
+        forces: dead nodal forces [N], shape (n, 3).
+        pulls: forces of the drives with imposed efforts [N], shape (a + c,).
+        travels: imposed travels as lengths [m], shape (a + c,), which count as the forces that they cause in a body of typical stiffness.
+        relative_tolerance: the share [1].
+    """
+    size, modulus = body.reach, float(np.median(body.material.young_modulus))
+    stiffness = SOFTNESS * modulus * size  # [N/m]
+    total = np.linalg.norm(forces, axis=1).sum() + pulls.sum() + stiffness * travels.sum()
+    return float(relative_tolerance * max(total, stiffness * LEAST_TRAVEL * size) + ROUNDING * modulus * size**2)
 
 
 def _drive_values(
@@ -289,7 +348,7 @@ def _check_start(body: BodyModel, start: Equilibrium) -> None:
 
 
 def _loads_of(body: BodyModel, start: Equilibrium, loads: Loads) -> Loads:
-    """Return the loads under which a start was in equilibrium, for drives that are held where these are."""
+    """Return the loads under which a start was in equilibrium, with imposed travels for the same drives as in `loads`."""
     effort = np.array([*start.tension.values(), *start.pressure.values()])
     travel = travel_of(body, start.positions) + drive_compliance(body) * effort
     free = ~loads.controlled
@@ -302,7 +361,7 @@ def _loads_of(body: BodyModel, start: Equilibrium, loads: Loads) -> Loads:
 
 
 def _first_taut(body: BodyModel, loads: Loads) -> BoolArray:
-    """Return which drives are held at first where nothing is known: cables that are paid out are slack at rest."""
+    """Return which held drives carry load at rest, shape (a + c,): all but cables that are paid out."""
     cable = np.arange(len(loads.effort)) < len(body.cables)
     return loads.controlled & (~cable | (loads.target >= 0.0) | loads.bilateral)
 
@@ -327,7 +386,7 @@ def _initial_state(
         motor = start.tension[body.cable_names[i]]
         if motor > 0 and body.cables[i].friction > 0 and along is None:
             shares[i] = tensions / motor
-    far = np.inf if start.status == "unstable" else 0.0  # stability is checked even if nothing moves
+    far = np.inf if start.status == SolveStatus.UNSTABLE else 0.0  # stability is checked even if nothing moves
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
     return State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
 
@@ -346,41 +405,40 @@ def _residual(body: BodyModel, loads: Loads, state: State) -> float:
     return size if np.isfinite(here.energy) and np.isfinite(size) else np.inf
 
 
-def _step_loads(
-    body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int
-) -> tuple[State, str, float]:
-    """Go from the first loads to the wanted ones bit by bit; the steps shrink where Newton fails and grow where it succeeds.
+def _step_loads(body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int) -> _Attempt:
+    """Go from the first loads to the wanted loads in load steps, which shrink after a failure and grow after a success.
 
-    Returns:
-        the last equilibrium on the way, its status, and which share of the way it is.
+    Arguments:
+        good: the state under the first loads, or near it.
+        failed: the state of the attempt before, whose Newton steps count.
     """
     done, step = 0.0, 0.25
     spent, good.indefinite_steps, good.options = failed.iterations, failed.indefinite_steps, failed.options
     status = settle(body, first, good, max_iterations)
-    while status == CONVERGED and done < 1.0:
+    while status is SolveStatus.CONVERGED and done < 1.0:
         part = min(1.0, done + step)
         there, state = loads.part_way(first, part), _copied(good)
         state.T = np.where(loads.controlled, good.T, there.effort)
         status = settle(body, there, state, max_iterations)
         count(equilibria=1)
         spent += state.iterations - good.iterations
-        if status == CONVERGED:
+        if status is SolveStatus.CONVERGED:
             good, done, step = state, part, 1.5 * step
-        elif 0.4 * step >= SMALLEST_PART and spent < good.options.most_steps:
-            status, step = CONVERGED, 0.4 * step
-        else:
-            status = status if status in ("singular", "cables") else "overload"
+        elif 0.4 * step >= SMALLEST_STEP and spent < good.options.most_steps:
+            status, step = SolveStatus.CONVERGED, 0.4 * step
+        elif status not in (SolveStatus.SINGULAR, SolveStatus.CABLES):
+            status = SolveStatus.OVERLOAD
     good.iterations = spent
-    return good, status, done
+    return _Attempt(good, status, done)
 
 
 def _copied(state: State) -> State:
-    """Return a copy that can be moved on without harm to the original, with a factor to come."""
+    """Return a copy of a state without its factor, which Newton's method may move."""
     shares, x = [s.copy() for s in state.shares], state.x.copy()
     return replace(state, x=x, T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False, here=None)
 
 
-def _result(body: BodyModel, state: State, status: str, reached: float, nodal_forces: FloatArray) -> Equilibrium:
+def _result(body: BodyModel, state: State, status: SolveStatus, reached: float, nodal_forces: FloatArray) -> Equilibrium:
     names, a = body.cable_names, len(body.cables)
     travel = travel_of(body, state.x)
     return Equilibrium(

@@ -1,4 +1,4 @@
-"""How far a Newton step may go: as long as the potential falls (Armijo), along elements that turn where the step is long."""
+"""Line search of Newton's method on the potential (Armijo). Long steps are first tried with elements that rotate (`rotated_step`)."""
 
 from __future__ import annotations
 
@@ -11,51 +11,64 @@ from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 from femsense.fem.cables import segments
 from femsense.fem.chambers import chamber_volume
+from femsense.fem.newton_equations import NewtonEquations
 from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, kinematic_rows, travel_of
 from femsense.fem.rotated_step import rotated_step
+
+MOST_TRIALS = 25
+"""Largest number of step lengths that are tried; each is half of the length before."""
+SUFFICIENT = 1e-4
+"""A step is accepted if the potential decreases by this share of the decrease that its slope predicts (Armijo)."""
 
 
 def line_search(
     body: BodyModel,
     loads: Loads,
     state: State,
-    held: npt.NDArray[np.intp],
     here: Internal,
+    equations: NewtonEquations,
     du: FloatArray,
     dT: FloatArray,
-    gap: FloatArray,
-    force: FloatArray,
+    *,
+    tangent: bool,
 ) -> Internal | None:
-    """Backtrack along a Newton step until the potential decreases sufficiently (Armijo); return the internal state there, or None.
+    """Move `state` along a Newton step until the potential decreases sufficiently (Armijo); return the internal forces there,
+    or None where no step length does, and `state` stays.
 
-    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
+    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions. `tangent`: assemble the tangent stiffness at the
+    first trial, which is accepted in most cases.
     """
+    held, gap, force = equations.held, equations.gap, equations.force
     free = body.free_map.dofs
     x0, T0 = state.x, state.T
     step = np.zeros(x0.shape)
     step.reshape(-1)[free] = du
-    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
-    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: the friction at its bends is a given force
+    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / equations.lever
+    # a held cable with friction is no pure constraint: the friction at its bends is a given force, the tension that is lost there
+    lost = np.zeros(len(T0))
     rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
     lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
     base = _merit(body, loads, state, held, here, penalty, lost)
     slope = -float(force @ du)
     if len(held):
         slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
+    # rounding errors of the potential
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
-    length = min(1.0, 0.5 * reach / longest)
+    length = min(1.0, 0.5 * reach / longest)  # no node moves farther than half of the body's size
     turned = rotated_step(body, x0, length * step) if longest > state.options.curved * reach else None
-    for trial in range(25):
+    for trial in range(MOST_TRIALS):
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0 and not state.serves)
+        there = internal(body, state.x, tangent=trial == 0 and tangent)
         if np.isfinite(there.energy):
             merit = _merit(body, loads, state, held, there, penalty, lost)
-            if merit <= base + 1e-4 * length * slope + noise:
+            if merit <= base + SUFFICIENT * length * slope + noise:
                 return there
-        length, turned = (0.5 * length if turned is None else length), None
+        if turned is None:
+            length *= 0.5
+        turned = None  # the same length is tried straight next
     state.x, state.T = x0, T0
     return None
 

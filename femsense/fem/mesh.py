@@ -317,12 +317,12 @@ def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatAr
 
 
 ROUNDING = 1e-12
-"""Weights below this are rounding. Their products, in the stiffness of cables,
-would be numbers so small that processors take many times as long for them: factors in single precision took twice the time."""
+"""Smaller weights are rounding errors and become 0. Products of such weights in the stiffness of cables would be denormal numbers, which
+processors handle slowly: factors in single precision took twice the time."""
 ONE_BY_ONE = 16
-"""Up to this number of points, a comparison with every centre is faster than importing SciPy's tree."""
+"""Number of points up to which a comparison with every centre of an element is faster than importing SciPy's tree."""
 AT_ONCE = 4096
-"""Points that are looked for together."""
+"""Number of points that are located together, which limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,8 +366,8 @@ def _find_holders(mesh: TetMesh, elements: _Elements, points: FloatArray, elemen
 
 
 def _carriers_of_outsiders(elements: _Elements, points: FloatArray, radius: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre,
-    and the distance to it [m]."""
+    """Return the element nearest to each point outside of the mesh, and its distance [m]; of equally near elements, the element with the
+    nearest centre."""
     _, candidate, start = _pairs(_centres_within(elements, points, radius))
     carrier, outside = np.empty(len(points), dtype=np.int64), np.empty(len(points))
     carry(elements.corners, elements.centres, elements.reach, elements.size, freeze(points), candidate, start, carrier, outside)
@@ -375,7 +375,7 @@ def _carriers_of_outsiders(elements: _Elements, points: FloatArray, radius: Floa
 
 
 def _nearest_centres(elements: _Elements, points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return how far the nearest centre is from each point [m], shape (p,), and of which element, shape (p,)."""
+    """Return the distance of the nearest centre of an element from each point [m], shape (p,), and that element, shape (p,)."""
     if len(points) <= ONE_BY_ONE:
         square = [((elements.centres - point) ** 2).sum(axis=1) for point in points]
         nearest = np.array([one.argmin() for one in square], dtype=np.int64)
@@ -393,7 +393,7 @@ def _centres_within(elements: _Elements, points: FloatArray, radius: FloatArray)
 
 
 def _pairs(found: Any) -> tuple[IntArray, IntArray, IntArray]:
-    """Return pairs (point, candidate) of lists of candidates, one a point, and where those of each point begin, with the end."""
+    """Return the pairs (point, candidate) of one list of candidates per point, and where the pairs of each point begin, with the end."""
     count = np.array([len(one) for one in found], dtype=np.int64)
     candidate = np.fromiter(chain.from_iterable(found), np.int64, count.sum())
     return np.repeat(np.arange(len(count)), count), candidate, np.concatenate([[0], np.cumsum(count)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 
@@ -14,27 +15,34 @@ from femsense.fem.cables import cable_forces, shortening
 from femsense.fem.chambers import volume_changes, volume_gradient
 from femsense.fem.linalg.factorization import Factorization
 
-CONVERGED = "converged"
+
+class SolveStatus(StrEnum):
+    """How a solve ended; `ADVICE` of `femsense.fem.equilibrium` has the causes and remedies."""
+
+    CONVERGED = "converged"
+    UNSTABLE = "unstable"
+    SINGULAR = "singular"
+    STALLED = "stalled"
+    ITERATIONS = "iterations"
+    CABLES = "cables"
+    OVERLOAD = "overload"
 
 
 @dataclass(frozen=True, slots=True)
 class NewtonOptions:
-    """When Newton factorises a new stiffness, when it uses rotated steps, and when it gives up a trial state."""
+    """When Newton's method makes a new factor, uses rotated steps, and gives up a trial state, which is a state that a search tries."""
 
-    chord: float = 1e-2
-    """A stiffness serves for another step where the last one left less than this share of the residual,
-    or where two more such steps are enough (unless it was factorised so far off that another one is needed at the end)."""
+    patience: int = 3
+    """A factor is kept if this number of further steps is enough at the present rate; 0: every step has a new factor."""
     curved: float = 1e-3
-    """Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
+    """A step longer than this share of the body is first tried with elements that turn, then straight."""
     patience_tried: int = 8
-    """In single precision a stiffness of a state that is only tried serves where so many more steps are enough if each leaves the
-    share that the last one left: about what a factor takes."""
+    """The same number for a trial state, whose steps are in single precision."""
     steps_tried: int = 30
-    """Newton steps of a state that is only tried."""
+    """Newton steps of a trial state."""
     indefinite_tried: int = 6
-    """Stiffnesses of such a state that are indefinite: it is too far off where it meets more.
-    Bodies that fold meet 8 to 11 of these in their 30 steps,
-    those that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
+    """Indefinite stiffnesses of a trial state, before it is given up. Bodies that fold meet 8 to 11 of these in their 30 steps,
+    bodies that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
     most_steps: int = 1500
     """Newton steps of a state in all, load steps included."""
     watch: Callable[[float], None] | None = None
@@ -43,19 +51,31 @@ class NewtonOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Loads:
-    """The drives of the body (cables, then chambers: a + c)."""
+    """Dead loads and drives of a body. The drives are its a cables, then its c chambers.
 
-    forces: FloatArray  # dead nodal forces [N], (n, 3)
-    effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
-    target: FloatArray  # imposed shortening [m] or growth [m³] of held drives, (a + c,)
-    controlled: BoolArray  # whether the travel is imposed, (a + c,)
-    lever: FloatArray  # effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], (a + c,)
+    The effort of a drive is the tension of a cable [N] or the pressure of a chamber [Pa]; its travel is the shortening of a cable [m] or
+    the growth of a chamber [m³] since rest. Either is imposed; a drive with an imposed travel is called held.
+    """
+
+    forces: FloatArray
+    """Dead nodal forces [N], shape (n, 3)."""
+    effort: FloatArray
+    """Imposed efforts, 0 for held drives, shape (a + c,)."""
+    target: FloatArray
+    """Imposed travels, 0 for other drives, shape (a + c,)."""
+    controlled: BoolArray
+    """Whether the travel is imposed, shape (a + c,)."""
+    lever: FloatArray
+    """Effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], shape (a + c,)."""
     bilateral: bool
-    before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
-    tolerance: float  # of the residual [N]
+    """Whether held cables may push."""
+    before: tuple[FloatArray, ...]
+    """Tensions along each cable before the motion [N], for friction."""
+    tolerance: float
+    """Of the residual [N]."""
 
     def part_way(self, first: Loads, part: float) -> Loads:
-        """Return the loads on the straight way from the first ones (part 0) to these (part 1)."""
+        """Return the loads on the straight way from other loads (part 0) to these loads (part 1)."""
         mixed = {
             name: (1.0 - part) * getattr(first, name) + part * getattr(self, name) for name in ("forces", "effort", "target")
         }
@@ -66,22 +86,35 @@ class Loads:
 class State:
     """State of the Newton iteration."""
 
-    x: FloatArray  # (n, 3)
-    T: FloatArray  # motor tensions [N], then pressures [Pa], (a + c,)
-    taut: BoolArray  # held cables that carry load, and held chambers, (a + c,)
-    shares: list[FloatArray]  # segment tension / motor tension
+    x: FloatArray
+    """Node positions [m], shape (n, 3)."""
+    T: FloatArray
+    """Efforts: motor tensions [N], then pressures [Pa], shape (a + c,)."""
+    taut: BoolArray
+    """Whether a drive is held and carries load; chambers that are held always do, shape (a + c,)."""
+    shares: list[FloatArray]
+    """Tension of each segment of each cable relative to the motor tension [1]: below or above 1 by friction."""
     factor: Factorization | None = None
-    borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
+    """The last factor of the stiffness."""
+    borrowed: bool = False
+    """Whether the factor was made at another state."""
     iterations: int = 0
     residual: float = np.inf
-    shifted: bool = False  # the stiffness was not positive definite where it was last factorised
-    shift: float = 0.0  # shift that made the stiffness positive definite there [N/m]
-    single: bool = False  # factors in single precision
-    rough: bool = False  # a trial state
+    """Largest unbalanced nodal force [N]."""
+    shifted: bool = False
+    """Whether the stiffness was not positive definite at the last factorisation."""
+    shift: float = 0.0
+    """Shift that made the stiffness positive definite at the last factorisation [N/m]."""
+    single: bool = False
+    """Whether factors are made in single precision."""
+    rough: bool = False
+    """Whether the state is a trial of a search: it converges by the length of a step as well, and is given up early."""
     indefinite_steps: int = 0
-    factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
-    here: Internal | None = None  # last residual of Newton, at x
-    serves: bool = False  # the factor is likely to serve for the step after this one
+    """Stiffnesses that were not positive definite."""
+    factored_at: float = 0.0
+    """Residual at the last factorisation [N]."""
+    here: Internal | None = None
+    """Internal forces at x."""
     options: NewtonOptions = field(default_factory=NewtonOptions)
 
 

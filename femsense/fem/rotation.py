@@ -12,7 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.kernels import njit
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
-"""Rounding may differ; infinities and NaN are kept."""
+"""Fast-math flags of LLVM that change rounding only: infinities and NaN are kept."""
 
 
 @njit(cache=True)

@@ -75,7 +75,7 @@ def _cut_triangles(corners: FloatArray, height: FloatArray) -> tuple[FloatArray,
 
 
 def _nearest_part(mesh: TetMesh, tets: IntArray, point: FloatArray) -> IntArray:
-    """Return which of these tetrahedra hang together with the one nearest to a point."""
+    """Return the tetrahedra that are connected with the tetrahedron nearest to a point."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""Which held cables are slack, and where friction lets the tensions along cables rest."""
+"""Updates between Newton steps: which held cables are slack, and the tensions along cables with friction."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from femsense.fem.newton_state import Loads, State, travel_of
 
 
 def let_go(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Let go the held cable that is shortest against its command, where held cables contradict each other;
-    False where none may go."""
+    """Make one of several contradicting held cables slack: the one that exceeds its imposed shortening most. Return whether there was one."""
     cable = np.arange(len(state.T)) < len(body.cables)
     candidates = np.flatnonzero(state.taut & cable)
     if loads.bilateral or not len(candidates):
@@ -42,7 +41,7 @@ def update_slack(body: BodyModel, loads: Loads, state: State) -> bool:
 
 
 def update_friction(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Move the tensions along the cables to where friction lets them rest; return whether they rested already."""
+    """Update the tensions along cables by capstan friction; return whether they were in equilibrium with the bends already."""
     still = True
     for i, cable in enumerate(body.cables):
         if cable.friction == 0:

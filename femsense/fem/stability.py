@@ -10,9 +10,12 @@ from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linalg.factorization import factorize
-from femsense.fem.newton import FAR, bordered_step, factor_here, stiffness_blocks
-from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, unbalanced_force
+from femsense.fem.newton_equations import equations_at
+from femsense.fem.newton_state import Loads, State, drive_rows, unbalanced_force
+from femsense.fem.stiffness_factor import factor_here, stiffness_blocks
 
+FAR = 1e6
+"""A stiffness factorised at a residual above this multiple of the tolerance does not decide the stability of the final state."""
 FALL_ITERATIONS = 30
 """Inverse iterations towards the softest motion of a state that may be unstable."""
 
@@ -41,17 +44,17 @@ def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
 def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:
     """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
 
-    The curvature along it is a difference of forces, so that a false alarm needs more than a factor's perturbed pivot.
+    The curvature along that motion is a difference of forces: a perturbed pivot of a factor alone cannot raise a false alarm.
     """
-    held = np.flatnonzero(state.taut)
-    rows, free = drive_rows(body, state), body.free_map.dofs
-    H, stretch, lever = rows[held][:, free], drive_compliance(body)[held], loads.lever[held]
-    factor = factor_here(body, internal(body, state.x), state, H, H, stretch, lever)
+    here, free = internal(body, state.x), body.free_map.dofs
+    equations = equations_at(body, loads, state, here)
+    equations = replace(equations, H=equations.C, gap=np.zeros(len(equations.held)))  # a self-adjoint problem without friction
+    factor = factor_here(body, here, state, equations)
     if factor is None or not state.shifted:
         return False
     motion = np.random.default_rng(0).standard_normal(len(free))
     for _ in range(FALL_ITERATIONS):
-        motion, _ = bordered_step(factor, motion, np.zeros(len(held)), H, H, stretch, lever)
+        motion, _ = replace(equations, force=motion).step(factor)
         motion /= np.abs(motion).max()
     step = np.zeros(state.x.size)
     step[free] = 1e-6 * body.reach * motion

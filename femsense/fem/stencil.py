@@ -34,8 +34,8 @@ class Lanes:
 class Stencil:
     """Gradients, volumes and block pattern of a mesh.
 
-    The stiffness is symmetric: only its 3×3 blocks of nodes i ≤ j are kept. A block array has one row more than there are
-    such pairs, the last one; there goes what is added to the other half, and nobody reads it.
+    The stiffness is symmetric: only its 3×3 blocks of nodes i ≤ j are kept. A block array has one more row, at the end. Blocks i > j are added
+    to that row, which is never read.
     """
 
     tets: IntArray
@@ -122,7 +122,7 @@ def _geometry(mesh: TetMesh) -> tuple[IntArray, FloatArray, FloatArray, FloatArr
 
 
 def in_lanes(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return what belongs to elements (m, …) in groups, shape (g, …, LANES); the first element fills the last group up."""
+    """Return values of elements, shape (m, …), in groups, shape (g, …, LANES); copies of the first element fill the last group."""
     count = len(values)
     groups = -(-count // LANES)
     which = np.concatenate([np.arange(count), np.zeros(groups * LANES - count, dtype=np.int64)])

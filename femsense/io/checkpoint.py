@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, TypeVar
 from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.factorization import Pattern
-from femsense.fem.linalg.symbolic import Analysis
+from femsense.fem.linalg.symbolic import Analysis, Pool
 from femsense.fem.stencil import FreeMap
 from femsense.io.files import PART_PREFIX, json_text, write_beside
 from femsense.model.effects import Effect
@@ -33,7 +33,7 @@ DIGEST = 32
 """Number of bytes at the beginning of the file that identify the inputs of the computation."""
 NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
     Equilibrium: ("factor", lambda: None),
-    Analysis: ("idle", dict),
+    Analysis: ("pool", Pool),
     Pattern: ("idle", list),
     FreeMap: ("laplacian", list),
 }

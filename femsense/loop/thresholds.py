@@ -37,18 +37,19 @@ class Thresholds:
 
     # --- discretisation ----------------------------------------------------------------------------------------------------------
     mesh_share: float = 0.7
-    """Standard deviation of the share of the discretisation error that is common to all sweeps …"""
+    """Standard deviation of the share of the discretisation error that is common to all sweeps."""
     mesh_varies: float = 0.25
-    """… of the share that each sweep adds …"""
+    """Standard deviation of the share of the discretisation error that each sweep adds."""
     mesh_turns: float = 0.07
-    """… and of the entries of a matrix that rotates and stretches the error."""
+    """Standard deviation of the entries of a matrix that rotates and stretches the discretisation error."""
 
     # --- values that calibration fits --------------------------------------------------------------------------------------------
     significant: float = 3.0
-    """Number of standard deviations from the declared value to be reported; and ratio to the median marker offset to count as a single outlier."""
+    """A value is reported if it deviates from the declared one by more than this number of standard deviations and by `relevant`. A marker whose
+    offset is this multiple of the median offset counts as a single outlier."""
     relevant: float = 0.02
-    """… and minimum deviation, as a share of the value, of a cable's range, or of the body's reach: upper limit of a noise that was not measured, and of the
-    distance of a fitted place from the body; 0: no criterion."""
+    """Minimum deviation of a reported value, as a share of the value, of a cable's range, or of the body's reach. As a share of the reach, also the
+    upper limit of a noise that was not measured, and of the distance of a fitted place from the body; 0: no criterion."""
 
     # --- verdict -----------------------------------------------------------------------------------------------------------------
     explained: float = 0.8
@@ -63,9 +64,9 @@ class Thresholds:
 
     # --- data ----------------------------------------------------------------------------------------------------------------------
     outlying: float = 4.0
-    """A measurement is an outlier beyond this multiple of the 90 % quantile; inf: no outliers …"""
+    """A measurement is an outlier if its residual exceeds this multiple of the 90 % quantile and the limit `far_off`; inf: no outliers."""
     far_off: float = 0.05
-    """… and beyond this share of the body's reach."""
+    """Smallest residual of an outlier, as a share of the body's reach; see `outlying`."""
     rare: float = 0.02
     """If more than this share of the measurements would be outliers, none is removed: such a deviation is systematic."""
     states: int = 5

@@ -30,14 +30,14 @@ class ForceEstimate:
     nuisance: FloatArray
     """Factors of the nuisance columns, shape [k]."""
     covariance: FloatArray
-    """Of the forces [N²], shape [f, f]: 0 for a force held by a bound,
-    inf on the diagonal (0 beside it) for one that no row sees."""
+    """Covariance of the forces [N²], shape [f, f]: 0 for a force at an active bound; for a force that no row depends on, inf on the
+    diagonal and 0 off the diagonal."""
     std: FloatArray
-    """Square root of its diagonal [N], shape [f]."""
+    """Standard deviation of each force [N], shape [f]."""
     held: BoolArray
-    """Forces that a bound or the constraints fix alone: their std is 0 and says nothing, shape [f]."""
+    """Whether a force is determined by bounds or constraints alone, shape [f]: its std is then 0, which is no measure of its error."""
     residual: FloatArray
-    """What is left of each row: modelled − observed [m], shape [r]."""
+    """Residual of each row: modelled − observed [m], shape [r]."""
     reduced_chi2: float
     """Weighted squares of the residual per degree of freedom, about 1 where std is right; NaN without degrees of freedom."""
     certificate: Solution
@@ -45,7 +45,7 @@ class ForceEstimate:
 
     @property
     def status(self) -> str:
-        """`solved`, or what happened."""
+        """`solved`, or the reason of the failure."""
         return str(self.certificate.status)
 
 
@@ -187,7 +187,7 @@ def _covariance(P: FloatArray, H: FloatArray, Z: FloatArray, forces: slice) -> t
 def _reduced_chi2(
     W: FloatArray, weights: FloatArray, residual: FloatArray, prior: FloatArray, x: FloatArray, Z: FloatArray
 ) -> float:
-    """Return the weighted squares per degree of freedom, where each prior counts as one more row; NaN without freedom."""
+    """Return the weighted sum of squares per degree of freedom, each prior being one more row; NaN without degrees of freedom."""
     rows = np.vstack([np.sqrt(weights)[:, None] * W, np.diag(np.sqrt(prior))[prior > 0.0]])
     used = int((weights > 0.0).sum() + (prior > 0.0).sum())
     freedom = used - (int(np.linalg.matrix_rank(rows @ Z)) if Z.shape[1] else 0)
@@ -195,8 +195,7 @@ def _reduced_chi2(
 
 
 def _times(covariance: FloatArray, factor: float) -> FloatArray:
-    """Return the covariance times a factor; where the factor is unknown every force that is not held is uncertain without
-    limit."""
+    """Return the covariance times a factor; if the factor is unknown (NaN), the variance of every force that is not held is inf."""
     if np.isfinite(factor):
         return np.where(np.isinf(covariance), covariance, covariance * factor)
     return np.diag(np.where(np.diag(covariance) > 0.0, np.inf, 0.0))

@@ -74,16 +74,16 @@ class Multipliers:
     """Lagrange multipliers of a problem."""
 
     z: FloatArray
-    """Of G x ≤ h, ≥ 0, shape [m]."""
+    """Multipliers of G x ≤ h, ≥ 0, shape [m]."""
     y: FloatArray
-    """Of A x = b, shape [k]."""
+    """Multipliers of A x = b, shape [k]."""
     z_box: FloatArray
-    """Of the bounds, shape [n]: ≤ 0 where the lower one acts, ≥ 0 where the upper one does."""
+    """Multipliers of the bounds, shape [n]: ≤ 0 at an active lower bound, ≥ 0 at an active upper bound."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Residuals:
-    """How far an answer is from the conditions of Karush, Kuhn and Tucker; inf where there is no answer."""
+    """Residuals of the conditions of Karush, Kuhn and Tucker; inf without an answer."""
 
     primal: float
     """Largest violation of a constraint [units of x and of the rows]."""
@@ -95,18 +95,18 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ForceOptions:
-    """What is known of the unknowns of the force problem: inputs, bounds and priors."""
+    """Inputs, bounds and priors of the force problem."""
 
     cable_inputs: npt.ArrayLike | None = None
-    """Measured tensions [N], shape (a,); with neither these nor displacements the tensions are unknowns."""
+    """Measured tensions [N], shape (a,). Without measured tensions or displacements, the tensions are unknowns."""
     cable_displacements: npt.ArrayLike | None = None
-    """Measured displacements [m], shape (a,); they need W_aa, W_af and delta_a_free."""
+    """Measured displacements of the cables [m], shape (a,); require W_aa, W_af and delta_a_free."""
     W_aa: npt.ArrayLike | None = None
     """Displacement of the cables per tension [m/N], shape (a, a)."""
     W_af: npt.ArrayLike | None = None
     """Displacement of the cables per force [m/N], shape (a, f)."""
     delta_a_free: npt.ArrayLike | None = None
-    """Displacement of the cables without these forces [m], shape (a,)."""
+    """Displacement of the cables without tensions and contact forces [m], shape (a,)."""
     force_lower: npt.ArrayLike | None = None
     """Bounds of the forces [N]: a number, (f,), or (f/3, 3)."""
     force_upper: npt.ArrayLike | None = None
@@ -118,9 +118,9 @@ class ForceOptions:
     ridge: float = 0.0
     """Price of force [objective / N²]: 1/σ² for forces expected to be about σ."""
     nuisance: npt.ArrayLike | None = None
-    """Further columns that may move the rows, shape (r, k); their factors are unknowns."""
+    """Columns of k nuisance parameters, shape (r, k); their factors are further unknowns."""
     nuisance_std: npt.ArrayLike | None = None
-    """Standard deviations of these factors, shape (k,); inf leaves them free; 1 where not given."""
+    """Prior standard deviations of the factors of `nuisance`, shape (k,); inf: no prior. Default 1."""
 
 
 def build_force_problem(
@@ -178,9 +178,9 @@ def build_force_problem(
 
 
 def kkt_residuals(problem: Problem, x: FloatArray | None, multipliers: Multipliers | None) -> Residuals:
-    """Return how far an answer is from optimal: primal, dual and gap, inf for an answer that is missing or not finite.
+    """Return the residuals of the optimality conditions; inf for an answer that is missing or not finite.
 
-    The three vanish exactly where x is optimal (the problem being convex). Units as in `Residuals`.
+    Primal residual, dual residual and gap are all zero if and only if x is optimal, because the problem is convex.
     """
     P, q, G, h, A, b, lb, ub = problem.parts()
     if x is None or multipliers is None:
@@ -321,6 +321,7 @@ def _actuation(
 
 
 def _bound_work(bounds: FloatArray, multipliers: FloatArray) -> float:
-    """Return Σ bound · multiplier, where an absent bound with multiplier zero counts as zero and any other as inf."""
+    """Return Σ bound · multiplier over the nonzero multipliers: an absent bound (±inf) then contributes nothing, and an absent bound with
+    a nonzero multiplier makes the sum infinite."""
     acting = multipliers != 0.0
     return float(bounds[acting] @ multipliers[acting])

@@ -1,8 +1,8 @@
 """Solving a quadratic problem, with a certificate.
 
-The problem is scaled first: unknowns to unit curvature, rows to unit length, the gradient to one. Newtons over compliances of
-1e-3 m/N would otherwise meet absolute tolerances made for numbers of order one. An answer counts only when its own residuals are
-small; otherwise the next solver tries.
+The problem is scaled first: unknowns to unit curvature, rows to unit length, the gradient to one, because the solvers' absolute tolerances
+are made for numbers of order one, and compliances are of the order of 1e-3 m/N. An answer is accepted only if its residuals are small;
+otherwise the next solver is called.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _OPTIONS: dict[str, dict[str, float | int | bool]] = {
 
 
 class Status(StrEnum):
-    """What came out, why, and what to try."""
+    """How a solve ended, with its cause and remedy."""
 
     SOLVED = "solved"
     INFEASIBLE = "infeasible"
@@ -37,12 +37,12 @@ class Status(StrEnum):
 
     @property
     def cause(self) -> str:
-        """Why this status came out."""
+        """Cause of the status."""
         return _TEXTS[self][0]
 
     @property
     def advice(self) -> str:
-        """What to try."""
+        """Remedy."""
         return _TEXTS[self][1]
 
 
@@ -79,7 +79,7 @@ class Solution:
     x: FloatArray | None
     """Shape [n]."""
     multipliers: Multipliers | None
-    """Of the constraints; see `Multipliers` for the signs."""
+    """Lagrange multipliers of the constraints; `Multipliers` states the signs."""
     primal_residual: float
     """Largest violation of a constraint, in the problem's units."""
     dual_residual: float
@@ -87,11 +87,11 @@ class Solution:
     gap: float
     """Difference of primal and dual objective, in the problem's units."""
     certificate: float
-    """Largest of the three for the scaled problem, no unit; compared with the tolerance."""
+    """Largest of primal residual, dual residual and gap of the scaled problem [1]; compared with the tolerance."""
     status: Status
-    """`solved`, or what happened; with `.cause` and `.advice`."""
+    """`solved`, or the reason of the failure; with `.cause` and `.advice`."""
     solver: str
-    """The solver whose answer this is; empty without one."""
+    """Name of the solver that gave the answer; empty without an answer."""
 
     @property
     def solved(self) -> bool:
@@ -100,7 +100,7 @@ class Solution:
 
 
 Answer = tuple[FloatArray | None, Multipliers | None]
-"""x and multipliers of one solver; None where it has no answer or is not installed."""
+"""x and multipliers from a solver; None if the solver has no answer or is not installed."""
 
 
 def solve(
@@ -228,7 +228,7 @@ def _without_answer(status: Status) -> Solution:
 
 
 def call_solver(problem: Problem, solver: str) -> Answer:
-    """Return x and multipliers of one solver, None where it has no answer or is not installed."""
+    """Return x and multipliers from a solver; None if the solver has no answer or is not installed."""
     import qpsolvers
 
     if solver not in qpsolvers.available_solvers:
@@ -254,7 +254,7 @@ def _writable(part: FloatArray | None) -> FloatArray | None:
 
 
 def _cleaned(problem: Problem, z: FloatArray | None, y: FloatArray | None, z_box: FloatArray | None) -> Multipliers:
-    """Return multipliers with absent parts as zeros, and none on bounds that are not there."""
+    """Return multipliers with zeros for absent parts and absent bounds."""
     _, q, _, h, _, b, lb, ub = problem.parts()
     box = _first(z_box, len(q))
     box[(box < 0.0) & ~np.isfinite(lb)] = 0.0
@@ -267,8 +267,7 @@ def _cleaned(problem: Problem, z: FloatArray | None, y: FloatArray | None, z_box
 
 
 def _first(values: FloatArray | None, length: int) -> FloatArray:
-    """Return the first entries as a new array, zeros where there are too few (solvers differ in what they give for absent
-    parts)."""
+    """Return the first entries as a new array; zeros if there are too few. Solvers return different values for absent parts."""
     given = np.zeros(0) if values is None else np.asarray(values, dtype=np.float64)
     return np.array(given[:length]) if len(given) >= length else np.zeros(length)
 

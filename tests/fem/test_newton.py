@@ -14,7 +14,7 @@ from hollow_bar_cable import hollow
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem import newton, newton_state
+from femsense.fem import newton_state, stiffness_factor
 from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import bend_angles
@@ -50,7 +50,7 @@ def test_newton_is_quadratic_near_the_solution(law: str, given: dict[str, Any]) 
     if law == "gent":
         body = body.with_material(replace(body.material, stretch_limit=2.0))
     residuals = list[float]()
-    how = NewtonOptions(chord=0.0, curved=np.inf, watch=residuals.append)
+    how = NewtonOptions(patience=0, curved=np.inf, watch=residuals.append)
     state = solve_equilibrium(body, options=SolveOptions(relative_tolerance=1e-13, newton=how), **given)
     assert state.converged and state.indefinite_steps == 0
     near = [r for r in residuals if r > 1e-8]
@@ -348,7 +348,7 @@ def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_do
 
     def factored(share: float, shift: float = 0.0, scale: float = 1.0) -> tuple[Any, newton_state.State]:
         state = newton_state.State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
-        return newton.definite_factor(pattern, lowered(share, scale), state), state
+        return stiffness_factor.definite_factor(pattern, lowered(share, scale), state), state
 
     for share, shift in ((1.5, 0.0), (1.5, 2.2 * lowest), (30.0, 0.0)):
         factor, state = factored(share, shift)
@@ -379,17 +379,17 @@ def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
     factor: Any = _Known(true + 0.4 * turned[:, :3] @ turned[:, :3].T)  # too stiff along three motions
     load, ends = rng.standard_normal(20), list[float]()
     for learns in (False, True):
-        secants, x = newton.Secants(), np.zeros(20)
+        secants, x = stiffness_factor.Secants(factor), np.zeros(20)
         for _ in range(7):
             force = load - true @ x
             if learns:
                 secants.learn(x, force)
-            x = x + secants.step(factor, force)
+            x = x + secants.solve(force)
         ends.append(float(np.linalg.norm(load - true @ x)))
     assert ends[1] < 0.02 * ends[0]
     step, fell, _ = secants.pairs[-1]
-    np.testing.assert_allclose(secants.step(factor, fell), step, atol=1e-12 + 1e-9 * np.abs(step).max())
-    inverse = np.array([secants.step(factor, unit) for unit in np.eye(20)])
+    np.testing.assert_allclose(secants.solve(fell), step, atol=1e-12 + 1e-9 * np.abs(step).max())
+    inverse = np.array([secants.solve(unit) for unit in np.eye(20)])
     np.testing.assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
 
 
@@ -404,6 +404,6 @@ def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes() -> N
     lent = SolveOptions(reuse_factor=True, rough=True)
     tried = solve_equilibrium(soft, tension=pull, start=start, options=lent)
     assert tried.converged and tried.factor is start.factor
-    assert np.abs(tried.positions - there.positions).max() < 2 * newton.ARRIVED * body.reach
+    assert np.abs(tried.positions - there.positions).max() < 2 * stiffness_factor.ARRIVED * body.reach
     impatient = replace(lent, newton=NewtonOptions(patience_tried=0))
     assert solve_equilibrium(soft, tension=pull, start=start, options=impatient).factor is not start.factor

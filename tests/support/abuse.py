@@ -141,7 +141,7 @@ def _maker(kind: str, number: int, small: bool) -> Solve:
     def solve() -> tuple[BodyModel, Equilibrium]:
         rng = np.random.default_rng([number, 7])
         body, given = KINDS[kind](rng, small)
-        memory = {key: given[key] for key in ("before", "reuse_factor") if key in given}
+        memory = {key: given[key] for key in ("before", "reuse_factor", "relative_tolerance") if key in given}
         drive = {key: value for key, value in given.items() if key not in memory}
         state = solve_equilibrium(body, **drive, options=SolveOptions(**memory))
         if state.converged:

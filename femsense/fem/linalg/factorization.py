@@ -32,11 +32,11 @@ ITERATIVE_FROM = 100_000
 Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/results/speed.md, `python benchmarks/body.py
 iterative`), so memory is the only criterion."""
 ITERATIVE_LEAST = 60
-"""Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
+"""Number of unknowns below which the factor is always direct: the coarse space of the iterative solver needs larger bodies."""
 MEMORY_SHARE = 0.6
-"""A direct factor may take this share of the memory that is free."""
+"""Largest share of the free memory for a direct factor."""
 LEAST_SHIFT = 1e-6
-"""Share of the typical diagonal entry that is tried first to make a matrix positive definite."""
+"""Smallest shift by which a matrix is made positive definite, relative to its typical diagonal entry."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,13 +54,13 @@ class Pattern:
     idle: list[Any] = field(default_factory=list)
     """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
     analyses: list[Analysis] = field(default_factory=list)
-    """The analysis for Cholesky, once it was needed."""
+    """The analysis for Cholesky, after the first use."""
     grid: Level | None = None
     """The nodes behind the unknowns, for the iterative solver; None: unknown."""
     levels_made: list[Levels] = field(default_factory=list)
-    """The levels of the iterative solver, once they were needed."""
+    """The levels of the iterative solver, after the first use."""
     fits: list[bool] = field(default_factory=list)
-    """Whether a direct factor fits into memory; None until it was checked."""
+    """Whether a direct factor fits into memory; empty until this was checked."""
 
     @property
     def size(self) -> int:
@@ -133,12 +133,12 @@ def factorize_definite(
     """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
 
     Arguments:
-        first: the shift to try first where one is needed [N/m], such as a quarter of that which served near by.
-        single: single precision is enough, as for a step that is corrected by others.
-        indefinite: the matrix is known not to be positive definite as it is.
+        first: the shift to try first if the matrix is indefinite [N/m], such as a quarter of the shift at a nearby state.
+        single: single precision is enough, as for a Newton step.
+        indefinite: the matrix is known to be indefinite without a shift.
 
     Returns:
-        the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
+        the factor (None if no shift helped) and the shift [N/m], 0 for a positive definite matrix.
     """
     factor = None if indefinite else _definite(pattern, values, single)
     if factor is not None:
@@ -158,8 +158,8 @@ def factorize_definite(
 
 
 def least_shift(pattern: Pattern, values: FloatArray) -> float:
-    """Return the smallest shift that `factorize_definite` tries [N/m]: a matrix that needs more is indefinite,
-    in single precision, too."""
+    """Return the smallest shift that `factorize_definite` tries [N/m]. A matrix that needs a larger shift is indefinite in exact
+    arithmetic, not only by the rounding errors of single precision."""
     size = np.abs(values[_diagonal(pattern)])
     return LEAST_SHIFT * float(np.median(size)) if len(size) and np.isfinite(size).all() else np.inf
 
@@ -177,11 +177,11 @@ def _wanted() -> str:
 
 
 def iterates(pattern: Pattern, *, asked_from: int = ITERATIVE_FROM) -> bool:
-    """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory.
+    """Return whether matrices of a pattern are solved by conjugate gradients: by choice, or because a factor does not fit into memory.
 
     Arguments:
         pattern: the sparsity pattern.
-        asked_from: unknowns from which on memory is looked at.
+        asked_from: number of unknowns from which on the memory is checked.
     """
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
     if pattern.grid is None or pattern.size < ITERATIVE_LEAST:
@@ -190,13 +190,13 @@ def iterates(pattern: Pattern, *, asked_from: int = ITERATIVE_FROM) -> bool:
         return chosen == "iterative"
     if pattern.size < asked_from:
         return False
-    if not pattern.fits:  # decided once: the memory of a factor that is made is no longer free, but it is used again
+    if not pattern.fits:  # decided once: the memory of an existing factor is no longer free, but the next factor reuses it
         pattern.fits.append(direct_bytes(pattern) <= MEMORY_SHARE * available_memory())
     return not pattern.fits[0]
 
 
 def _iterate(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    """Return a stiffness solved by conjugate gradients, None where it is not definite or they take too long."""
+    """Return a stiffness solved by conjugate gradients; None if it is indefinite, or if too many iterations are needed."""
     try:
         return iterative(pattern.levels(), values)
     except UnsettledError:
@@ -204,7 +204,7 @@ def _iterate(pattern: Pattern, values: FloatArray) -> Factorization | None:
 
 
 def _require_memory(pattern: Pattern) -> None:
-    """Raise FemsenseError where a direct factor is needed and does not fit into memory."""
+    """Raise FemsenseError if a direct factor does not fit into memory."""
     needed, free = direct_bytes(pattern), MEMORY_SHARE * available_memory()
     if needed > free:
         raise FemsenseError(
@@ -217,7 +217,7 @@ def _require_memory(pattern: Pattern) -> None:
 def direct_bytes(pattern: Pattern) -> int:
     """Return the memory that the direct factor takes while it is made [bytes]."""
     analysis = pattern.analysis()
-    return 8 * (int(analysis.offset[-1]) + analysis.stack)
+    return 8 * (analysis.factor_entries + analysis.tree.stack)
 
 
 def available_memory() -> float:

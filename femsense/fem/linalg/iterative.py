@@ -37,11 +37,11 @@ from femsense.fem.linalg.symbolic import Analysis, analyse
 TOLERANCE = 1e-10
 """Relative tolerance of the preconditioned residual √(rᵀM⁻¹r)."""
 PROBE = 1e-5
-"""The same of the random right-hand side with which a matrix is tested for being definite."""
+"""Relative tolerance for the random right-hand side by which a matrix is tested for being positive definite."""
 MOST = 300
-"""Iterations for a right-hand side; a matrix that needs more is one for the direct solver."""
+"""Largest number of iterations for a right-hand side; a matrix that needs more goes to the direct solver."""
 RESTARTS = 4
-"""Times that a solution is improved from its true residual, where rounding stopped it before."""
+"""Largest number of restarts from the true residual, after rounding errors have stopped the iteration."""
 
 
 class UnsettledError(Exception):
@@ -81,7 +81,7 @@ class Levels:
     children: sp.csr_matrix
     """Its transpose."""
     weights: FloatArray
-    """How a node follows, one 3 × u block for each entry of `parents`, shape (entries, 3, u)."""
+    """Displacement of a node per displacement of a coarse node, for each entry of `parents`, shape (entries, 3, u)."""
     coarse_rows: IntArray
     """Coarse nodes coupled with each coarse node, in CSR, shape (q + 1,)."""
     coarse_columns: IntArray
@@ -200,8 +200,8 @@ class Iterative:
     def is_definite(self) -> bool:
         """Return whether conjugate gradients on a random right-hand side meet positive curvature only.
 
-        Their curvatures are the pivots of Lanczos' matrix, one of which is negative as soon as it has a negative eigenvalue;
-        and what has a share of the right-hand side is not left out before they converge. Raises UnsettledError.
+        The curvatures are the pivots of Lanczos' matrix: one of them is negative as soon as that matrix has a negative eigenvalue. Conjugate
+        gradients do not converge before they have met every eigenvector that is part of the right-hand side. Raises UnsettledError.
         """
         right = self._levels.prolong @ np.random.default_rng(1).standard_normal(self._levels.prolong.shape[1]).astype(np.float32)
         b = np.random.default_rng(0).standard_normal(self.size) + right
@@ -260,7 +260,7 @@ class Iterative:
 
 
 def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANCE) -> Iterative | None:
-    """Prepare conjugate gradients for a symmetric matrix; None where it is not positive definite.
+    """Prepare conjugate gradients for a symmetric matrix; None if the matrix is not positive definite.
 
     Arguments:
         levels: of its pattern, from `make_levels`.
@@ -282,7 +282,7 @@ def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANC
 
 
 def coarse_factor(levels: Levels, values: FloatArray) -> Cholesky | None:
-    """Return the factor of PᵀKP; None where it is not positive definite, and K with it."""
+    """Return the factor of PᵀKP; None if PᵀKP, and therefore K, is not positive definite."""
     fine: tuple[Any, ...] = (levels.rows, levels.columns, values, levels.parents.indptr, levels.parents.indices)
     coarse = (levels.coarse_rows, levels.coarse_columns)
     if levels.weights.shape[2] == 3:

@@ -3,36 +3,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
+from femsense.fem.linalg.blas import Blas, gemm, syrk
 from femsense.fem.linalg.simd_tiles import WIDE, add_run, subtract_and_solve, subtract_product, write_product
+from femsense.fem.linalg.symbolic import Tree
 
 LARGE = 144
-"""Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time:
-two solid bars were slower by up to 2 % with 120, and with 180 by up to 5 % in double precision (in single 1–2 % faster)."""
-
-
-@intrinsic
-def call_blas(typing_context: Any, address: Any, arguments: Any) -> Any:
-    """Call a Fortran routine at an address; all its arguments are pointers, given as a tuple of integers."""
-    del typing_context
-
-    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        integer = ir.IntType(64)
-        kind = ir.FunctionType(ir.VoidType(), [integer] * len(arguments))
-        pointers = [builder.extract_value(values[1], i) for i in range(len(arguments))]
-        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
-        return context.get_dummy_value()
-
-    return types.void(address, arguments), build
+"""Columns that register tiles factorise at a time; wider fronts also call BLAS. Two solid bars were slower by up to 2 % with 120 columns,
+and with 180 by up to 5 % in double precision (1–2 % faster in single)."""
 
 
 @njit(cache=True)
@@ -59,7 +40,7 @@ def _factor_corner(L: FloatArray, at: int, height: int, columns: int, corner: Fl
 
 @njit(cache=True)
 def _factor_panel(L: FloatArray, start: int, height: int, first: int, last: int, corner: FloatArray) -> bool:
-    """Factorise columns first … last of a panel, those before being done with; False where a pivot is not positive."""
+    """Factorise columns first … last of a panel whose earlier columns are factorised; return False if a pivot is not positive."""
     width = L.itemsize
     for j in range(first, last, WIDE):
         columns, depth = min(WIDE, last - j), j - first
@@ -74,26 +55,20 @@ def _factor_panel(L: FloatArray, start: int, height: int, first: int, last: int,
 
 
 @njit(cache=True)
-def _take_children(
-    low: int,
-    high: int,
-    front: int,
-    height: int,
-    child: int,
-    follow: IntArray,
-    unit: int,
-    begin: IntArray,
-    place: IntArray,
-    heads: IntArray,
-    runs: IntArray,
-    room: IntArray,
-    pile: int,
-    L: FloatArray,
+def _add_children(
+    tree: Tree, low: int, high: int, front: int, height: int, child: int, follow: IntArray, pile: int, L: FloatArray
 ) -> None:
-    """Add the update matrices of a child and its followers to nodes low … high of columns of a front at an address.
+    """Add the update matrices of a child and its followers to nodes low … high of the columns of a front.
 
-    It goes from one pair of runs to the next: columns with the same few rows follow each other, which the processor foresees.
+    Arguments:
+        front, height: address of the front and rows in it.
+        child, follow: the first child, and the next child after each (−1: none).
+        pile: address of the update matrices.
+        L: the factor, for its kind of numbers.
+
+    The update matrix is added one pair of runs at a time: columns with the same few rows follow each other, which the processor foresees.
     """
+    unit, begin, place, heads, runs, room = tree.unit, tree.begin, tree.place, tree.heads, tree.runs, tree.room
     node, step = L.itemsize * unit, L.itemsize * height
     while child != -1:
         rows, end = place[begin[child] : begin[child + 1]], heads[child + 1]
@@ -115,63 +90,46 @@ def _take_children(
 
 
 @njit(cache=True, nogil=True)
-def factorise(
-    values: FloatArray,
-    entries: IntArray,
-    source: IntArray,
-    target: IntArray,
-    unit: int,
-    firsts: IntArray,
-    parent: IntArray,
-    begin: IntArray,
-    place: IntArray,
-    offset: IntArray,
-    heads: IntArray,
-    runs: IntArray,
-    room: IntArray,
-    blas: IntArray,
-    L: FloatArray,
-    stack: FloatArray,
-    head: IntArray,
-    follow: IntArray,
-    letters: npt.NDArray[np.uint8],
-    numbers: npt.NDArray[np.int32],
-    scalars: FloatArray,
-) -> bool:
-    """Write the factor; False where the matrix is not positive definite."""
-    width, corner = L.itemsize, np.empty(WIDE * WIDE, L.dtype)
-    lower, no, yes = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2
-    at, minus, one, zero = numbers.ctypes.data, scalars.ctypes.data, scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
+def factorize(tree: Tree, values: FloatArray, source: IntArray, blas: Blas, L: FloatArray, stack: FloatArray) -> bool:
+    """Write the factor of a matrix to L; return False where the matrix is not positive definite.
+
+    Arguments:
+        values: entries of the matrix.
+        source: where the entries named by `tree.source` stand in `values`.
+        blas: the routines for the numbers of L.
+        stack: memory for the update matrices, of the same kind, tree.stack entries.
+    """
+    width, corner, count = L.itemsize, np.empty(WIDE * WIDE, L.dtype), len(tree.parent)
     base, pile = L.ctypes.data, stack.ctypes.data
-    family = (follow, unit, begin, place, heads, runs, room, pile, L)
-    head[:] = -1
-    for s in range(len(parent)):
-        own = firsts[s + 1] - firsts[s]
-        columns, rest = unit * own, unit * (begin[s + 1] - begin[s])
-        height, start, update = columns + rest, offset[s], pile + width * room[s]
-        L[start : offset[s + 1]] = 0.0
-        for k in range(entries[s], entries[s + 1]):
-            L[start + target[k]] = values[source[k]]
-        _take_children(0, own, base + width * start, height, head[s], *family)
+    head, follow = np.full(count, -1, np.int64), np.empty(count, np.int64)  # children of each supernode as a linked list
+    for s in range(count):
+        own = tree.firsts[s + 1] - tree.firsts[s]
+        columns, rest = tree.unit * own, tree.unit * (tree.begin[s + 1] - tree.begin[s])
+        height, start, update = columns + rest, tree.offset[s], pile + width * tree.room[s]
+        # assemble the panel
+        L[start : tree.offset[s + 1]] = 0.0
+        for k in range(tree.entries[s], tree.entries[s + 1]):
+            L[start + tree.target[k]] = values[source[k]]
+        _add_children(tree, 0, own, base + width * start, height, head[s], follow, pile, L)
+        # factorise it
         for j in range(0, columns, LARGE):
             last = min(j + LARGE, columns)
             if not _factor_panel(L, start, height, j, last, corner):
                 return False
-            if last < columns:  # the rest of the panel: A[last:, last:columns] −= X[last:, j:last] X[last:columns, j:last]ᵀ
-                numbers[0], numbers[1], numbers[2], numbers[3] = height - last, columns - last, last - j, height
+            if last < columns:  # A[last:, last:columns] −= X[last:, j:last] X[last:columns, j:last]ᵀ
                 x, y = base + width * (start + j * height + last), base + width * (start + last * height + last)
-                call_blas(blas[0], (no, yes, at, at + 4, at + 8, minus, x, at + 12, x, at + 12, one, y, at + 12))
+                gemm(blas, False, True, height - last, columns - last, last - j, -1.0, x, height, x, height, 1.0, y, height)
+        # update matrix: −X Xᵀ with the rows X below, then the parts of the children's update matrices that concern these rows
         x = base + width * (start + columns)
         if columns > LARGE and rest > 0:
-            numbers[0], numbers[1], numbers[2], numbers[3] = rest, columns, height, rest
-            call_blas(blas[1], (lower, no, at, at + 4, minus, x, at + 8, zero, update, at + 12))
+            syrk(blas, rest, columns, -1.0, x, height, update, rest)
         else:
             for j in range(0, rest, WIDE):
                 here = x + width * j
                 to = update + width * (j * rest + j)
                 write_product(L, here, here, height, to, rest, rest - j, min(WIDE, rest - j), columns)
-        _take_children(own, height, update - width * columns * (rest + 1), rest, head[s], *family)
-        if parent[s] != -1:
-            follow[s] = head[parent[s]]
-            head[parent[s]] = s
+        _add_children(tree, own, height, update - width * columns * (rest + 1), rest, head[s], follow, pile, L)
+        if tree.parent[s] != -1:
+            follow[s] = head[tree.parent[s]]
+            head[tree.parent[s]] = s
     return True

@@ -90,19 +90,17 @@ def _sorted(start: IntArray, rows: IntArray, n: int) -> IntArray:
 
 
 WORTH_PEELING = 10_000
-"""Free nodes from which on minimum degree is not asked where there is METIS: telling it takes SuperLU a second,
-and minutes on huge meshes. With 19 000 to 58 000 nodes cutting made half the work on a solid bar and on thin limbs alike
-(`body.py orders` has the latter)."""
-
-
+"""Number of free nodes from which on minimum degree is not tried if METIS is installed: SuperLU takes a second for that order, and minutes
+on huge meshes. With 19 000 to 58 000 nodes, nested dissection halved the work on a solid bar and on thin limbs (`body.py orders`)."""
 WORTH_CUTTING = 500
-"""Nodes; below, either order takes a millisecond."""
+"""Number of nodes below which nested dissection is not tried: a factor then takes a millisecond in any order."""
 
 
 def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
-    """Return the free nodes in an order of little fill for the couplings rows–columns:
-    of multiple minimum degree (by SuperLU) and nested dissection (by METIS, where it is installed) the one that makes less work.
-    Thick bodies are better cut than peeled."""
+    """Return the free nodes in an order of little fill for the couplings rows–columns.
+
+    It is the cheaper one of multiple minimum degree (by SuperLU) and, if METIS is installed, nested dissection, which suits thick bodies.
+    """
     n = len(free)
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)
@@ -122,11 +120,11 @@ def minimum_degree(graph: sp.csr_matrix) -> IntArray:
 
 
 def nested_dissection(graph: sp.csr_matrix, *, worth_cutting: int = WORTH_CUTTING) -> list[IntArray]:
-    """Return the order of METIS; none where there is little to cut (and where nodes stand alone, which METIS does not survive).
+    """Return the order of METIS; none for few nodes, and none if nodes without neighbours exist, because METIS crashes on them.
 
     Arguments:
-        graph: nodes that are not 0 where they are coupled, shape (n, n).
-        worth_cutting: with fewer nodes there is little to cut.
+        graph: not 0 for coupled nodes, shape (n, n).
+        worth_cutting: smallest number of nodes.
     """
     between = sp.csr_matrix(graph - sp.diags_array(graph.diagonal()))
     between.eliminate_zeros()

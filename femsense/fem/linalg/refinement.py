@@ -12,27 +12,28 @@ from femsense.fem.linalg.factorization import Factorization, Pattern, factorize,
 from femsense.fem.linalg.iterative import UnsettledError, iterative
 
 REFINED_FROM = 3000
-"""Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
-REFINED, MOST_REFINED = 1e-6, 4
-"""Share of a solution that the next correction may still bring;
-corrections at most before the factor is made in double precision."""
+"""Number of unknowns from which on a factor in single precision and one more solve take less time than a factor in double precision."""
+REFINED = 1e-6
+"""Largest relative correction of a solution that is still to come when the refinement ends."""
+MOST_REFINED = 4
+"""Largest number of corrections; after these the factor is made in double precision."""
 NEAR_ENOUGH = 3e-2
-"""A factor of a nearby state is used if the first relative correction of its solution is smaller than this."""
+"""The factor of a nearby state is used if the first correction of its solution is below this share of the solution."""
 ROUGH = 1e-3
-"""Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes
-moved a fit by two percent."""
+"""Largest error of a rough solution, relative in the energy norm. With 1e-2, a fit whose discretisation error was computed in this way changed
+by two percent when the nodes were numbered in another order."""
 ROUGH_FROM = 9000
-"""Unknowns from which on a rough solution takes conjugate gradients instead of a factor."""
+"""Number of unknowns from which on a rough solution takes conjugate gradients instead of a factor."""
 
 
 class Refined:
-    """A stiffness behind its factor in single precision: solutions are corrected from their true residual (Wilkinson 1963)."""
+    """A stiffness with its factor in single precision: solutions are corrected from their true residual (Wilkinson 1963)."""
 
     def __init__(self, pattern: Pattern, values: FloatArray, plain: Cholesky, *, lent: bool = False) -> None:
         self.negative, self.size, self.bytes = 0, pattern.size, plain.bytes + values.nbytes
         self.plain = plain
         self._lent = lent
-        """Whether the factor is that of a state near by, and has not shown yet that it serves."""
+        """Whether the factor was made at a nearby state, and no solution has converged with it yet."""
         self._pattern, self._values = pattern, values
         self._matrix = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
         self._exact: Factorization | None = None
@@ -53,7 +54,7 @@ class Refined:
         return np.asarray(columns.T @ self.solve(columns.toarray()))
 
     def _refined(self, right: FloatArray) -> FloatArray | None:
-        """Return the corrected solution; None where corrections do not shrink as they should."""
+        """Return the corrected solution; None if MOST_REFINED corrections are not enough."""
         answer, first = self.plain.solve(right), 0.0
         for _ in range(MOST_REFINED):
             more = self.plain.solve(right - self._matrix @ answer)
@@ -67,7 +68,7 @@ class Refined:
         return None
 
     def _factorised(self) -> bool:
-        """Put a factor of its own in the place of the one that was lent; return whether there is one in single precision."""
+        """Replace a lent factor by the factor of this stiffness; return whether there is such a factor in single precision."""
         own = factorize_definite(self._pattern, self._values, tries=0, single=True)[0]
         self._lent = False
         self.plain = own if isinstance(own, Cholesky) else self.plain
@@ -83,9 +84,12 @@ def _share(more: FloatArray, answer: FloatArray) -> float:
 def refined(
     pattern: Pattern, values: FloatArray, lent: Factorization | None = None, *, pays_from: int = REFINED_FROM
 ) -> Factorization | None:
-    """Return a stiffness that is solved to REFINED or better,
-    from a factor in single precision where that pays and is enough: from that which a state near by has lent, as long as it
-    serves. `pays_from`: unknowns from which single precision pays."""
+    """Return a stiffness that is solved to REFINED or better, with a factor in single precision if that is faster and accurate enough.
+
+    Arguments:
+        lent: factor of a nearby state, which is used as long as solutions converge with it.
+        pays_from: number of unknowns from which on single precision is faster.
+    """
     if pattern.size < pays_from or not np.isfinite(values).all():
         return factorize(pattern, values)
     if isinstance(lent, Cholesky) and lent.size == pattern.size:
@@ -95,7 +99,7 @@ def refined(
 
 
 def prepare_roughly(pattern: Pattern) -> None:
-    """Make the data of a pattern that `roughly` needs for any values; they are kept with the pattern."""
+    """Make the data of a pattern that `roughly` needs for all values; the pattern keeps the data."""
     if pattern.size < ROUGH_FROM or pattern.grid is None:
         pattern.analysis()
     else:
@@ -105,8 +109,8 @@ def prepare_roughly(pattern: Pattern) -> None:
 def roughly(
     pattern: Pattern, values: FloatArray, tolerance: float = ROUGH, *, pays_from: int = ROUGH_FROM
 ) -> Factorization | None:
-    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor:
-    from `pays_from` unknowns on."""
+    """Return a stiffness that is solved to a tolerance; by conjugate gradients from `pays_from` unknowns on, where these are faster than a
+    factor."""
     if pattern.size < pays_from or pattern.grid is None or not np.isfinite(values).all():
         return factorize(pattern, values)
     try:

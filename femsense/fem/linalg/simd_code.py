@@ -11,15 +11,15 @@ from numba import types
 from numba.extending import intrinsic
 
 BYTES = 64 if llvm.get_host_cpu_features().get("avx512f", False) else 32
-"""Size of a register; a processor with smaller ones takes two."""
+"""Size of a vector register [bytes]. A processor with smaller registers uses two."""
 INTEGER = ir.IntType(64)
 LINE = 64
-"""Bytes of a line of the cache."""
+"""Size of a cache line [bytes]."""
 
 
 @intrinsic
 def fetch_ahead(context: Any, address: Any, size: Any) -> Any:
-    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
+    """Prefetch `size` bytes at an address into the cache, line by line; the address need not be valid."""
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -51,7 +51,7 @@ def fetch_function(module: Any) -> Any:
 
 
 def fetch(builder: Any, address: Any, size: int) -> None:
-    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
+    """Prefetch `size` bytes at an address into the cache, line by line; the address need not be valid."""
     pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
     fetch = declared(builder.module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
     for line in range(0, size, LINE):

@@ -26,7 +26,7 @@ from femsense.fem.linalg.simd_code import (
 )
 
 SIDES = 8
-"""Right-hand sides that are solved at once."""
+"""Number of right-hand sides that the `…_sides` functions solve at once."""
 
 
 def _columns(name: str, count: int, write: Callable[[Any, str, Any, int], Any]) -> Any:
@@ -222,11 +222,12 @@ class _Elimination:
 
 
 down_one, down_three, down_six = (_columns("down", count, _column_function) for count in (1, 3, 6))
-"""(like, a, step, x, rows, ahead): for a matrix at the address `a`, its columns `step` entries apart,
-that begins with a lower triangle T and goes on with `rows` rows A: x ← T⁻¹ x, and y −= A x for the y behind x. What lies `ahead`
-bytes further is brought into the cache meanwhile."""
+"""Forward substitution by one, three or six columns (like, a, step, x, rows, ahead). At the address `a` stands a lower triangle T above a
+matrix A with `rows` rows, `step` entries from column to column. x ← T⁻¹ x, and y −= A x for the y behind x. The memory `ahead` bytes
+further is loaded into the cache meanwhile."""
 up_one, up_three, up_six = (_columns("up", count, _column_function) for count in (1, 3, 6))
-"""The same with x −= Aᵀ y, and x ← T⁻ᵀ x."""
+"""Backward substitution by one, three or six columns, with the arguments of `down_one`: x −= Aᵀ y, then x ← T⁻ᵀ x."""
 down_three_sides, down_six_sides = (_columns("down", count, _side_function) for count in (3, 6))
+"""Forward substitution as by `down_three`, for SIDES right-hand sides: each row of x and of y is SIDES numbers."""
 up_three_sides, up_six_sides = (_columns("up", count, _side_function) for count in (3, 6))
-"""The same for SIDES right-hand sides: each row of x and of y is SIDES numbers."""
+"""Backward substitution as by `up_three`, for SIDES right-hand sides: each row of x and of y is SIDES numbers."""

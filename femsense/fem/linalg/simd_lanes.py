@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 from femsense.fem.linalg.simd_code import INTEGER, declared, function_named, kind_of, number, pointer_at
 
 LANES = 8
-"""Elements that `add_gradient` and `add_divergence` work on at once."""
+"""Number of elements on which `add_gradient` and `add_divergence` work at once."""
 
 
 @intrinsic

@@ -1,11 +1,9 @@
 # mypy: allow-untyped-decorators, allow-untyped-calls
-"""Dense work on fronts too small for a BLAS to pay: tiles that stay in the vector registers,
-written as LLVM code for the processor at hand.
+"""Dense products and triangular solves on fronts too small for BLAS: tiles in vector registers, as LLVM code for the present processor.
 
-A tile is up to three registers of rows times six columns. Reading beyond the last row or column of a matrix is harmless (what is
-read there reaches no result). Registers are written whole, with the old values beyond the last row: a masked store takes a dozen cycles
-without AVX-512. The memory must reach PADDING entries beyond its end,
-and nobody else may write there.
+A tile is up to three registers of rows times six columns. Entries beyond the last row or column of a matrix are read, but do not affect the
+result. Registers are written whole, with the old values beyond the last row, because a masked store takes a dozen cycles without AVX-512.
+The memory must therefore extend PADDING entries beyond its end, and no other thread may write there.
 """
 
 from __future__ import annotations
@@ -29,11 +27,11 @@ from femsense.fem.linalg.simd_code import (
 )
 
 WIDE = 6
-"""Columns of a tile: two nodes."""
+"""Number of columns of a tile: two nodes."""
 REGISTERS = 3 if BYTES == 64 else 2
-"""Registers of rows in a tile."""
+"""Number of registers that hold the rows of a tile."""
 PADDING = 4 * BYTES
-"""Entries beyond the end of a matrix that may be read, and written again as they are."""
+"""Number of entries beyond the end of a matrix that kernels may read, and write back unchanged."""
 
 
 @intrinsic
@@ -215,8 +213,8 @@ def _eliminated(builder: Any, value: Any, known: list[Any], L: Any, shape: tuple
 
 
 def _run_function(module: Any, like: Any) -> Any:
-    """Return the function that adds a run of numbers, a register at a time and what is left in halves of one:
-    the next run may begin right after."""
+    """Return the function that adds a run of numbers, a register at a time. The remainder is added in halves of a register, because the next run
+    may begin right behind."""
     letter, kind, lanes = kind_of(like)
     function, known = function_named(module, f"femsense_add_{letter}", 3)
     if known:

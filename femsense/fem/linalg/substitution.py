@@ -1,14 +1,13 @@
 # mypy: allow-untyped-decorators
-"""Solves with a multifrontal factor: one side, a few side by side, many by BLAS, and sparse ones; compiled."""
+"""Solves with a multifrontal factor: for one right-hand side, a few side by side, many by BLAS, and for sparse ones; compiled."""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.multifrontal import call_blas
+from femsense.fem.linalg.blas import Blas, gemm, syrk, trsm
 from femsense.fem.linalg.simd_columns import (
     SIDES,
     down_one,
@@ -23,20 +22,13 @@ from femsense.fem.linalg.simd_columns import (
     up_three_sides,
 )
 from femsense.fem.linalg.simd_tiles import add_run
+from femsense.fem.linalg.symbolic import Tree
 
 
 @njit(cache=True, nogil=True)
-def solve_one(
-    unit: int,
-    firsts: IntArray,
-    begin: IntArray,
-    below: IntArray,
-    offset: IntArray,
-    L: FloatArray,
-    x: FloatArray,
-    half: FloatArray,
-) -> None:
-    """Solve in place for one right-hand side in the order of elimination."""
+def solve_one(tree: Tree, L: FloatArray, x: FloatArray, half: FloatArray) -> None:
+    """Solve in place for one right-hand side x (f,) in the order of elimination; `half` (f,) is work memory."""
+    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
     width, base, y = L.itemsize, L.ctypes.data, half.ctypes.data
     for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
@@ -89,18 +81,12 @@ def solve_one(
 
 
 @njit(cache=True, nogil=True)
-def solve_sides(
-    unit: int,
-    firsts: IntArray,
-    begin: IntArray,
-    below: IntArray,
-    offset: IntArray,
-    L: FloatArray,
-    x: FloatArray,
-    half: FloatArray,
-) -> None:
-    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination; unit is 3 here.
-    half (g, …) has room for the tallest front. What is read of the factor for one group is in the cache for the others."""
+def solve_sides(tree: Tree, L: FloatArray, x: FloatArray, half: FloatArray) -> None:
+    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination, where a node has 3 unknowns.
+
+    `half` (g, …) is work memory for the tallest front. All groups go through a panel while it is in the cache.
+    """
+    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
     width, base, groups = L.itemsize, L.ctypes.data, len(x)
     line, block = width * SIDES, SIDES * unit
     for s in range(len(firsts) - 1):
@@ -153,36 +139,16 @@ def solve_sides(
 
 
 @njit(cache=True, nogil=True)
-def solve_many(
-    unit: int,
-    firsts: IntArray,
-    begin: IntArray,
-    below: IntArray,
-    offset: IntArray,
-    blas: IntArray,
-    L: FloatArray,
-    X: FloatArray,
-    work: FloatArray,
-    letters: npt.NDArray[np.uint8],
-    numbers: npt.NDArray[np.int32],
-    scalars: FloatArray,
-) -> None:
-    """Solve in place for the columns of X (f, k) in the order of elimination; work holds k times the tallest front."""
-    width, k = L.itemsize, X.shape[1]
-    lower, no, yes, right = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2, letters.ctypes.data + 3
-    at = numbers.ctypes.data
-    minus, one, zero = scalars.ctypes.data, scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
-    numbers[0] = k
+def solve_many(tree: Tree, blas: Blas, L: FloatArray, X: FloatArray, work: FloatArray) -> None:
+    """Solve in place for the columns of X (f, k) in the order of elimination; `work` holds k times the tallest front."""
+    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
+    width, k, after = L.itemsize, X.shape[1], work.ctypes.data
     for s in range(len(firsts) - 1):
         c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
-        numbers[1], numbers[2], numbers[3] = columns, unit * rows, columns + unit * rows
-        panel, here = L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
-        call_blas(blas[2], (right, lower, yes, no, at, at + 4, one, panel, at + 12, here, at))
+        height, panel, here = columns + unit * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        trsm(blas, True, k, columns, panel, height, here, k)
         if rows > 0:
-            call_blas(
-                blas[0],
-                (no, yes, at, at + 8, at + 4, one, here, at, panel + width * columns, at + 12, zero, work.ctypes.data, at),
-            )
+            gemm(blas, False, True, k, unit * rows, columns, 1.0, here, k, panel + width * columns, height, 0.0, after, k)
         for q in range(rows):
             for a in range(unit):
                 line, part = X[unit * below[begin[s] + q] + a], work[(unit * q + a) * k : (unit * q + a + 1) * k]
@@ -190,18 +156,14 @@ def solve_many(
                     line[r] -= part[r]
     for s in range(len(firsts) - 2, -1, -1):
         c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
-        numbers[1], numbers[2], numbers[3] = columns, unit * rows, columns + unit * rows
-        panel, here = L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        height, panel, here = columns + unit * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
         for q in range(rows):
             for a in range(unit):
                 for r in range(k):
                     work[(unit * q + a) * k + r] = X[unit * below[begin[s] + q] + a, r]
         if rows > 0:
-            call_blas(
-                blas[0],
-                (no, no, at, at + 4, at + 8, minus, work.ctypes.data, at, panel + width * columns, at + 12, one, here, at),
-            )
-        call_blas(blas[2], (right, lower, no, no, at, at + 4, one, panel, at + 12, here, at))
+            gemm(blas, False, False, k, columns, unit * rows, -1.0, after, k, panel + width * columns, height, 1.0, here, k)
+        trsm(blas, False, k, columns, panel, height, here, k)
 
 
 @njit(cache=True)
@@ -232,27 +194,16 @@ def reach(parent: IntArray, owner: IntArray, indptr: IntArray, rows: IntArray) -
 
 @njit(cache=True)
 def add_gram(
-    unit: int,
-    firsts: IntArray,
-    begin: IntArray,
-    below: IntArray,
-    offset: IntArray,
-    start: IntArray,
-    active: IntArray,
-    blas: IntArray,
-    L: FloatArray,
-    X: FloatArray,
-    work: FloatArray,
-    W: FloatArray,
-    letters: npt.NDArray[np.uint8],
-    numbers: npt.NDArray[np.int32],
-    scalars: FloatArray,
+    tree: Tree, blas: Blas, start: IntArray, active: IntArray, L: FloatArray, X: FloatArray, work: FloatArray, W: FloatArray
 ) -> None:
-    """Add XᵀK⁻¹X to W (lower half in the order of `active`); X (f, k), in the order of elimination, is zero after it."""
-    width = L.itemsize
-    lower, no, yes, right = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2, letters.ctypes.data + 3
-    at = numbers.ctypes.data
-    one, zero = scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
+    """Add XᵀK⁻¹X to the lower half of W (in the order of `active`); X (f, k), in the order of elimination, is zero afterwards.
+
+    Arguments:
+        start, active: which columns of X each supernode sees (`reach`).
+        work: memory for k columns of the tallest front, or of a supernode with k rows below.
+    """
+    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
+    width, here = L.itemsize, work.ctypes.data
     for s in range(len(firsts) - 1):
         seen = active[start[s] : start[s + 1]]
         k = len(seen)
@@ -260,25 +211,21 @@ def add_gram(
             continue
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         rest = unit * (begin[s + 1] - begin[s])
-        height = columns + rest
+        height, panel, after = columns + rest, L.ctypes.data + width * offset[s], here + width * columns * k
         for i in range(columns):
             for r in range(k):
                 work[i * k + r] = X[c0 + i, seen[r]]
                 X[c0 + i, seen[r]] = 0.0
-        numbers[0], numbers[1], numbers[2], numbers[3] = k, columns, rest, height
-        here = work.ctypes.data
-        after = here + width * columns * k
-        call_blas(blas[2], (right, lower, yes, no, at, at + 4, one, L.ctypes.data + width * offset[s], at + 12, here, at))
+        trsm(blas, True, k, columns, panel, height, here, k)
         if rest > 0:
-            below_panel = L.ctypes.data + width * (offset[s] + columns)
-            call_blas(blas[0], (no, yes, at, at + 8, at + 4, one, here, at, below_panel, at + 12, zero, after, at))
+            gemm(blas, False, True, k, rest, columns, 1.0, here, k, panel + width * columns, height, 0.0, after, k)
             for q in range(begin[s + 1] - begin[s]):
                 to = unit * below[begin[s] + q]
                 for a in range(unit):
                     line = (columns + unit * q + a) * k
                     for r in range(k):
                         X[to + a, seen[r]] -= work[line + r]
-        call_blas(blas[1], (lower, no, at, at + 4, one, here, at, zero, after, at))
+        syrk(blas, k, columns, 1.0, here, k, after, k)
         for c in range(k):
             for r in range(c, k):
                 W[seen[r], seen[c]] += work[(columns + c) * k + r]

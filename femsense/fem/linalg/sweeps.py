@@ -39,7 +39,7 @@ def grouped(rows: ShortArray, columns: ShortArray) -> IntArray:
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, inline="always")
 def _gathered(columns: ShortArray, first: int, last: int, x: Any, near: Any) -> None:
-    """Write into `near` what x holds at some columns, so that a row multiplies numbers that lie side by side."""
+    """Copy the entries of x at some columns to `near`, so that a row multiplies adjacent numbers."""
     for k in range(last - first):
         j = 3 * np.int64(columns[first + k])
         near[3 * k], near[3 * k + 1], near[3 * k + 2] = x[j], x[j + 1], x[j + 2]
@@ -189,7 +189,7 @@ def galerkin_of_corners(
     coarse_rows: IntArray,
     coarse_columns: IntArray,
 ) -> FloatArray:
-    """Return the same where nodes follow theirs by a share alone: each row of K P is made once, for all that its node follows."""
+    """Return PᵀKP as `galerkin` does, for weights that are multiples of the unit matrix (`share`): each row of K P is computed once."""
     count, most = len(coarse_rows) - 1, 2 * np.diff(rows).max()
     result = np.zeros(9 * coarse_rows[count])
     number = np.full(count, -1, np.int64)

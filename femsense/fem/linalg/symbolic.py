@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,44 @@ from femsense.core.arrays import IntArray
 from femsense.core.kernels import njit
 from femsense.fem.linalg.ordering import _elimination_tree, _structures
 from femsense.fem.linalg.simd_tiles import PADDING
+
+
+class Tree(NamedTuple):
+    """The supernodes of a factor and their tree: all that the compiled kernels read of an analysis.
+
+    A node has `unit` unknowns (3: a point in space). A supernode is a run of nodes with the same rows below the diagonal. Its columns
+    stand as one dense panel in the factor: first its own nodes, then the nodes below. A front is the panel with the update matrix, the
+    part that its elimination subtracts from the nodes below. Arrays of shape (s + 1,) hold the beginning of each supernode's list in another
+    array, and the end of the last list.
+    """
+
+    unit: int
+    firsts: IntArray
+    """First node of each supernode, shape (s + 1,)."""
+    parent: IntArray
+    """Supernode above, −1 at a root, shape (s,)."""
+    begin: IntArray
+    """Where the nodes below each supernode begin in `below`, shape (s + 1,)."""
+    below: IntArray
+    """Nodes below the supernodes."""
+    place: IntArray
+    """Where each of `below` stands in the front of the parent."""
+    offset: IntArray
+    """Where the panel of each supernode begins in the factor, shape (s + 1,)."""
+    entries: IntArray
+    """Where the entries of the matrix that go into each panel begin in `source` and `target`, shape (s + 1,)."""
+    source: npt.NDArray[np.int32]
+    """Places of these entries in the matrix."""
+    target: npt.NDArray[np.int32]
+    """Places of these entries in the panel."""
+    heads: IntArray
+    """Where the runs of each supernode begin in `runs`, shape (s + 1,)."""
+    runs: IntArray
+    """First row of each run: rows below that follow each other in the front of the parent as well."""
+    room: IntArray
+    """Where the update matrix of each supernode stands in work memory until its parent has taken it, shape (s,)."""
+    stack: int
+    """Entries of the work memory of all update matrices."""
 
 
 @njit(cache=True)
@@ -51,7 +89,7 @@ def _postorder(parent: IntArray, by_weight: IntArray) -> IntArray:
 
 @njit(cache=True)
 def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
-    """Return the first column of each supernode and the end; small ones are merged with their parents where few zeros result."""
+    """Return the first column of each supernode and the end; a small supernode is merged with its parent if few zeros result."""
     n = len(parent)
     firsts = np.empty(n + 1, np.int64)
     zeros = np.zeros(n + 1, np.float64)
@@ -226,9 +264,8 @@ def _layout(
     columns: IntArray,
     parent: IntArray,
     unit: int,
-) -> Any:
-    """Return the fields of an `Analysis` from `firsts` on, as far as they follow from the order:
-    one kernel to load instead of six."""
+) -> Tree:
+    """Return the tree of supernodes of a pattern in an order of elimination: one kernel to load instead of six."""
     start, structure = _structures(rows, columns, parent)
     count = np.empty(len(parent), np.int64)
     for j in range(len(parent)):
@@ -242,73 +279,72 @@ def _layout(
     starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below, unit)
     room, stack = _rooms(above, begin, unit)
     run_heads, runs = _runs(begin, place)
-    return firsts, above, begin, below, place, offset, starts, source, target, room, stack, run_heads, runs
+    return Tree(unit, firsts, above, begin, below, place, offset, starts, source, target, run_heads, runs, room, stack)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Analysis:
-    """Data common to the factorisations of all matrices of one pattern. Each node has `unit` unknowns."""
+class Pool:
+    """Arrays for reuse: fresh pages of the system take longer than the factor that is written to them.
 
-    unit: int
-    order: IntArray
-    """Unknowns in the order of elimination, shape (f,)."""
-    firsts: IntArray
-    """First node of each supernode, and the end, shape (s + 1,)."""
-    parent: IntArray
-    """Supernode above, −1 at a root, shape (s,)."""
-    begin: IntArray
-    """Where the nodes below each supernode begin in `below`, shape (s + 1,)."""
-    below: IntArray
-    place: IntArray
-    """Where each of `below` stands in the front of the parent."""
-    offset: IntArray
-    """Where the panel of each supernode begins in the factor, shape (s + 1,)."""
-    entries: IntArray
-    """Where the entries of the matrix that go into each panel begin in `source` and `target`, shape (s + 1,)."""
-    source: npt.NDArray[np.int32]
-    target: npt.NDArray[np.int32]
-    """Their places in the matrix and in the panel."""
-    heads: IntArray
-    """Where the runs of each supernode begin in `runs`, shape (s + 1,)."""
-    runs: IntArray
-    """First row of each run of rows below that follow each other in the front of the parent as well."""
-    room: IntArray
-    """Where the update matrix of each supernode lives, shape (s,)."""
-    stack: int
-    """Entries of the room of all update matrices."""
-    rank: IntArray
-    """Place of each unknown in the order of elimination, shape (f,)."""
-    owner: IntArray
-    """Supernode of each unknown in the order of elimination, shape (f,)."""
-    idle: dict[tuple[str, int], list[npt.NDArray[Any]]]
-    """Released memory by kind and number of entries, for reuse: fresh pages of the system take longer than a factor."""
-    columns: dict[tuple[str, int], npt.NDArray[Any]]
-    """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
+    An array has one owner. Whoever takes it owns it, until giving it back, and keeps no view of it afterwards. A `Cholesky` owns the
+    array of its factor and gives it back when it is collected. Threads may share a pool.
+    """
 
-    @property
-    def size(self) -> int:
-        return len(self.order)
-
-    @property
-    def tallest(self) -> int:
-        """Rows of the tallest front."""
-        return int(self.unit * (np.diff(self.firsts) + np.diff(self.begin)).max(initial=0))
+    def __init__(self) -> None:
+        self.idle: dict[tuple[str, int], list[npt.NDArray[Any]]] = {}
+        """Arrays without an owner, by kind and number of entries."""
+        self._zeros: dict[tuple[str, int, int], npt.NDArray[Any]] = {}
 
     def take(self, kind: str, entries: int) -> npt.NDArray[Any]:
-        """Return memory for so many numbers and what may be read beyond them."""
+        """Return an array of any content with some entries and PADDING more, up to which the kernels may read."""
         size = entries + PADDING
         try:
             return self.idle.setdefault((kind, size), []).pop()
         except IndexError:
             return np.empty(size, kind)
 
-    def give_back(self, memory: npt.NDArray[Any]) -> None:
-        """Let others take memory that is needed no more."""
-        self.idle[memory.dtype.char, len(memory)].append(memory)
+    def give_back(self, array: npt.NDArray[Any]) -> None:
+        """Take over an array that its owner needs no more."""
+        self.idle[array.dtype.char, len(array)].append(array)
+
+    def take_zeros(self, kind: str, rows: int, columns: int) -> npt.NDArray[Any]:
+        """Return zeros, shape (rows, columns)."""
+        kept = self._zeros.pop((kind, rows, columns), None)
+        return np.zeros((rows, columns), kind) if kept is None else kept
+
+    def give_back_zeros(self, array: npt.NDArray[Any]) -> None:
+        """Take over an array that its owner has made zero again."""
+        self._zeros[array.dtype.char, *array.shape] = array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Analysis:
+    """Data common to the factorisations of all matrices of one pattern, and the memory for their factors."""
+
+    tree: Tree
+    order: IntArray
+    """Unknowns in the order of elimination, shape (f,)."""
+    rank: IntArray
+    """Place of each unknown in the order of elimination, shape (f,)."""
+    owner: IntArray
+    """Supernode of each unknown in the order of elimination, shape (f,)."""
+    pool: Pool
+
+    @property
+    def size(self) -> int:
+        return len(self.order)
+
+    @property
+    def factor_entries(self) -> int:
+        return int(self.tree.offset[-1])
+
+    def tallest(self, columns: int = 0) -> int:
+        """Return the rows of the tallest front [unknowns], with at least so many nodes below each supernode."""
+        tree = self.tree
+        return int(tree.unit * (np.diff(tree.firsts) + np.maximum(np.diff(tree.begin), columns)).max(initial=0))
 
 
 def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
-    """Analyse the pattern of a symmetric matrix in CSC with sorted indices; its order is taken as one of little fill."""
+    """Analyse the pattern of a symmetric matrix in CSC with sorted indices, whose unknowns are in an order of little fill."""
     unit = 3 if _has_blocks(indptr, indices) else 1
     heads, entries = np.asarray(indptr, np.int64), np.asarray(indices, np.int64)
     counts = np.diff(heads)[::unit] // unit
@@ -321,35 +357,12 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     columns = inverse[columns[_ranges(rows[:-1][order], counts[order], 1)]]
     rows = np.concatenate([[0], np.cumsum(counts[order])])
     parent = np.where(parent[order] >= 0, inverse[parent[order]], -1)
-    firsts, above, begin, below, place, offset, starts, source, target, room, stack, run_heads, runs = _layout(
-        heads, entries, order, inverse, rows, columns, parent, unit
-    )
-    width = unit * np.diff(firsts)
+    tree = _layout(heads, entries, order, inverse, rows, columns, parent, unit)
     unknowns = (unit * order[:, None] + np.arange(unit)).ravel()
     rank = np.empty_like(unknowns)
     rank[unknowns] = np.arange(len(unknowns))
-    owner = np.repeat(np.arange(len(above)), width)
-    return Analysis(
-        unit=unit,
-        order=unknowns,
-        firsts=firsts,
-        parent=above,
-        begin=begin,
-        below=below,
-        place=place,
-        offset=offset,
-        entries=starts,
-        source=source,
-        target=target,
-        heads=run_heads,
-        runs=runs,
-        room=room,
-        stack=int(stack),
-        rank=rank,
-        owner=owner,
-        idle={},
-        columns={},
-    )
+    owner = np.repeat(np.arange(len(tree.parent)), unit * np.diff(tree.firsts))
+    return Analysis(tree, unknowns, rank, owner, Pool())
 
 
 def _ranges(starts: IntArray, counts: IntArray, step: int) -> IntArray:

@@ -1,15 +1,15 @@
 # mypy: allow-untyped-decorators
-"""Equilibria along a path of loads as a power series: the nonlinear answer of a body, from one factor.
+"""Equilibria along a path of loads as a power series: the nonlinear response of a body, from one factor.
 
-Where the loads move on a straight line, from those that hold x₀ (s = 0) to others (s = 1), the state is x(s) = x₀ + s x₁ + s² x₂ + …,
-and each term follows from the ones before by one solve with the tangent K of x₀ (asymptotic numerical method; Cochelin, Damil &
-Potier-Ferry 1994):
+The loads change along a straight line, from the loads of an equilibrium x₀ (s = 0) to the wanted ones (s = 1). The state is
+x(s) = x₀ + s x₁ + s² x₂ + …, and each term follows from the terms before by one solve with the tangent K of x₀ (asymptotic numerical
+method; Cochelin, Damil & Potier-Ferry 1994):
 
     K x_{N+1} = g_N,    g_N = Σ_{n ≤ N+1} of the coefficients of the unbalanced force, with x_{N+1} = 0.
 
-The sum over all orders hands what a solve in single precision has missed on to the next term. A correction with a kept factor takes the
-force of x₀ + x₁ as a whole instead: a slender body that turns by ω is stretched by |ω|²/2 there, and the force of that, which the second
-term takes back, has a part across the body that the factor reads as a large motion. Term by term this cancels.
+The sum is over all orders up to N + 1, so that the next term corrects the error of a solve in single precision. A quasi-Newton correction
+would take the force of x₀ + x₁ as a whole instead. There a slender body that rotates by ω is stretched by |ω|²/2; the force of this
+stretch, which the second term cancels, has a transverse part that K⁻¹ turns into a large motion. In the series it cancels term by term.
 
 Coefficients of the corotational element: F = R₀ F̂ and R = R₀ A with A = I + s A₁ + …, A_n = [a_n]ₓ + M_n. AᵀA = I gives
 
@@ -40,22 +40,20 @@ from femsense.fem.realtime.series_kernels import cable_series, element_frames, s
 from femsense.fem.stencil import in_lanes, lanes_of
 
 MEMORY = 8
-"""Equilibria whose stretches are kept."""
+"""Number of equilibria whose stretches are kept."""
 SAMPLE = 300
-"""Nodes whose positions tell how far states are apart."""
+"""Number of nodes whose positions measure the distance of two states."""
 ALIKE = 0.06
-"""What is known at a state holds for others as far as this share of the body away (root of the mean square):
-ℓ in `combination`."""
+"""Correlation length ℓ of states in `combination`: root mean square distance of the nodes, as a share of the body's size."""
 NOISE = 1e-5
-"""Variance of what is known at a state, as a share of that of states that lie far apart."""
+"""Variance of a quantity at a known state, relative to its variance between states that are far apart (`combination`)."""
 TERMS = 3
-"""Terms of a series at most."""
+"""Largest number of terms of a series."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SeriesLanes:
-    """What a series needs of the elements in groups of LANES, the element being the last axis;
-    elements of no volume fill the last group up."""
+    """Data of the elements for a series, in groups of LANES elements (last axis); elements without volume fill the last group."""
 
     nodes: IntArray
     """shape (g, a, LANES)."""
@@ -68,9 +66,9 @@ class SeriesLanes:
 
 
 class Expansion:
-    """A state of a body from which others follow as series: cables under given tensions, a rigid clamp.
+    """An expansion point of a body, and series about it: cables under given tensions, a rigid clamp.
 
-    Laws without a series of their own have two terms, the second being the correction with the factor of x₀.
+    Only the corotational law has a series. For other laws there are two terms; the second is a quasi-Newton correction.
     """
 
     def __init__(self, body: BodyModel, *, single: bool) -> None:
@@ -79,11 +77,11 @@ class Expansion:
         self.is_series = body.material.law == "corotational"
         self._lanes = _lanes(body) if self.is_series else None
         self._blocks = np.zeros((len(body.stencil.block_columns), 9), np.float32 if single else np.float64)
-        self._source = np.asarray(body.free_map.source[body.free_map.pattern.analysis().source], dtype=np.int32)
+        self._source = np.asarray(body.free_map.source[body.free_map.pattern.analysis().tree.source], dtype=np.int32)
         self.positions = body.mesh.nodes
         self.factor: Cholesky | None = None
         self.unbalanced = np.zeros_like(self.positions)
-        """What the last term answered to [N], shape (n, 3)."""
+        """Unbalanced force from which the last term was computed [N], shape (n, 3)."""
         self.tension, self._held = np.zeros(len(body.cables)), np.zeros_like(self.positions)
         keeps = body.mesh.is_quadratic and self._lanes is not None
         self._room = np.zeros((len(body.mesh.tets), 4, 9)) if keeps else None
@@ -95,22 +93,22 @@ class Expansion:
         )
 
     def learn(self, x: FloatArray) -> None:
-        """Keep the stretches of an equilibrium x: their stress serves the stiffness of starts to come."""
+        """Keep the stretches of an equilibrium x: the stiffness of later expansion points is computed with them."""
         if self._room is not None:
             stretch = self._stretches.pop(0)[1] if len(self._stretches) == MEMORY else np.empty_like(self._room)
             internal(self.body, x, tangent=False, stretch=stretch)
             self._stretches.append((self.sample(x), stretch))
 
     def sample(self, x: FloatArray) -> FloatArray:
-        """Return the positions [m] of some nodes, shape (k, 3): what `combination` compares states by."""
+        """Return the positions [m] of SAMPLE nodes, shape (k, 3), by which `combination` compares states."""
         return np.asarray(x[:: max(1, len(x) // SAMPLE)]).copy()
 
     def forget(self) -> None:
-        """Forget what was learnt, after a leap."""
+        """Forget the learnt stretches, after a jump."""
         self._stretches = []
 
     def move(self, x: FloatArray, tension: FloatArray) -> bool:
-        """Start from node positions x [m] and tensions [N], shape (a,);
+        """Expand about node positions x [m] and tensions [N], shape (a,);
         return whether the stiffness is positive definite there."""
         body, blocks = self.body, self._blocks
         stretch = None
@@ -119,7 +117,7 @@ class Expansion:
             stretch = np.einsum("k,keqi->eqi", weights, np.array([s for _, s in self._stretches]), out=self._room)
         here = internal(body, x, room=blocks, stretch=stretch)
         add_cable_stiffness(body, x, tuple(np.full(len(c.path), t) for c, t in zip(body.cables, tension)), blocks)
-        self.factor = None  # its memory serves the next one
+        self.factor = None  # its memory goes to the next factor
         self.factor = cholesky(body.free_map.pattern.analysis(), blocks.ravel(), single=self._single, source=self._source)
         self.positions, self.tension, self._answers = x, tension.copy(), None
         self._held = -here.forces
@@ -141,8 +139,8 @@ class Expansion:
             yield terms[n]
 
     def _first_term(self, tension: FloatArray, loads: FloatArray) -> FloatArray | None:
-        """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start,
-        since it is linear in the tensions."""
+        """Return x₁ of the free unknowns, shape (f,), if the dead loads are those of the last series: x₁ is linear in the tensions, so
+        that one solve with a few right-hand sides suffices for an expansion point. None if the loads have changed."""
         assert self.factor is not None
         free, before = self.body.free_map.dofs, self._loads
         self._loads = loads.copy()
@@ -170,12 +168,10 @@ class Expansion:
 
 
 def combination(x: FloatArray, states: list[FloatArray], length: float) -> tuple[FloatArray, float]:
-    """Return weights of sum 1, shape (k,), by which what is known at some states carries over to the state x,
-    and how uncertain that is.
+    """Return the weights of known states, shape (k,) with sum 1, by which a quantity is interpolated at the state x, and its uncertainty.
 
-    Ordinary kriging (Cressie 1993, 3.2) with the covariance exp(−d²/2ℓ²) of states at a distance d (root of the mean square [m])
-    and a variance of NOISE of what is known; the uncertainty is the standard deviation,
-    as a share of what states far from each other differ by.
+    Ordinary kriging (Cressie 1993, 3.2) with the covariance exp(−d²/2ℓ²) of states at a distance d (root mean square [m]) and a variance
+    of NOISE at the known states. The uncertainty is a standard deviation, relative to the difference of states far from each other.
     """
     k, ways = len(states), (np.array([*states, x]) - x).reshape(len(states) + 1, -1)
     products = ways @ ways.T / ways.shape[1]

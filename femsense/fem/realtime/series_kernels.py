@@ -13,17 +13,16 @@ from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 ROWS = 54
-"""Rows of LANES numbers that a point takes.
-One array with fixed places for all of them lets a compiler see that they are apart,
-so that it takes the eight elements at once."""
+"""Rows of LANES numbers for a quadrature point. All rows stand in one array at fixed places: a compiler then sees that they do not overlap,
+and works on LANES elements at once."""
 FIRST, SECOND = 0, 9 * LANES
-"""Where F₁ (then F̂₁ + F̂₂, then a stress) and F₂ begin among them, nine rows each;"""
+"""Places in a point's array of F₁ (then F̂₁ + F̂₂, then a stress) and of F₂, nine rows each."""
 TURNS, THETA, MEANS = 18 * LANES, 27 * LANES, 31 * LANES
-"""a₁, a₂ and a₃, three rows each; θ₀ … θ₃, a row each; and their means over the element;"""
+"""Places in a point's array of a₁, a₂ and a₃ (three rows each), of θ₀ … θ₃ (a row each), and of their means over the element."""
 ROTATION, STRETCH = 35 * LANES, 44 * LANES
-"""R₀, nine rows, and S₀ (00 01 02 11 12 22);"""
+"""Places in a point's array of R₀ (nine rows) and of S₀ (00 01 02 11 12 22)."""
 VOLUME, LOCAL_BULK, MEAN_BULK, SHEAR = 50 * LANES, 51 * LANES, 52 * LANES, 53 * LANES
-"""volume, λ', λ − λ' and 2μ, a row each."""
+"""Places in a point's array of volume, λ', λ − λ' and 2μ, a row each."""
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")

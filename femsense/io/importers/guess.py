@@ -1,4 +1,4 @@
-"""Which importer a file or folder is for."""
+"""Identify the format of a file or folder, and open it as a source."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from femsense.io.importers.tables.mapping import check_names, check_taken, check
 
 PACKED = (".zstd", ".zst", ".zip", ".7z", ".tar", ".tgz", ".bz2", ".xz")
 FEW_CAMERAS = 8
-"""More captures than these are hardly the cameras of one recording, unless each has a name."""
+"""Largest number of captures without names that are taken for the cameras of one recording. It is also the number of entries of a folder that
+are examined to find out whether the folder holds captures."""
 UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is read by its folder, which holds metadata.yaml"
 
 
@@ -34,7 +35,7 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
         options: of the user.
 
     Raises:
-        InputError: no such file, an unknown format, or a choice that the user must make; the message lists the options.
+        InputError: there is no such file, the format is unknown, or the user must choose; the message lists the choices.
     """
     said = options or Options()
     check_targets(said.columns)
@@ -46,7 +47,7 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
 
 
 def _opened(path: str | Path, said: Options) -> Source:
-    """Return a source; whether it has the names of `--map` is not looked at."""
+    """Return a source, without a check that the columns named by `--map` exist in it."""
     source = Path(path).expanduser()
     if source.name in ("depth.txt", *PAIRS) and is_tum(source.parent):
         source = source.parent
@@ -67,7 +68,7 @@ def _opened(path: str | Path, said: Options) -> Source:
 
 
 def _format(source: Path, said: Options) -> Format:
-    """Return the format of the options, else the identified one. Raises InputError."""
+    """Return the format that the options name; without a name, identify it. Raises InputError."""
     one = FORMATS.get(said.format) if said.format else format_of(source)
     if one is not None:
         return one
@@ -86,19 +87,20 @@ def _format(source: Path, said: Options) -> Format:
 
 
 def _hint_of_many(folder: Path) -> str | None:
-    """Return how a folder of captures is imported; None where it is none."""
+    """Return a hint how to import a folder of captures; None if the folder holds no captures."""
     if not folder.is_dir() or not any(format_of(item) for item in sorted(folder.iterdir())[:FEW_CAMERAS]):
         return None
     return f"a folder of captures: --jobs '{folder}/*' makes a recording of each"
 
 
 def open_sources(paths: Sequence[str | Path], options: Options | None = None) -> Source:
-    """Return the contents of one or several captures as one source; each of several is a camera or a motion capture of the same
-    recording.
+    """Return the contents of one or more captures as a single source.
+
+    Several captures must belong to the same recording: each is a camera or a motion capture.
 
     Arguments:
         paths: files or folders; NAME=PATH names the camera.
-        options: of the user, for all of them; a topic may be in any of the bags.
+        options: of the user, for all captures; a topic may be in any of the bags.
 
     Raises:
         InputError: as `open_source`; duplicate names; clocks that do not overlap, not even by recording time.
@@ -146,7 +148,7 @@ def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
 
 
 def _one_of(path: Path, options: Options) -> Source:
-    """Return one of several captures, a camera of its own."""
+    """Return one of several captures as a source; it must hold a single camera."""
     one = _format(path, options) if path.exists() else None
     if one is not None and one.topics is not None and options.topics:
         held = set(one.topics(path))
@@ -164,7 +166,7 @@ def _one_of(path: Path, options: Options) -> Source:
 
 
 def split_name(text: str | Path) -> tuple[str, Path]:
-    """Return the name, empty where none is given, and the path of NAME=PATH."""
+    """Return the name and the path of NAME=PATH; an empty name if only a path is given."""
     name, mark, path = str(text).partition("=")
     if Path(text).expanduser().exists() or not mark or not re.fullmatch(r"\w[\w-]*", name):
         return "", Path(text).expanduser()
@@ -172,7 +174,7 @@ def split_name(text: str | Path) -> tuple[str, Path]:
 
 
 def guess_format(path: Path) -> str | None:
-    """Return a name of FORMATS from the first bytes, the ending and the files of a folder; None where nothing fits."""
+    """Identify a format of FORMATS by the first bytes, the ending, or the files of a folder; return its name, None if there is none."""
     one = format_of(path)
     return None if one is None else one.name
 
@@ -181,6 +183,6 @@ def contents(path: Path) -> dict[str, Any]:
     """Return the contents of a capture for `femsense inspect`, without reading its frames.
 
     Raises:
-        InputError: it is broken, empty, or of an unknown format.
+        InputError: the capture is broken, empty, or of an unknown format.
     """
     return contents_of(_format(path, Options()), path)

@@ -48,7 +48,10 @@ def select_next(setting: Setting, fitted: FittedModel, table: list[Candidate]) -
 
 
 def leaders(setting: Setting, fitted: FittedModel, refits: Mapping[int, Refit]) -> dict[int, Refit]:
-    """Return the eligible refits within `evidence` of the best one, on fitted and held-out data together, each with its seed improved."""
+    """Return the eligible refits whose score on all data is within the threshold `evidence` of the best score, each with its seed improved.
+
+    "All data" are the fitted and the held-out frames together.
+    """
     able = eligible(setting.data, refits.values(), setting.noise)
     best = max((r.on_all_data for r in able), default=np.inf)
     near = {i: r for i, r in refits.items() if r in able and r.on_all_data > best - setting.data.thresholds.evidence}
@@ -66,7 +69,7 @@ def _refitted(setting: Setting, fitted: FittedModel, listed: Sequence[Candidate]
         record = RefitRecord(name, candidate.seed)
         others = [
             r.score for r in refits.values() if r.record.passes and r.candidate.effect.name != name
-        ]  # forms of one effect share their errors, so that one must not stop another early
+        ]  # forms of the same effect share their errors, so that a form must not stop another form early
         wanted = max([evident, *(score - 2.0 * evident for score in others)])
         try:
             made = refit(setting.data, fitted, candidate, setting.noise, wanted=wanted)
@@ -79,13 +82,15 @@ def _refitted(setting: Setting, fitted: FittedModel, listed: Sequence[Candidate]
 
 
 def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
-    """Return the records with those of the refits in their places."""
+    """Return the records, replaced by the record of the refit where there is one."""
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
 def polished(setting: Setting, fitted: FittedModel, refitted: Refit) -> Refit:
-    """Return a refit with an improved seed, tested again, and with the scatter of its coordinates over seeds that fit equally well. A refit that passes
-    keeps a seed whose improvement does not."""
+    """Return a refit with an improved seed, tested again, and with the scatter of its coordinates over seeds that fit equally well.
+
+    If the refit passes the acceptance test with its present seed and fails it with the improved seed, the present seed is kept.
+    """
     made, scatter = _polish(setting, fitted, refitted)
     record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
@@ -95,7 +100,7 @@ def polished(setting: Setting, fitted: FittedModel, refitted: Refit) -> Refit:
 
 
 def _enriched(setting: Setting, fitted: FittedModel, winner: Refit, table: list[Candidate]) -> Refit:
-    """Return the best refit in a form with more parameters if that has `evidence` over the simpler one."""
+    """Return the best refit in a form with more parameters, if the evidence for that form exceeds the threshold `evidence`."""
     data, noise = setting.data, setting.noise
     winner = _with_more_markers(setting, fitted, winner, table)
     for form in _forms(table, winner.candidate.effect.name):
@@ -115,8 +120,11 @@ def _enriched(setting: Setting, fitted: FittedModel, winner: Refit, table: list[
 
 
 def _with_more_markers(setting: Setting, fitted: FittedModel, winner: Refit, table: list[Candidate]) -> Refit:
-    """Return marker offsets extended by those of further markers, one at a time while each has `evidence`: the penalty of all at once is too large.
-    Other effects are returned unchanged."""
+    """Return marker offsets extended by the offsets of further markers; other effects are returned unchanged.
+
+    Markers are added one at a time, while the evidence for each exceeds the threshold `evidence`. One test of all markers together would
+    reject a few real offsets, because its penalty counts the parameters of all markers.
+    """
     data, noise = setting.data, setting.noise
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
@@ -177,7 +185,10 @@ def shortlist(table: list[Candidate], thresholds: Thresholds, effort: Effort, *,
 
 
 def hinted(table: list[Candidate], thresholds: Thresholds, effort: Effort) -> bool:
-    """Return whether candidates screened with fields of the previous model may gain enough with fields of the current one."""
+    """Return whether a candidate could be on the shortlist of the present model, judged by the fields of the previous model.
+
+    With the fields of the present model, a candidate may gain up to 1 / `thresholds.hinted` times as much.
+    """
     wished = [replace(c, score=c.gain / thresholds.hinted - c.cost) for c in table]
     return bool(shortlist(wished, thresholds, effort, first=False))
 

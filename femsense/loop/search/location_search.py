@@ -32,7 +32,7 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.robot import Robot
 
 GAINS_ONLY = 100.0
-"""Number of observations where only gains are compared, which do not depend on it."""
+"""Number of observations that is assumed when only gains are compared, which are independent of that number."""
 
 
 def located(

@@ -26,7 +26,8 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.observation import SceneJet
 
 COLLINEAR = 0.95
-"""Cosine of two fields above which they count as one: two places of an effect, or two effects that an experiment does not distinguish."""
+"""Cosine of the angle between two fields, above which the fields are treated as equal: two places of an effect, or two effects that an
+experiment does not distinguish."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -198,7 +198,7 @@ def test_memory_of_dead_factors_is_used_again(solver: str) -> None:
     if solver == "pardiso":
         assert len(pattern.idle) == 1
     if solver == "cholesky":
-        assert all(len(idle) == 1 for idle in pattern.analysis().idle.values())
+        assert all(len(idle) == 1 for idle in pattern.analysis().pool.idle.values())
 
 
 @pytest.mark.parametrize("quadratic", [False, True])
