@@ -134,14 +134,12 @@ def search_recordings(
     robot: Robot,
     recordings: Sequence[Recording],
     *,
-    validation: Sequence[Recording] = (),
     effects: Sequence[str] | None = None,
-    without: Sequence[str] | None = None,
     options: ImproveOptions | None = None,
 ) -> tuple[Data, Search]:
     """Return the data and the completed search, without the conclusion that `conclude` draws; arguments and errors as of `improve`."""
     options, work = options or ImproveOptions(), WorkPlan(lambda text: None)
-    task = _task(robot, recordings, validation, effects, without, options, work)
+    task = _task(robot, recordings, (), effects, None, options, work)
     with Checkpoint(options.keep, task.forms) as checkpoint:
         return _searched(task, checkpoint, work)
 

@@ -217,17 +217,6 @@ class SceneJet:
     pulled: BoolArray
     """Whether the derivatives count the tension of a frame as not cut off, shape (F, a)."""
 
-    def pick(self, rows: BoolArray) -> SceneJet:
-        """Return the jet of some of the rows (k,)."""
-        return replace(
-            self,
-            residual=self.residual[rows],
-            by_pose=self.by_pose[rows],
-            by_initial=self.by_initial[rows],
-            by_effect=self.by_effect[rows],
-            by_input=self.by_input[rows],
-        )
-
 
 def evaluate_scene(
     hypothesis: Hypothesis,

@@ -28,8 +28,6 @@ class Actuation:
     """true = recorded + offset [m], shape (a,)."""
     slack: FloatArray
     """Play that is taken up before a cable pulls [m], shape (a,)."""
-    stretch_stiffness: FloatArray
-    """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
     coupling: FloatArray | None = None
     """Share of the scaled input of each cable (column) that is added to each other one (row) [1], shape (a, a); None: none."""
     pressure_gain: FloatArray = field(default_factory=lambda: freeze(np.ones(())))
@@ -178,7 +176,7 @@ class Robot:
 def plain_actuation(cable_count: int) -> Actuation:
     """Return the transmission of cables whose true inputs equal the recorded ones."""
     one, zero = np.ones(cable_count), np.zeros(cable_count)
-    return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero), freeze(one * np.inf))
+    return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero))
 
 
 def spread_features(body: BodyModel, count: int, *, among: IntArray | None = None) -> IntArray:

@@ -70,9 +70,9 @@ def statistic(value: Any, digits: int = 3) -> str:
     return "0" if known(value) and abs(value) < NIL else number(value, digits)
 
 
-def signed(value: Any, digits: int = 2) -> str:
+def signed(value: Any) -> str:
     """Return a number with its sign, also where it is positive."""
-    text = number(value, digits)
+    text = number(value, 2)
     return f"+{text}" if known(value) and value > 0 else text
 
 

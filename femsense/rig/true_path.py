@@ -99,19 +99,18 @@ class _Load:
         return _Load(inputs, forces, contact, gravity, pressures)
 
 
-def true_path(robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Path()) -> list[TrueFrame]:
+def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]:
     """Return the true state of every frame.
 
     Arguments:
         robot: see `true_robot`.
         plan: the inputs and loads.
         substeps: steps from frame to frame; inputs and loads are interpolated linearly.
-        folder: of the object meshes.
 
     Raises:
         DataError: no equilibrium.
     """
-    path = TruePath(robot, plan, folder)
+    path = TruePath(robot, plan, Path())
     return [path.frame(k, substeps) for k in range(len(plan.time_s))]
 
 
@@ -122,7 +121,8 @@ def true_course(
     the one before.
 
     Arguments:
-        robot, plan, substeps, folder: as of `true_path`.
+        robot, plan, substeps: as of `true_path`.
+        folder: of the object meshes.
         kept: progress of an interrupted call; the continuation gives bit-identical results.
     """
     course = kept or Course()

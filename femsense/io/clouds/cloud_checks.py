@@ -24,11 +24,11 @@ OTHER_UNIT = 5.0
 """Ratio of the distances of clouds and markers of a frame above which their units differ."""
 
 
-def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[int, int, PointCloud]]:
+def some_clouds(recording: Recording) -> list[tuple[int, int, PointCloud]]:
     """Return frame, view and cloud of some frames that have one and whose file can be read."""
     r = recording
     having = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
-    chosen = [having[i] for i in spread_evenly(len(having), most)]
+    chosen = [having[i] for i in spread_evenly(len(having), CLOUDS_READ)]
     found = []
     for k, v in chosen:
         try:

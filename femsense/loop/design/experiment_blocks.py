@@ -121,7 +121,6 @@ class Block:
     """Rows of rest.csv, one set per recording."""
     states: int
     """Number of distinct states of markers."""
-    rows: int
 
 
 def make_block(
@@ -159,7 +158,7 @@ def make_block(
     distinct = len(np.unique(trial.groups.state[rows]))
     gram, placements = _gram(_own(jet)[rows], columns[rows], noise), _placements(jet, rest_columns, noise)
     if not with_rest:
-        return Block(recording, gram, None, placements, distinct, int(rows.sum()))
+        return Block(recording, gram, None, placements, distinct)
     placed = _with_rest(trial, robot)
     jet = _jet(placed, robot, jet.states)
     moved = [f for f in forms if f.effect.moves_rest]  # only these change the measured placements
@@ -167,7 +166,7 @@ def make_block(
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
     rested = _gram(_own(jet)[rows], columns[rows], noise)
-    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), distinct, int(rows.sum()))
+    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), distinct)
 
 
 def _own(jet: SceneJet) -> FloatArray:

@@ -47,8 +47,6 @@ class Step:
     """One candidate that was added."""
 
     element: Element
-    confusion: float
-    """Before it."""
     better: tuple[str, ...]
     """Its benefits, in words."""
 
@@ -296,7 +294,7 @@ def _grow(
         if best is None or best[0] > now.confusion - WORTH:
             return steps, now
         _, element, then = best
-        steps.append(Step(element, now.confusion, tuple(_better(now, then))))
+        steps.append(Step(element, tuple(_better(now, then))))
         have = have if element.rest_file else [*have, blocks[element.key]]
         rest, now, budget = rest or element.rest_file, then, budget - element.frames
         extras = [e for e in extras if e is not element]

@@ -286,10 +286,3 @@ def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise
 
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     return JointProblem(fit.hypothesis, fit.prior, data.train, noise.whiteners(data.train), data.placement_std)
-
-
-def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:
-    """Return a fit with other weights or rows, at its current values, with the `jets` of the rows; its nonsmoothness is not recomputed."""
-    residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
-    assert jacobian is not None
-    return replace(fit, fit=replace(fit.fit, residual=residual, jacobian=jacobian), chi2=float(residual @ residual), jets=jets)

@@ -42,22 +42,19 @@ class _Weights:
         return _Weights(self.hidden + step[:first].reshape(self.hidden.shape), self.out + step[first:].reshape(self.out.shape))
 
 
-def train_bayesian(
-    x: FloatArray, y: FloatArray, *, rng: np.random.Generator, hidden: int = HIDDEN, steps: int = STEPS
-) -> Network:
+def train_bayesian(x: FloatArray, y: FloatArray, *, rng: np.random.Generator, steps: int = STEPS) -> Network:
     """Return the paper's network.
 
     Arguments:
         x: inputs, shape (n, d).
         y: outputs, shape (n, o).
         rng: for the weights at the start.
-        hidden: sigmoid units.
         steps: Levenberg–Marquardt steps at most.
     """
     centre, scale = x.mean(axis=0), inverse_spread(x)
     middle, size = y.mean(axis=0), 1.0 / float(inverse_spread(y.ravel()[:, None])[0])
     z = np.hstack([(x - centre) * scale, np.ones((len(x), 1))])
-    weights = _minimise(z, (y - middle) / size, _start(z, y.shape[1], hidden, rng), steps)
+    weights = _minimise(z, (y - middle) / size, _start(z, y.shape[1], rng), steps)
     A, d = size * weights.out[:, :-1], middle + size * weights.out[:, -1]
     return Network(
         Units.SIGMOID, centre, scale, weights.hidden[:, :-1], weights.hidden[:, -1], A, np.zeros((len(d), x.shape[1])), d
@@ -121,14 +118,14 @@ def _normal_equations(z: FloatArray, errors: FloatArray, H: FloatArray, weights:
     return G, slope
 
 
-def _start(z: FloatArray, outputs: int, hidden: int, rng: np.random.Generator) -> _Weights:
+def _start(z: FloatArray, outputs: int, rng: np.random.Generator) -> _Weights:
     """Return weights that spread the units over the inputs (Nguyen and Widrow 1990)."""
     inputs = z.shape[1] - 1
-    W = rng.standard_normal((hidden, inputs))
-    W *= 1.4 * hidden ** (1.0 / inputs) / np.linalg.norm(W, axis=1, keepdims=True)
-    places = z[rng.integers(len(z), size=hidden), :-1]
+    W = rng.standard_normal((HIDDEN, inputs))
+    W *= 1.4 * HIDDEN ** (1.0 / inputs) / np.linalg.norm(W, axis=1, keepdims=True)
+    places = z[rng.integers(len(z), size=HIDDEN), :-1]
     W = np.hstack([W, -(W * places).sum(axis=1, keepdims=True)])
-    return _Weights(W, 0.1 * rng.standard_normal((outputs, hidden + 1)))
+    return _Weights(W, 0.1 * rng.standard_normal((outputs, HIDDEN + 1)))
 
 
 def inverse_spread(x: FloatArray) -> FloatArray:

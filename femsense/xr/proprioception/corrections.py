@@ -103,7 +103,7 @@ def explain(frames: Frames) -> tuple[str, dict[str, float]]:
     return chosen, {name: marker_rms(found) for name, found in errors.items()}
 
 
-def is_better(errors: FloatArray, than: FloatArray, *, seed: int = 0) -> bool:
+def is_better(errors: FloatArray, than: FloatArray) -> bool:
     """Whether errors are smaller than others of the same frames, shape (n, 3 m), by a tenth of the mean distance, and not by chance.
 
     Parts in time are drawn again and again (Künsch 1989), the same of both; in 95 of 100 drawings they have to be smaller.
@@ -112,7 +112,7 @@ def is_better(errors: FloatArray, than: FloatArray, *, seed: int = 0) -> bool:
         return False
     gained = (marker_distances(than) - marker_distances(errors)).sum(axis=1)
     parts = np.array([part.sum() for part in np.array_split(gained, min(RESAMPLED, len(gained)))])
-    drawn = np.random.default_rng(seed).integers(len(parts), size=(RESAMPLES, len(parts)))
+    drawn = np.random.default_rng(0).integers(len(parts), size=(RESAMPLES, len(parts)))
     return bool(np.quantile(parts[drawn].sum(axis=1), 0.05) > 0.0)
 
 

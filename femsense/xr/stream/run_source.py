@@ -51,12 +51,11 @@ class RunStream:
         return float(self.skin.time_s[-1])
 
 
-def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True) -> RunStream:
+def open_run(folder: str | Path, *, clouds: bool = True) -> RunStream:
     """Read a run folder; its mesh is created if it is missing.
 
     Arguments:
         folder: written by `femsense estimate`.
-        name: of the robot in topics; by default the run's own.
         clouds: read the recording's clouds too, if they still exist.
 
     Raises:
@@ -70,7 +69,7 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
     skeleton = skin.skin.skeleton
     stress = stress_of_run(run, glb)
     twin = Twin(
-        name=name or str(told["name"]),
+        name=str(told["name"]),
         glb=glb,
         bone_names=skeleton.names,
         T_robot_bone=skeleton.T_robot_bone,

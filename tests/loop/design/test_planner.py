@@ -78,7 +78,7 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     shared[:, 4] = shared[:, 1] + 0.3 * shared[:, 4]
     forms = [form("stiffness", 0, 1), form("poisson", 1, 1), form("gravity", 2, 2), form("geometry", 4, 1)]
     gram = Gram(own.T @ own, own.T @ shared, shared.T @ shared)
-    identifiability = Judge(forms).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
+    identifiability = Judge(forms).judge([Block("a", gram, None, nothing(3, 5), 40)])
     prior = np.zeros((1, 4))
     prior[0, 3] = 1 / MODULUS_STD
     N = np.vstack([np.hstack([own, shared[:, :1]]), prior])
@@ -107,7 +107,7 @@ def test_two_recordings_have_two_poses_and_one_has_one():
     halves = [(own[s], shared[s]) for s in (slice(0, 15), slice(15, 30))]
 
     def acceptance_test(keys):
-        blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, nothing(3, 1), 15, 15) for k, (o, s) in zip(keys, halves)]
+        blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, nothing(3, 1), 15) for k, (o, s) in zip(keys, halves)]
         return Judge(forms).judge(blocks).rows[0].retained
 
     assert acceptance_test("aa") > 0.5
