@@ -10,6 +10,8 @@ from threading import Lock
 
 MERGE_S = 2.0
 """An event that recurs within this time continues, with a higher count [s]. It bounds the number of events in a long session."""
+SAVED_S = 10.0
+"""Events that go on are written again at this interval, for a session that is killed [s]."""
 SHOWN_S = 10.0
 """Events are displayed for this long after their end [s]."""
 
@@ -73,6 +75,7 @@ class EventLog:
         """Arguments: start of the session, and the clock [s, monotonic clock]."""
         self.begun_s, self._clock = begun_s, clock
         self._lock = Lock()
+        self._saved_s = begun_s
         self._open: dict[StrEnum, SessionEvent] = {}
         self._newest: dict[StrEnum, SessionEvent] = {}
         self._counts: dict[StrEnum, int] = {}
@@ -98,11 +101,15 @@ class EventLog:
                 self._occurred(kind, text, now, float("inf"), 1)
 
     def tick(self) -> None:
-        """Write the events that can no longer recur."""
+        """Write the events that can no longer recur, and from time to time those that have changed."""
         with self._lock:
             now = self._clock()
             for event in [one for one in self._open.values() if one.ended_s < now - MERGE_S]:
                 self._close(event)
+            if now - self._saved_s >= SAVED_S:
+                self._saved_s = now
+                for event in [one for kind, one in self._open.items() if one != self._written[kind]]:
+                    self._emit(event)
 
     def write_to(self, write: Callable[[SessionEvent], None]) -> None:
         """Begin to write, first the events that nothing has received yet.

@@ -61,8 +61,6 @@ class RawFrame:
     markers: tuple[Marker, ...] = ()
     arrived_s: float = NAN
     """Arrival on this machine [s, monotonic clock]."""
-    ready_s: float = NAN
-    """Since when its reader waited for it [s, monotonic clock]; nan: unknown."""
     view_stamps_s: tuple[float, ...] = ()
     """Exposure time of each camera if there are several [s]."""
     exposure_s: float = NAN
@@ -71,6 +69,8 @@ class RawFrame:
     """Whether a recording declares the frame contact-free; None: unknown."""
     inputs: tuple[tuple[str, float], ...] = ()
     """Inputs of the frame: column of frames.csv (`cable_<name>`, `chamber_<name>`) and value [N], [m] or [Pa]."""
+    ready_s: float = NAN
+    """Since when its reader waited for it [s, monotonic clock]; nan: unknown."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

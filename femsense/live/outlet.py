@@ -84,7 +84,8 @@ class Outlet:
     def tell(self, snapshot: Snapshot, now_s: float) -> None:
         """Send the state of the session; while the camera is lost, repeat the last result with its status and age."""
         if snapshot.answer is None:
-            self.publisher.options = replace(self.publisher.options, waits_for=snapshot.todo or snapshot.phase)
+            doing = f"{snapshot.phase}: {snapshot.todo}" if snapshot.todo else snapshot.phase
+            self.publisher.options = replace(self.publisher.options, waits_for=f"the first forces ({doing})")
         elif self._last is not None and _is_lost(snapshot):
             frame, taken_s = self._last
             text = f"{snapshot.link.text(now_s)}; the last result is {now_s - taken_s:.1f} s old"

@@ -38,6 +38,8 @@ POLL_S = 0.1
 MOST_CALIBRATIONS = 4
 RECENT_S = 1.0
 """A state in which there was a contact this long ago is no contact-free reference [s]."""
+PATIENCE = "seconds, or a minute for quadratic elements; movements and touches do not matter meanwhile"
+"""Instruction during computations: frames that arrive are skipped."""
 STROKE = 0.1
 """Assumed largest displacement of a cable, as a share of the body's diagonal."""
 ACTUATION = (Notice.ACTUATION_LATE, Notice.ACTUATION_FROZEN, Notice.ACTUATION_AWAY)
@@ -307,7 +309,7 @@ class Session:
 
         Raises DataError after MOST_CALIBRATIONS attempts.
         """
-        self._phase, self._todo = Phase.CALIBRATING, ""
+        self._phase, self._todo = Phase.CALIBRATING, f"from {recording.frame_count} frames; {PATIENCE}"
         self._calibrations += 1
         try:
             found = calibrate(self.robot, recording)
@@ -333,7 +335,7 @@ class Session:
 
     def _learn(self, growing: GrowingRecording) -> None:
         """Estimate noise and model error from the contact-free frames, and process these frames, as a replay does."""
-        self._phase, self._todo = Phase.LEARNING, ""
+        self._phase, self._todo = Phase.LEARNING, PATIENCE
         self.log.lasts(Notice.CONTACT_FREE, "")
         assert self._calibration is not None
         if self._recorder is not None:
@@ -341,7 +343,7 @@ class Session:
         self._senser = Senser(self.robot, growing.recording, self._calibration)
         for k in range(growing.recording.frame_count):
             self._record(self._senser.sense(growing.recording, k))
-        self._phase = Phase.SENSING
+        self._phase, self._todo = Phase.SENSING, ""
 
     def _asked_to_tare(self, frame: StampedFrame | None) -> None:
         """Begin a new part with the present state as reference, unless there is a contact: the reference would hide its force."""

@@ -60,6 +60,17 @@ def test_a_condition_has_a_duration_and_one_that_flaps_is_one_event() -> None:
     assert finals(rows) == [(LinkState.UNPLUGGED, "again", 100.0, 107.0, 2)]
 
 
+def test_an_event_that_goes_on_is_written_now_and_then_as_the_session_may_be_killed() -> None:
+    log, clock = log_of()
+    rows: list[SessionEvent] = []
+    log.write_to(rows.append)
+    for _ in range(25):
+        clock.now += 1.0
+        log.happened(Notice.MISSED, "more", 3)
+        log.tick()
+    assert [row.count for row in rows] == [3, 30, 60]
+
+
 def test_what_happens_before_something_is_recorded_is_written_then() -> None:
     log, clock = log_of()
     log.happened(Notice.STAMPS_BACK, "early")

@@ -188,14 +188,15 @@ LATE = """
 const page = await opened.newPage({ viewport: { width: 700, height: 500 } });
 await page.goto(given[0]);
 await page.waitForFunction(() => femsense.shown.robots.get('bar')?.body?.isStale, null, { timeout: 60000 });
-const early = await page.textContent('#badge');
+await page.waitForFunction(() => document.querySelector('#about').textContent.includes('reconnect'), null, { timeout: 20000 }).catch(() => undefined);
+const [early, about] = [await page.textContent('#badge'), await page.textContent('#about')];
 const forces = () => page.evaluate(() => ['#sum', '#plot', '#contacts', '#curve', '#forces'].map((id) => document.querySelector(id).checkVisibility()));
 const spoken = await forces();
 await page.click('#robots button:has-text("mute")');
 await page.waitForFunction(() => femsense.shown.robots.get('mute').shown);
 await page.waitForFunction(() => !document.querySelector('#sum').checkVisibility(), null, { timeout: 20000 }).catch(() => undefined);
 const unspoken = await forces();
-console.log(JSON.stringify({ badge: early, spoken, unspoken, state: await page.evaluate(() => document.documentElement.dataset.stream),
+console.log(JSON.stringify({ badge: early, about, spoken, unspoken, state: await page.evaluate(() => document.documentElement.dataset.stream),
   live: await page.evaluate(() => femsense.shown.robots.get('bar-2').told.state),
   rate: await page.evaluate(async (bytes) => {                 // a page that is busy takes few poses: one of ten here, every 100 ms
     const robot = femsense.shown.robots.get('bar-2'), pose = new Uint8Array(bytes), head = new DataView(pose.buffer);
@@ -281,7 +282,13 @@ def test_who_comes_late_sees_that_a_stream_has_stopped_the_rate_is_the_source_s_
         assert within(5.0, lambda: source.publishers[0].sent > 0)
         source.flowing.clear()
         time.sleep(0.2)
-        source.hub.publish([Message("femsense/bar/status", status_bytes("stale", "unplugged for 9 s; reconnect the camera", time.time() - 100.0))])
+        source.hub.publish(
+            [
+                Message(
+                    "femsense/bar/status", status_bytes("stale", "unplugged for 9 s; reconnect the camera", time.time() - 100.0)
+                )
+            ]
+        )
         known = source.hub.newest()
         mute = {kind: known[f"femsense/bar/{kind}"].payload for kind in ("glb", "model", "pose")}
         mute["model"] = mute["model"].replace(b'"name":"bar"', b'"name":"mute"')
