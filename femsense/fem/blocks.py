@@ -21,18 +21,23 @@ def block_mesh(
     keep: Callable[[FloatArray], BoolArray] | None = None,
     place: Callable[[FloatArray], FloatArray] | None = None,
 ) -> TetMesh:
-    """Return the tetrahedra of a grid of blocks, six a cell, always the same ones.
+    """Mesh a body made of blocks: a grid of hexahedral cells, each split into six tetrahedra.
 
     Cells are split by Kuhn's rule, mirrored from each cell to the next, so that neighbours fit together and a grid with an even
     number of cells along an axis is its own mirror image across it (a symmetric body bends symmetrically).
 
     Arguments:
-        levels: where the cells begin and end along each of the three axes, rising, any unit.
-        keep: centres of the cells (c, 3) → which of them belong to the body, shape (c,); by default all.
-        place: grid points (n, 3) → where they are [m], (n, 3); by default as they are.
+        levels: coordinates of the grid planes along each of the three axes, increasing, in any unit.
+        keep: function from the centres of the cells (c, 3) to a mask of those that belong to the body, shape (c,). Default: all.
+        place: function from the grid points (n, 3) to their positions [m], shape (n, 3). Default: unchanged.
 
     Raises:
         InputError: levels that do not rise, or no cell left.
+
+    Example:
+        >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])  # m
+        >>> mesh.nodes.shape, mesh.tets.shape  # ten by two by two cells of six tetrahedra
+        ((99, 3), (240, 4))
     """
     axes = [np.asarray(level, dtype=np.float64) for level in levels]
     for name, axis in zip("xyz", axes):

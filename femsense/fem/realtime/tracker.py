@@ -89,7 +89,7 @@ class Tracker:
         single: bool | None = None,
         most_factorisations: int = MOST,
     ) -> None:
-        """Start at the equilibrium without tensions.
+        """Prepare to track, from the state at rest.
 
         Arguments:
             body: body with its weight, without friction, chambers and compliant clamps.
