@@ -21,15 +21,15 @@ def block_mesh(
     keep: Callable[[FloatArray], BoolArray] | None = None,
     place: Callable[[FloatArray], FloatArray] | None = None,
 ) -> TetMesh:
-    """Mesh a body made of blocks: a grid of hexahedral cells, each split into six tetrahedra.
+    """Return the tetrahedra of a grid of blocks, six per cell; the same input gives the same mesh.
 
     Cells are split by Kuhn's rule, mirrored from each cell to the next, so that neighbours fit together and a grid with an even
     number of cells along an axis is its own mirror image across it (a symmetric body bends symmetrically).
 
     Arguments:
-        levels: coordinates of the grid planes along each of the three axes, increasing, in any unit.
-        keep: function from the centres of the cells (c, 3) to a mask of those that belong to the body, shape (c,). Default: all.
-        place: function from the grid points (n, 3) to their positions [m], shape (n, 3). Default: unchanged.
+        levels: coordinates of the cells' sides along each of the three axes, increasing, in any unit.
+        keep: function of the centres of the cells (c, 3); returns whether each cell belongs to the body, shape (c,). Default: all.
+        place: function of the grid points (n, 3); returns the node positions [m], shape (n, 3). Default: the grid points.
 
     Raises:
         InputError: levels that do not rise, or no cell left.
