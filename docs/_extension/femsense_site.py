@@ -33,7 +33,7 @@ Python 3.11 and 3.12; SI units; command line and Python. Each link leads to a pa
 """
 
 
-ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]", re.DOTALL)
+ARRAY_LIKE = re.compile(r"~?[\w.]*_Buffer \| ~?[\w.]*_SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]", re.DOTALL)
 """What Sphinx makes of npt.ArrayLike."""
 ALIGNED = re.compile(r"\\begin\{(aligned|align\*?|split)\}(.*?)\\end\{\1\}", re.DOTALL)
 
