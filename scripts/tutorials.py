@@ -62,7 +62,8 @@ def printed_by(cell: Cell, names: dict[str, Any], scratch: Path) -> str:
     file = scratch / "printed.txt"
     with file.open("w", encoding="utf-8") as stream, contextlib.redirect_stdout(stream):
         exec(compile(cell.text, "<cell>", "exec"), names)  # the tutorials of this repository
-    return file.read_text(encoding="utf-8").strip("\n")
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return "\n".join(line for line in lines if not line.startswith("compiling kernels")).strip("\n")
 
 
 def page_of(name: str) -> tuple[str, dict[str, Path]]:

@@ -14,7 +14,7 @@ from typing import Any
 import latex2mathml.converter
 import typer.main
 from docutils import nodes
-from sphinx.addnodes import desc_annotation
+from sphinx.addnodes import desc_annotation, pending_xref_condition
 from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
@@ -33,7 +33,7 @@ Python 3.11 and 3.12; SI units; command line and Python. Each link leads to a pa
 """
 
 
-ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]", re.DOTALL)
+ARRAY_LIKE = re.compile(r"~?[\w.]*_Buffer \| ~?[\w.]*_SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]", re.DOTALL)
 """What Sphinx makes of npt.ArrayLike."""
 ALIGNED = re.compile(r"\\begin\{(aligned|align\*?|split)\}(.*?)\\end\{\1\}", re.DOTALL)
 
@@ -141,10 +141,12 @@ def _plain(text: str | None) -> str | None:
 def plain_annotations(_: Sphinx, page: nodes.document) -> None:
     """Write the types of fields as the source has them."""
     for node in page.findall(desc_annotation):
-        if ARRAY_LIKE.search(node.astext()):
-            text = ARRAY_LIKE.sub("ArrayLike", node.astext())
+        once = node.deepcopy()  # a name stands twice in it: as it is shown, and as it is shown if its link is found
+        for twice in list(once.findall(lambda one: isinstance(one, pending_xref_condition) and one["condition"] == "resolved")):
+            twice.parent.remove(twice)
+        if ARRAY_LIKE.search(text := once.astext()):
             node.clear()
-            node += nodes.Text(text)
+            node += nodes.Text(ARRAY_LIKE.sub("ArrayLike", text))
 
 
 def write_llms(sphinx: Sphinx, failure: Exception | None) -> None:

@@ -33,6 +33,11 @@ def block_mesh(
 
     Raises:
         InputError: levels that do not rise, or no cell left.
+
+    Example:
+        >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])  # m
+        >>> mesh.nodes.shape, mesh.tets.shape  # ten by two by two cells of six tetrahedra
+        ((99, 3), (240, 4))
     """
     axes = [np.asarray(level, dtype=np.float64) for level in levels]
     for name, axis in zip("xyz", axes):

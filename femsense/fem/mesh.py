@@ -270,7 +270,14 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
             or "nearest_centre" (by distance to its centre, SOFA's rule; cables).
 
     Returns:
-        the embedding, with the distance outside.
+        the embedding: element and shape functions of each point, and its distance outside of the mesh.
+
+    Example:
+        >>> body = fs.load_robot("finger").body
+        >>> tip = fs.embed_points(body.mesh, np.array([[0.092, 0.0, 0.007]]))
+        >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})
+        >>> tip.positions(pulled.positions).round(3)  # m, deformed
+        array([[0.088, 0.   , 0.021]])
     """
     points = as_points(points)
     elements = _by_centre(mesh)

@@ -28,15 +28,10 @@ def holds_itself(body: BodyModel, state: State) -> bool:
 
 
 def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
-    """Return whether the stability of an equilibrium must be checked with a new factorisation.
+    """Return whether the current stiffness leaves the stability of a balanced state undecided.
 
-    The last tangent stiffness decides unless it was not positive definite, or was factorised at an earlier iterate whose residual was larger
-    than FAR times the tolerance.
-
-    Arguments:
-        loads: loads, and tolerance of the residual.
-        state: the equilibrium, with its last factorisation.
-        follows_path: ignore the second case, because the next load step factorises the stiffness of this state anyway.
+    It does where it was not positive definite, and where it was factorised far from the end. A path from one state to the next is
+    spared the latter (`follows_path`): the next step, which starts with the stiffness of this state, sees it.
     """
     return state.shifted or (not follows_path and state.factored_at > FAR * loads.tolerance)
 

@@ -144,6 +144,12 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
 
     Raises:
         InputError: the robot was made in Python and has properties that robot.toml can only express by effects.
+
+    Example:
+        >>> import tempfile
+        >>> path = fs.save_robot(fs.load_robot("finger"), tempfile.mkdtemp(), effects=[{"name": "stiffness", "scale": 0.9}])
+        >>> fs.load_robot(path).document["effects"]
+        [{'name': 'stiffness', 'scale': 0.9}]
     """
     target = Path(folder)
     document = robot_document(robot, effects=effects)

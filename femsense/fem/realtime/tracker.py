@@ -1,14 +1,14 @@
-"""Equilibria of a body at camera rate: asymptotic-numerical continuation from frame to frame, with an error estimate, and the compliance.
+"""Follow a body from frame to frame while its inputs move: an equilibrium with a checked error, and its compliance,
+at camera rate.
 
-The state of a frame is a power series of up to three terms about an expansion point, a state whose stiffness was factorised some frames ago
-(`femsense.fem.realtime.power_series`): two or three solves, without assembly or factorisation.
-
-- **Error.** The error of a truncated series is below its last term, which is reported. After two terms, it is the third term as predicted from the last frame.
-- **New expansion point.** If the error will soon exceed a small share of the motion, or if the compliance has changed too much, a new point is chosen
-  slightly ahead of the motion. If a series fails at once, its sum becomes the new point. The first term from there is the true error of the old
-  series; if it exceeds the reported one, later reports are increased (`trust`).
-- **Compliance.** It is computed at the expansion points and extrapolated from them.
-- **Fallback.** If no series converges, `solve_equilibrium` is used.
+A frame follows from a state at which the stiffness was factorised some frames ago, as a power series of up to three terms
+(`femsense.fem.realtime.power_series`): two or three solves, no assembly, no factor. Where a series of terms x₁, x₂,
+x₃ is cut off, what is left is below its last term, and that is what is reported; where two terms do, it is what the third is
+expected to be, from the frame before. Where that will soon be more than a small share of the motion, or where the compliance has
+changed too much, a new start is made a little ahead on the way. Where a series fails at once, its sum becomes the start, and the
+first term from there is how far the old series has missed. That is compared with what was reported: where it was more, reports
+grow (`trust`). The compliance is known at the starts, and carried on from them. Where no series settles,
+`solve_equilibrium` takes over.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from femsense.fem.mesh import embed_points
 from femsense.fem.realtime.power_series import Expansion, combination
 
 GUESS = 4.0
-"""Factor on the reported error if the third term is only predicted from its growth in earlier frames."""
+"""Where the third term is only expected, from how it grew in frames before, the reported error is so many times that …"""
 FADES = 0.9
-"""Factor by which the weight of that growth decays with every third term computed since."""
+"""… and how it grew counts by so much less with every third term that was seen since."""
 SHRINK = 0.5
-"""Maximum ratio of consecutive terms of a converging series."""
+"""A term that is more than this share of the one before settles nothing."""
 NEAR = 0.005
-"""The extrapolation of the last frames is a new expansion point if its error in the previous frame was below this share of the motion."""
+"""The last frames carried on are a start where they missed by less than this share of the motion in the frame before."""
 CLOSE = 0.03
-"""Maximum distance of a new expansion point from its equilibrium, relative to the motion."""
+"""A start that is made for a frame is this share of the motion from its equilibrium at most."""
 LOOK, AHEAD = 0.25, 0.5
-"""A new expansion point is chosen if the series would fail this share of a motion ahead, and lies this share of a motion ahead."""
+"""A new start is made where the series would fail this share of a motion farther on, and so much of one ahead on the way."""
 DRIFT = 0.0165
-"""Maximum relative error of an extrapolated compliance."""
+"""Share by which the compliance may be off where it is carried on from other states."""
 LIBRARY = 16
-"""Maximum number of states whose compliance is stored."""
+"""States at most whose compliance is kept."""
 EXPLORED = 0.02
-"""Deformation by each cable, relative to the size of the body, at which the compliance is computed too."""
+"""How far a body is bent by each cable, as a share of its size, to learn how the compliance changes."""
 SOUND = 1e-5
-"""The stretches of a state are stored if its error is below this share of the body's size."""
+"""The stretches of a state are learnt where its error is below this share of the body's size."""
 MOST = 5
-"""Maximum number of factorisations per frame; then the full solver is used."""
+"""Factorisations a frame, before the full solver takes over."""
 SINGLE_FROM = 10_000
-"""Minimum number of unknowns for a factor in single precision; the series corrects its errors."""
+"""Unknowns from which on the factor is kept in single precision: the terms forgive its errors."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,22 +63,18 @@ class Tracked:
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     error_m: float
-    """Largest error of a node [m], estimated from the decrease of the terms."""
+    """How far any node may be from its equilibrium [m], estimated from how fast the terms shrink."""
     motion_m: float
-    """Largest displacement of a node since the last frame [m]."""
+    """How far the farthest node has moved since the frame before [m]."""
     residual_n: float
     """Largest unbalanced nodal force before the last term [N]."""
     factorisations: int
     fell_back: bool
-    """Whether the full solver was used."""
+    """Whether the full solver had to take over."""
 
 
 class Tracker:
-    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame.
-
-    The state is continued as a power series about a recently factorised one, with an error estimate in each frame. Cables with friction, held
-    cables, chambers and compliant clamps are not supported: use `solve_equilibrium`.
-    """
+    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame; without friction and without held cables."""
 
     def __init__(
         self,
@@ -89,17 +85,17 @@ class Tracker:
         single: bool | None = None,
         most_factorisations: int = MOST,
     ) -> None:
-        """Start at the equilibrium without tensions.
+        """Prepare to track.
 
         Arguments:
-            body: body with its weight, without friction, chambers and compliant clamps.
-            tolerance: maximum error of a frame, relative to its motion.
-            floor_m: error that is always accepted, and lower limit of the reported error [m].
+            body: with its weight; cables with friction, chambers and a clamp that gives are for `solve_equilibrium`.
+            tolerance: largest error of a frame, as a share of its motion.
+            floor_m: an error that is always small enough, and never undercut by what is reported [m].
             single: keep the factor in single precision; by default from SINGLE_FROM unknowns on.
-            most_factorisations: maximum number of factorisations per frame; then the full solver is used.
+            most_factorisations: so many a frame, before the full solver takes over.
 
         Raises:
-            InputError: the body has friction, chambers or a compliant clamp.
+            InputError: the body has what a tracker does not know.
         """
         if body.chambers or not body.clamp_is_rigid or any(c.friction > 0 for c in body.cables):
             raise InputError(
@@ -120,8 +116,8 @@ class Tracker:
         self._loads = np.zeros_like(body.mesh.nodes)
         self._terms: list[FloatArray] = []  # of the last series
         self._growth = 0.0  # largest recent ratio of the third term to second and first [1/m]
-        self._grown = False  # whether one is known from the current expansion point
-        self._learns = False  # whether the next accurate state is to be stored
+        self._grown = False  # whether one is known from the start at hand
+        self._learns = False  # whether the next sound state is to be learnt
         self._columns: dict[bytes, sp.csc_matrix] = {}
         self._known = Known(self.expansion.length)
 
@@ -129,8 +125,7 @@ class Tracker:
         """Return the state under new tensions [N] (cables that are not named are slack) and nodal forces [N], shape (n, 3).
 
         Raises:
-            InputError: wrong names or shapes.
-            FemsenseError: no equilibrium.
+            InputError: wrong names or shapes; FemsenseError: no equilibrium.
         """
         names = self.body.cable_names
         given = dict(tension or {})
@@ -145,9 +140,10 @@ class Tracker:
         return tracked
 
     def compliance(self, *, points: npt.ArrayLike = (), directions: npt.ArrayLike = ()) -> FloatArray:
-        """Return W as `femsense.compliance` does [m/N], extrapolated from the states at which it was computed.
+        """Return W as `femsense.compliance` does [m/N], carried on from the states at which it is known.
 
-        The first call with other points takes longer, because the compliance is computed with a little more tension in each cable too.
+        The first call with other points takes longer:
+        the compliance is learnt there with a little more tension in each cable too.
         """
         if not self._past:
             raise FemsenseError("nothing is tracked yet: call step first")
@@ -155,7 +151,7 @@ class Tracker:
         if P.shape != D.shape:
             raise InputError("points and directions differ in shape", where="directions", found=D.shape, expected=P.shape)
         k, key = len(P), P.tobytes()
-        if key not in self._columns:  # the same points in each frame: their columns are computed once
+        if key not in self._columns:  # the same points frame after frame: their columns are made once
             three = direction_rows(
                 embed_points(self.body.mesh, np.repeat(P, 3, axis=0)), np.tile(np.eye(3), (k, 1)), len(self.body.mesh.nodes)
             )
@@ -169,8 +165,8 @@ class Tracker:
         return np.concatenate([columns, rows[:, 3 * k :]], axis=1)
 
     def _explore(self) -> None:
-        """Compute the compliance at the current state and, for each cable, with a little more tension, because inputs can change in any
-        direction."""
+        """Learn the compliance at the state at hand and, for each cable, at one with a little more tension:
+        inputs may jitter all ways."""
         start, here, T = self.expansion, self._past[-1], self._tension
         self._known = Known(start.length)
         if not start.move(here, T):
@@ -193,7 +189,7 @@ class Tracker:
             raise FemsenseError("the state is unstable: reduce the load")
 
     def _know(self) -> None:
-        """Store the compliance at the current expansion point, unless it is known."""
+        """Add the compliance at the start at hand to what is known, unless it is."""
         start = self.expansion
         if self._known.newest is start.positions:
             return
@@ -203,7 +199,7 @@ class Tracker:
         self._known.add(start.positions, start.sample(start.positions), W, judge=len(self._known.states) > len(self._tension))
 
     def _follow(self, T: FloatArray, loads: FloatArray) -> Tracked | None:
-        """Return the state; None if no series converges."""
+        """Return the state, None where no series gets there."""
         if self.expansion.factor is None:
             return None
         last, carried, anew = self._past[-1], self._carried(), not self.expansion.is_series
@@ -234,7 +230,7 @@ class Tracker:
         return self.expansion.move(x, tension)
 
     def _look_ahead(self, T: FloatArray, motion: float) -> bool:
-        """Choose an expansion point slightly ahead if the current series will soon fail; return whether it was necessary."""
+        """Begin anew a little ahead on the way, where the series at hand will soon not do; return whether it was so."""
         start, terms = self.expansion, self._terms
         sizes, x = [_largest(term) for term in terms], start.positions
         if len(terms) < 2:
@@ -253,7 +249,8 @@ class Tracker:
         return max(self._tolerance * motion, self._floor)
 
     def _summed(self, T: FloatArray, loads: FloatArray, last: FloatArray, most: int) -> tuple[FloatArray, float, float]:
-        """Return the sum of a series, its first term and its error [m]; inf if the terms do not decrease."""
+        """Return the sum of a series of so many terms at most, its first term and its error [m],
+        inf where the terms do not shrink."""
         x, sizes, error, self._terms = self.expansion.positions, list[float](), np.inf, list[FloatArray]()
         for term in islice(self.expansion.terms(T, loads), most):
             sizes.append(_largest(term))
@@ -272,7 +269,7 @@ class Tracker:
         return x, sizes[0], error
 
     def _carried(self) -> FloatArray | None:
-        """Return the parabolic extrapolation of the last three states; None with fewer."""
+        """Return the last three states carried on as a parabola, None where there are fewer."""
         return 3.0 * self._past[2] - 3.0 * self._past[1] + self._past[0] if len(self._past) == 3 else None
 
     def _solve_anew(self, tension: Mapping[str, float], extra: FloatArray) -> Tracked:
@@ -289,16 +286,17 @@ class Tracker:
 
 
 class Known:
-    """The compliance at some states, extrapolated to others (`combination`), with an estimate of the error."""
+    """The compliance at some states, carried on to others (`combination`), and by how much that may be off."""
 
     def __init__(self, length: float) -> None:
-        """Start empty; `length` [m] is that of `combination`."""
+        """Know nothing; `length` [m] is that of `combination`."""
         self.states: list[FloatArray] = []  # samples of positions
         self.newest: FloatArray | None = None
         self._length, self._scale, self._stack = length, 1.0, np.zeros((LIBRARY, 0, 0))
 
     def add(self, x: FloatArray, state: FloatArray, W: FloatArray, *, judge: bool) -> None:
-        """Store the compliance W at positions x with a sample `state`; with `judge`, estimate from it the error of the extrapolation."""
+        """Keep the compliance W at positions x with a sample `state`; with `judge`,
+        learn from it how far the others have missed."""
         if judge:
             weights, doubt = combination(state, self.states, self._length)
             missed = _norm(W - np.tensordot(weights, self._stack[: len(weights)], 1)) / max(_norm(W), 1e-300)
@@ -318,7 +316,7 @@ class Known:
         return np.asarray(np.tensordot(weights, self._stack[: len(weights)], 1))
 
     def doubt(self, state: FloatArray) -> float:
-        """Return the relative error of W at a state; 0 if nothing is stored."""
+        """Return by which share W may be off at a state; 0 where nothing is known, since nobody has asked."""
         return self._scale * combination(state, self.states, self._length)[1] if self.states else 0.0
 
 

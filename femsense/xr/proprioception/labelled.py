@@ -30,20 +30,20 @@ class Course:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Labelled:
-    """Rows of readings, in order of time, each with all markers."""
+    """Training data of `learn`: sensor readings with marker positions, in order of time."""
 
     courses: tuple[Course, ...]
-    """Of the recordings that the rows are from."""
+    """Readings of each recording, with rows without markers too."""
     part: IntArray
-    """Which course each row is of, shape (n,)."""
+    """Index of the recording of each row, shape (n,)."""
     row: IntArray
-    """And which row of it, shape (n,)."""
+    """Row of that recording, shape (n,)."""
     markers: FloatArray
-    """[m], shape (n, m, 3)."""
+    """Marker positions [m], shape (n, m, 3)."""
     channels: tuple[str, ...]
     marker_names: tuple[str, ...]
     frame: str = AS_MEASURED
-    """Of reference: `ROBOT` or `AS_MEASURED`."""
+    """Coordinate system of the markers: `ROBOT` or `AS_MEASURED`."""
 
     def __len__(self) -> int:
         return len(self.row)
@@ -93,7 +93,9 @@ def labelled(
     marker_names: Sequence[str] | None = None,
     frame: str = AS_MEASURED,
 ) -> Labelled:
-    """Return readings with markers from arrays. Rows without a finite reading are left out; those without a finite marker only enter filters.
+    """Combine sensor readings and marker positions into training data for `learn`.
+
+    Rows without a finite reading are left out; those without a finite marker only enter filters.
 
     Arguments:
         time_s: when each row was read [s], not decreasing, shape (n,).
@@ -104,6 +106,14 @@ def labelled(
 
     Raises:
         InputError: shapes that do not match, decreasing times, or an unknown frame.
+
+    Example:
+        >>> time_s = np.arange(100) / 50.0
+        >>> bend = np.sin(2.0 * time_s)[:, None]  # one sensor
+        >>> tip = np.stack([0.1 * np.cos(bend), 0.0 * bend, 0.1 * np.sin(bend)], axis=2)  # one marker [m]
+        >>> data = fs.labelled(time_s, bend, tip, channels=("flex",), marker_names=("tip",))
+        >>> data.markers.shape
+        (100, 1, 3)
     """
     t, x, y = (np.asarray(array, dtype=np.float64) for array in (time_s, readings, markers))
     if t.ndim != 1 or x.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or not len(t) == len(x) == len(y):
