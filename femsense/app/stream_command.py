@@ -165,12 +165,13 @@ def stream_sensors(
 
 
 def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
-    """Let viewers drag the robot of a run that streams; the first that `live` plays.
+    """Let viewers drag the robot of a run that streams; the first that `live` plays. Its calibration's initial inputs are subtracted from commands.
 
     Raises InputError if commands are allowed but `StreamOptions.commands` is not set: the access control of brokers was not checked then.
     """
     if options.gate.allowed and not live.commands:
         raise InputError("this stream sends no commands", where="options.gate", expected="StreamOptions(commands=True)")
+    from femsense.calib.files import read_calibration
     from femsense.sensing.run_files import read_run
     from femsense.xr.glb_reader import read_glb
     from femsense.xr.stream.drag_server import DragServer, handles_of
@@ -178,7 +179,8 @@ def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
     publisher = live.publishers[0]
     robot = read_run(run).robot
     skin = read_glb(publisher.twin.glb).skin
-    server = DragServer(live.hub, robot, skin, name=publisher.twin.name, options=options)
+    known = read_calibration(run) if (run / "calibration.json").is_file() else None
+    server = DragServer(live.hub, robot, skin, name=publisher.twin.name, calibration=known, options=options)
     publisher.announce(replace(publisher.twin, handles=handles_of(robot), commands=options.gate.allowed))
     live.closers.append(server.close)
     return server

@@ -38,6 +38,7 @@ from femsense.app.stream_options import need_one
 from femsense.calib.calibration import Calibration
 from femsense.calib.files import write_calibration
 from femsense.core.errors import InputError
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
@@ -246,6 +247,31 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
             assert is_found(heard) and ("command" in heard) == bool(commands)
             if commands:
                 assert {row["name"] for row in heard["command"]["inputs"]} == set(made.robot.body.cable_names)
+
+
+def test_commands_of_a_drag_are_counted_from_the_calibrated_initial_tensions(tmp_path: Path, page: Path) -> None:
+    robot = write_block_robot(tmp_path / "robot")
+    made = make_run(load_robot(robot))
+    recording = load_recording(write_small_recording(tmp_path / "recording"))
+    run = write_run(made, tmp_path / "run", inputs=run_inputs(made.robot, recording, None))
+    body = made.robot.body
+    state = solve_equilibrium(body, tension=dict.fromkeys(body.cable_names, 1.0))
+    place = tuple(float(x) for x in made.robot.markers.positions(state.positions)[0])
+
+    def tensions() -> np.ndarray:
+        with stream_runs([run], StreamOptions(port=0, page=page)) as live:
+            server = let_drag(live, run, DragOptions())
+            answered = server.answer(made.robot.glued_names[0], place)
+            while answered.status == "converging":
+                answered = server.answer(made.robot.glued_names[0], place)
+        return np.array([answered.inputs[name] for name in body.cable_names])
+
+    from_zero = tensions()
+    initial = dict.fromkeys(body.cable_names, 0.2)
+    here, unknown = np.eye(4), np.zeros((6, 6))
+    found = Calibration(here, (here,), ("",), initial, {}, 0.0, {}, (), here, unknown, initial, {}, "converged")
+    write_calibration(found, run / "calibration.json")
+    np.testing.assert_allclose(tensions(), from_zero - 0.2, atol=0.02)
 
 
 def is_found(heard: dict[str, dict[str, object]]) -> bool:
