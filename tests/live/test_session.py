@@ -214,7 +214,12 @@ def test_constant_inputs_need_not_move_and_others_are_waited_for(block: tuple[Pa
     )
     loose = SessionOptions(coverage=replace(WAITS, frames=4, position_m=1.0, rotation_rad=1.0))
     answers, last = run_session(block[0], str(still), loose)
-    assert not answers and "still to be moved: cable_top" in last.todo
+    assert not answers and last.todo == "move the cables, touch nothing: still to be moved: cable_top by 0.5 N"
+    described = (still / "recording.toml").read_text()
+    (still / "recording.toml").write_text(described.replace('"tension"', '"displacement"'))
+    _, last = run_session(block[0], str(still), loose)
+    assert last.todo.endswith("still to be moved: cable_top by 0.00109 m")  # a hundredth of the body's diagonal
+    (still / "recording.toml").write_text(described)
     accepted, _ = run_session(block[0], str(still), loose, act=lambda session: session.accept_fixed())
     assert accepted[0].report.frame == 4
     constant, _ = run_session(block[0], str(still), loose, inputs="fixed:top=1,side=0.5")
