@@ -99,11 +99,15 @@ def equations_at(body: BodyModel, loads: Loads, state: State, here: Internal) ->
     """Return the equations at a state with its internal forces."""
     free, held = body.free_map.dofs, np.flatnonzero(state.taut)
     rows, stretch = drive_rows(body, state), drive_compliance(body)[held]
+    gap, H = np.zeros(0), np.zeros((0, len(free)))
+    if len(held):  # travels of many cables take as long as a solve
+        gap = (loads.target - travel_of(body, state.x))[held] - stretch * state.T[held]
+        H = kinematic_rows(body, state, rows)[held][:, free]
     return NewtonEquations(
         held=held,
         force=unbalanced_force(loads, state, here, rows)[free],
-        gap=(loads.target - travel_of(body, state.x))[held] - stretch * state.T[held],
-        H=kinematic_rows(body, state, rows)[held][:, free],
+        gap=gap,
+        H=H,
         C=rows[held][:, free],
         stretch=stretch,
         lever=loads.lever[held],

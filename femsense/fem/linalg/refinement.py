@@ -60,14 +60,14 @@ class Refined:
             more = self.plain.solve(right - self._matrix @ answer)
             share = _share(more, answer)
             if self._lent and not share <= NEAR_ENOUGH:
-                return self._refined(right) if self._factorised() else None
+                return self._refined(right) if self._has_own_factor() else None
             self._lent, first = False, first or share
             answer = answer + more
             if share * first <= REFINED:
                 return np.asarray(answer)
         return None
 
-    def _factorised(self) -> bool:
+    def _has_own_factor(self) -> bool:
         """Replace a lent factor by the factor of this stiffness; return whether there is such a factor in single precision."""
         own = factorize_definite(self._pattern, self._values, tries=0, single=True)[0]
         self._lent = False
