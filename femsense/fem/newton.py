@@ -54,7 +54,8 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
     """
     keeper, length = FactorKeeper(body, loads, state), np.inf
     here = state.here = internal(body, state.x, tangent=not state.borrowed)
-    can_follow = any(c.friction > 0 for c in body.cables) and not state.taut.any()
+    has_friction = any(c.friction > 0 for c in body.cables)
+    can_follow = has_friction and not state.taut.any()
     for iteration in range(max_iterations):
         follows = can_follow and iteration < FOLLOW_FRICTION
         if follows and (iteration or state.borrowed):  # at a cold start the bends are still those at rest
@@ -66,7 +67,7 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             state.options.watch(residual)
         if not (np.isfinite(residual) and np.isfinite(here.energy)):
             return SolveStatus.STALLED
-        is_short = state.rough and not follows and length <= ARRIVED * body.reach
+        is_short = state.rough and not has_friction and length <= ARRIVED * body.reach  # friction needs the exact bends
         if equations.is_closed and (is_short or residual <= loads.tolerance):
             return SolveStatus.CONVERGED
         # step

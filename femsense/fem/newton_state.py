@@ -32,8 +32,8 @@ class SolveStatus(StrEnum):
 class NewtonOptions:
     """When Newton's method makes a new factor, uses rotated steps, and gives up a trial state, which is a state that a search tries."""
 
-    patience: int = 3
-    """A factor is kept if this number of further steps is enough at the present rate; 0: every step has a new factor."""
+    patience: int = 2
+    """A factor in double precision is kept if this number of further steps is enough at the present rate; 0: every step has a new factor."""
     curved: float = 1e-3
     """A step longer than this share of the body is first tried with elements that turn, then straight."""
     patience_tried: int = 8

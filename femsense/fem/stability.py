@@ -12,10 +12,8 @@ from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linalg.factorization import factorize
 from femsense.fem.newton_equations import equations_at
 from femsense.fem.newton_state import Loads, State, drive_rows, unbalanced_force
-from femsense.fem.stiffness_factor import factor_here, stiffness_blocks
+from femsense.fem.stiffness_factor import FAR, factor_here, stiffness_blocks
 
-FAR = 1e6
-"""A stiffness factorised at a residual above this multiple of the tolerance does not decide the stability of the final state."""
 FALL_ITERATIONS = 30
 """Inverse iterations towards the softest motion of a state that may be unstable."""
 

@@ -12,9 +12,16 @@ from femsense.fem.linalg.factorization import Factorization, Pattern, factorize,
 from femsense.fem.newton_equations import NewtonEquations
 from femsense.fem.newton_state import Loads, State
 
-FOLLOWING = 0.1
-"""A factor is kept if the last step reduced the residual below this share, while the tensions along cables with friction follow the
-bends."""
+FAST = 1e-2
+"""A factor is kept if the last step reduced the residual below this share: the state at the end is then far more exact than the tolerance."""
+FAST_BORROWED = 0.1
+"""The same share if the factor belongs to a nearby state."""
+FAST_FOLLOWING = 0.3
+"""The same share while the tensions along cables with friction follow the bends, at which rate they converge with a new factor, too."""
+FAR = 1e6
+"""A factor made at a residual above this multiple of the tolerance does not decide the stability of the final state."""
+PATIENCE_SINGLE = 5
+"""A factor in single precision is kept if this number of further steps is enough at the present rate."""
 ARRIVED = 5e-7
 """A trial state has converged after a step shorter than this share of the body's size."""
 PROMISING = 0.1
@@ -61,16 +68,18 @@ class FactorKeeper:
 
     | rule | for | kept if | why |
     |---|---|---|---|
-    | residual in sight | all states | r qⁿ ≤ tolerance, n = `patience` (3) | three steps with the last factor take less time than a factor |
-    | | trial states | the same with n = `patience_tried` (8) | eight steps in single precision take the time of a factor |
+    | fast | all states | q ≤ FAST; FAST_BORROWED or FAST_FOLLOWING where these apply | a new factor would hardly be faster |
+    | residual in sight | factors made near the solution (FAR) | r qⁿ ≤ tolerance, n = `patience` (2) | two steps take less time than a factor |
+    | | single precision | the same with n = PATIENCE_SINGLE (5), for trial states n = `patience_tried` (8) | eight steps take the time of a factor |
     | length in sight | trial states | l pⁿ ≤ ARRIVED · size, n = 8 | trial states converge by the length of a step as well |
-    | following | tensions follow friction | q ≤ FOLLOWING | the tensions converge at this rate with a new factor, too |
 
-    A ratio above 1 counts as 1. A first step has q = 0, so that it takes the factor of a nearby state, if there is one.
+    A ratio above 1 counts as 1. A first step has q = 0, so that it takes the factor of a nearby state, if there is one. More patience saves 5 % of the
+    factors, but leaves errors of exact states close to the tolerance, which differences of states then show four times as large.
     """
 
     def __init__(self, body: BodyModel, loads: Loads, state: State) -> None:
         self._body, self._loads, self._state = body, loads, state
+        self._has_friction = any(c.friction > 0 for c in body.cables)
         self._residual, self._length = float("inf"), float("inf")
         self.expects_new_factor = True
         """Whether the state behind the next step will probably need a new factor: its tangent is then assembled with its forces, which takes
@@ -89,11 +98,14 @@ class FactorKeeper:
         state, residual, tolerance = self._state, equations.residual, self._loads.tolerance
         q, p = _ratio(residual, self._residual), _ratio(length, self._length)
         self._residual, self._length = residual, length
-        patience = state.options.patience_tried if state.rough else state.options.patience
+        options = state.options
+        fast = FAST_FOLLOWING if follows else FAST_BORROWED if state.borrowed else FAST
+        in_single = options.patience_tried if state.rough else PATIENCE_SINGLE
         keeps = (
-            residual * min(q, 1.0) ** patience <= tolerance,
-            state.rough and length * min(p, 1.0) ** patience <= ARRIVED * self._body.reach,
-            follows and q <= FOLLOWING,
+            options.patience > 0 and q <= fast,
+            state.factored_at <= FAR * tolerance and residual * min(q, 1.0) ** options.patience <= tolerance,
+            state.single and residual * min(q, 1.0) ** in_single <= tolerance,
+            state.single and state.rough and length * min(p, 1.0) ** in_single <= ARRIVED * self._body.reach,
         )
         if state.factor is None or not any(keeps):
             state.factor, state.borrowed, state.factored_at = factor_here(self._body, here, state, equations), False, residual
@@ -102,7 +114,7 @@ class FactorKeeper:
         if state.factor is None:
             return None
         updated = self._updated = self._updated or Secants(state.factor)
-        if not follows and not len(equations.held):  # else the force changes with the tensions, too
+        if not self._has_friction and not len(equations.held):  # else the force changes with the tensions, too
             updated.learn(state.x.ravel()[self._body.free_map.dofs], equations.force)
         return updated
 
