@@ -21,7 +21,10 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BodyModel:
-    """A body with its clamp, cables and dead loads. A change makes a new object (`with_…`)."""
+    """A finite-element body with n nodes and m elements: mesh, material, clamp, cables, chambers and dead loads.
+
+    `make_body` and `load_robot` make one. Bodies are immutable: each method `with_…` returns a changed copy.
+    """
 
     mesh: TetMesh
     """Mesh at rest."""
@@ -212,29 +215,40 @@ def make_body(
     chambers: tuple[Chamber, ...] = (),
     gravity: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> BodyModel:
-    """Build a body.
+    """Build a finite-element body with n nodes and m elements from a mesh, its material, its clamp and its drives.
+
+    Three constitutive laws have the same small-strain moduli: the corotational law is linear elasticity in rotating elements, the neo-Hookean law
+    describes rubber at larger strains, and the Gent law also its stiffening near a limit of stretch.
 
     Arguments:
-        mesh: tet4 or tet10 mesh.
-        young_modulus: [Pa], a number or an array (m,).
-        poisson_ratio: [1], a number or an array (m,).
-        density: [kg/m³].
-        law: "corotational", "neo_hookean" or "gent".
-        clamped: indices of the clamped nodes, or a mask (n,); see also `BodyModel.with_clamp_nodes`.
-        cables: see `tie_cable`.
-        chambers: see `chambers.find_chamber`.
-        gravity: [m/s²], shape (3,).
+        mesh: mesh at rest [m], of linear (4 nodes) or quadratic (10 nodes) tetrahedra.
+        young_modulus: Young's modulus [Pa], above 0: a number, or one value per element, shape (m,).
+        poisson_ratio: Poisson's ratio [1], between −1 and 0.5 (0.49 for silicone): a number, or one value per element, shape (m,).
+        density: density [kg/m³], at least 0. Default 0: no weight.
+        law: constitutive law: "corotational" (default), "neo_hookean" or "gent".
+        clamped: indices of the nodes that cannot move, or a mask, shape (n,). Default: none. `BodyModel.with_clamp_stiffness` makes the
+            clamp compliant.
+        cables: results of `tie_cable`. Default: none.
+        chambers: closed cavities under pressure, results of `femsense.fem.cavities.find_chamber`. Default: none.
+        gravity: gravity in the axes of the mesh [m/s²], shape (3,). Default: none.
+
+    Returns:
+        the body at rest, for `solve_equilibrium`, `compliance` and `Tracker`.
 
     Raises:
-        InputError: a value is out of its range.
+        InputError: a value outside of the ranges above, an unknown law, a node that does not exist, or inverted elements.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])
         >>> bar = fs.make_body(mesh, young_modulus=1e6, poisson_ratio=0.45, clamped=mesh.nodes[:, 0] == 0.0)
+        >>> corner = np.argmax(mesh.nodes.sum(axis=1))  # of the tip
         >>> forces = np.zeros_like(mesh.nodes)
-        >>> forces[np.argmax(mesh.nodes.sum(axis=1)), 2] = -0.05  # N, at one corner of the tip
-        >>> fs.solve_equilibrium(bar, nodal_forces=forces).converged
-        True
+        >>> forces[corner, 2] = -0.05  # N
+        >>> bent = fs.solve_equilibrium(bar, nodal_forces=forces)
+        >>> round(1e3 * float(bent.positions[corner, 2] - mesh.nodes[corner, 2]), 1)  # deflection [mm]
+        -0.8
     """
     n, m = len(mesh.nodes), len(mesh.tets)
     E, nu = (np.broadcast_to(np.asarray(v, dtype=float), (m,)) for v in (young_modulus, poisson_ratio))
@@ -322,7 +336,26 @@ def tie_cable(
     max_tension: float = np.inf,
     friction: float = 0.0,
 ) -> Cable:
-    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, is embedded in an element (see `embed_points`)."""
+    """Tie a cable to a mesh: each point of its path is embedded in the element with the nearest centre, and moves with it.
+
+    Arguments:
+        mesh: mesh of the body at rest [m].
+        name: name of the cable, by which inputs refer to it.
+        path: p points of the cable in the body at rest [m], shape (p, 3), from the far end to the exit.
+        pull_point: fixed point outside of the body towards which the cable is pulled [m], shape (3,).
+        exit_direction: direction in which the cable leaves the pull point, shape (3,), of any length. Only friction depends on it.
+            Default: no bend at the pull point.
+        min_tension: smallest tension [N]. Default: 0.
+        max_tension: largest tension [N]. Default: no limit.
+        friction: capstan coefficient μ at each bend [1], at least 0: a bend by the angle φ changes the tension by a factor of up to exp(μ φ).
+            Default: 0.
+
+    Returns:
+        the cable, for the argument `cables` of `make_body`.
+
+    Raises:
+        InputError: negative friction, a direction of length 0, or arrays of another shape.
+    """
     if not (np.isfinite(friction) and friction >= 0):
         raise InputError("out of range", where=f"friction of cable {name}", found=friction, expected="≥ 0")
     embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")

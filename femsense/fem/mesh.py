@@ -25,7 +25,7 @@ FACE_EDGES = np.array([[1, 5, 4], [3, 5, 2], [0, 4, 3], [2, 1, 0]])  # middle of
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TetMesh:
-    """A tetrahedral mesh at rest."""
+    """A mesh of tetrahedra at rest, with n nodes and m elements."""
 
     nodes: FloatArray
     """Node positions [m], shape (n, 3): those of the linear mesh first, then the mid-edge nodes."""
@@ -258,10 +258,10 @@ def closest_in_triangle(corners: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "nearest_element") -> Embedding:
-    """Embed points in the elements that contain them at rest.
+    """Embed points in a mesh: find the element that contains each point at rest, and its shape functions there.
 
-    A point outside goes with one element through the first-order expansion of that element's shape functions at the
-    closest point of the element (for tet4 this is the element's affine map).
+    An embedded point moves with the deformed mesh. A point outside of the mesh moves with one element, by the first-order expansion of its
+    shape functions at the closest point of the element (for linear elements its affine map).
 
     Arguments:
         mesh: the mesh at rest.
@@ -273,6 +273,8 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
         the embedding: element and shape functions of each point, and its distance outside of the mesh.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> body = fs.load_robot("finger").body
         >>> tip = fs.embed_points(body.mesh, np.array([[0.092, 0.0, 0.007]]))
         >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})

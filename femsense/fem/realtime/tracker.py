@@ -125,7 +125,8 @@ class Tracker:
         """Return the state under new tensions [N] (cables that are not named are slack) and nodal forces [N], shape (n, 3).
 
         Raises:
-            InputError: wrong names or shapes; FemsenseError: no equilibrium.
+            InputError: an unknown cable or a wrong shape.
+            FemsenseError: no equilibrium was found.
         """
         names = self.body.cable_names
         given = dict(tension or {})
@@ -140,10 +141,9 @@ class Tracker:
         return tracked
 
     def compliance(self, *, points: npt.ArrayLike = (), directions: npt.ArrayLike = ()) -> FloatArray:
-        """Return W as `femsense.compliance` does [m/N], carried on from the states at which it is known.
+        """Return the compliance matrix [m/N] of the current state, as `femsense.compliance` defines it, extrapolated from states where it is exact.
 
-        The first call with other points takes longer:
-        the compliance is learnt there with a little more tension in each cable too.
+        The first call with other points takes longer: the compliance is then also computed at a slightly larger tension of each cable.
         """
         if not self._past:
             raise FemsenseError("nothing is tracked yet: call step first")
