@@ -66,7 +66,7 @@ class Calibration:
 
     @property
     def settled(self) -> bool:
-        """Whether the fit came to an end; what has not settled is no calibration."""
+        """Whether the fit converged; a calibration that did not must not be used."""
         return not self.status.startswith("not settled")
 
     def __repr__(self) -> str:
