@@ -20,7 +20,11 @@ from femsense.xr.proprioception.spread import Spread
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProprioceptiveModel:
-    """A model from readings to markers (`markers`) and bones (`armature`), with a check of its inputs (`check`)."""
+    """A learnt map from the readings of c sensors in the body to the positions of m markers on it.
+
+    `markers` predicts the markers, `interval` their 95 % intervals and `armature` the bones; `check` lists readings outside of the training domain.
+    `learn` and `load_model` make one.
+    """
 
     channels: tuple[str, ...]
     """Names of the readings, in the order of a row."""
