@@ -28,7 +28,7 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Recording:
-    """F frames in order of time, seen by one camera or several (views)."""
+    """A recording of one experiment: F frames in order of time, with the inputs of the robot and the observations of one or several cameras (views)."""
 
     folder: Path | None
     """Where it was read; None where it was made in Python."""
@@ -141,19 +141,22 @@ def make_recording(
     unnamed: UnnamedRows | None = None,
     about: About | None = None,
 ) -> Recording:
-    """Return a recording made of its parts; parts that are left out are empty or unknown.
+    """Make a recording from its parts. `recording_from_arrays` is simpler for one camera and named markers.
 
     Arguments:
-        timeline: the frames.
-        drives: inputs of the cables, pressures of the chambers.
-        markers: those with names.
-        loads: known loads.
-        views: cameras and their files.
-        unnamed: markers without names.
-        about: properties of the whole recording.
+        timeline: times and labels of the F frames.
+        drives: inputs of the cables, pressures of the chambers. Default: none.
+        markers: observations of markers with names. Default: none.
+        loads: known loads. Default: none.
+        views: cameras and their files. Default: one camera with unknown pose and no files.
+        unnamed: observations of markers without names. Default: none.
+        about: properties of the whole recording. Default: unknown.
+
+    Returns:
+        the recording.
 
     Raises:
-        InputError: where shapes do not fit, times do not increase, or an index points nowhere.
+        InputError: shapes that do not match, times that do not increase, or an index outside of its array.
     """
     seen = views or Views()
     times = freeze(np.asarray(timeline.time_s, dtype=np.float64).reshape(-1))
@@ -175,14 +178,18 @@ def make_recording(
 
 
 def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
-    """Return the recording of some of its frames, in order of time.
+    """Return a recording with some of the frames of another.
 
     Arguments:
-        recording: the recording.
-        which: a mask, shape (F,), or indices 0 … F − 1.
+        recording: a recording with F frames.
+        which: a mask, shape (F,), or indices from 0 to F − 1.
+
+    Returns:
+        the selected frames in order of time.
 
     Example:
-        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> import femsense as fs
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")  # installed with femsense
         >>> fs.select_frames(recording, range(36, 40)).frame_count
         4
     """

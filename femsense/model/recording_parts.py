@@ -49,7 +49,7 @@ class Drives:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MarkerRows:
-    """Observations of named markers, K rows."""
+    """Observations of named markers: K rows, one per marker that is visible in a frame."""
 
     names: Sequence[str]
     """Names of the markers."""
@@ -67,7 +67,7 @@ class MarkerRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UnnamedRows:
-    """Observations of markers without names, U rows; calibration assigns them."""
+    """Observations of markers without names: U rows, one per point in a frame. `calibrate` assigns them to the markers of the robot."""
 
     frame: npt.ArrayLike = ()
     """An index 0 … F − 1, shape (U,)."""
@@ -79,7 +79,7 @@ class UnnamedRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadRows:
-    """Known loads, L rows."""
+    """Known loads on the body: L rows, one per load in a frame."""
 
     frame: npt.ArrayLike = ()
     """An index 0 … F − 1, shape (L,)."""
@@ -91,7 +91,7 @@ class LoadRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Views:
-    """V cameras and the files of their images or clouds."""
+    """The V cameras of a recording: poses, intrinsics, and the files of their images or clouds."""
 
     names: Sequence[str] = ("",)
     """Name of each camera; ("",) for a single one."""
@@ -111,9 +111,9 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tool:
-    """A body of known shape that may touch the robot.
+    """A rigid object of known shape that may touch the robot.
 
-    Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own.
+    The origin of its coordinates is the centre of a ball or cylinder (with axis z), or that of the file of a mesh.
     """
 
     name: str
@@ -136,7 +136,7 @@ class Tool:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RestMarkers:
-    """Markers measured with the body unloaded, camera frame."""
+    """Positions of markers measured on the unloaded body, in camera coordinates (rest.csv)."""
 
     names: tuple[str, ...]
     """Names of the markers."""
@@ -150,7 +150,7 @@ class RestMarkers:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class About:
-    """Properties of a whole recording."""
+    """Properties of a whole recording, such as its folder and session."""
 
     folder: Path | None = None
     """Folder that it was loaded from; None: made in Python."""
