@@ -24,6 +24,7 @@ class InputError(FemsenseError):
         hint: a remedy.
 
     Example:
+        >>> import femsense as fs
         >>> try:
         ...     fs.load_robot("fingre")
         ... except fs.InputError as error:

@@ -28,7 +28,10 @@ from femsense.sensing.options import SensingOptions
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ContactForce:
-    """A contact in one frame of a recording: contact point, force, and their standard deviations, in the robot's coordinate system."""
+    """A contact in one frame of a recording: contact point, force, and their standard deviations, in the robot's coordinate system.
+
+    A contact that lasts six frames gives six objects with the same `track`.
+    """
 
     frame: int
     """Number of the frame as in frames.csv."""
