@@ -1,6 +1,6 @@
 """Close the loop: screen all effects, refit the best candidates jointly, accept on held-out data, and return an improved robot.
 
-The steps and their reasons are in docs/method/closing-the-loop.md.
+The steps and their reasons are in docs/reference/closing-the-loop-rules.md.
 """
 
 from __future__ import annotations

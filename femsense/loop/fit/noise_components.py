@@ -1,6 +1,6 @@
 """The noise of marker residuals: components common to a marker, a frame, a sweep and a repeated state, and white noise.
 
-The model (docs/method/closing-the-loop.md, section 4) is
+The model (docs/reference/closing-the-loop-rules.md, section 4) is
 
     Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 
