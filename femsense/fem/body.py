@@ -101,7 +101,7 @@ class BodyModel:
         return self.weight() + self.dead_forces
 
     def is_held(self) -> bool:
-        """Return whether clamp or springs stop every rigid motion of every part: three of its nodes there are not on a line."""
+        """Return whether the clamp or its springs prevent every rigid motion of every connected part: each has three held nodes that are not on a line."""
         held = self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes  # a plate holds all of them
         return all(_spread_out(self.mesh.nodes[held[self.parts[held] == part]]) for part in range(int(self.parts.max()) + 1))
 
@@ -143,17 +143,15 @@ class BodyModel:
         return replace(self, cables=cables)
 
     def with_cable_places(self, places: Mapping[str, FloatArray]) -> BodyModel:
-        """Return the body with points of some cables' paths elsewhere at rest, name → [m], shape (p, 3);
-        each keeps the element that carries it."""
+        """Return the body with other cable paths: name → p points at rest [m], shape (p, 3); each point stays embedded in its element."""
         paths = {c.name: tie_to_elements(self.mesh, places[c.name], c.path.element) for c in self.cables if c.name in places}
         return replace(self, cables=tuple(replace(c, path=paths.get(c.name, c.path)) for c in self.cables))
 
     def with_rest_nodes(self, nodes: FloatArray) -> BodyModel:
-        """Return the body of another shape at rest: its nodes elsewhere [m], shape (n, 3), free of stress there;
-        ties and patterns stay.
+        """Return the body with another stress-free shape: other node positions at rest [m], shape (n, 3). Embedded points and sparsity patterns are kept.
 
         Raises:
-            InputError: where an element would fold over.
+            InputError: an element would be inverted.
         """
         mesh = TetMesh(nodes, self.mesh.tets)
         stencil = reshaped(self.stencil, mesh)
@@ -166,16 +164,15 @@ class BodyModel:
         return replace(self, mesh=mesh, stencil=stencil, chambers=chambers)
 
     def with_clamp_nodes(self, nodes: npt.ArrayLike) -> BodyModel:
-        """Return the body with other nodes that springs replace where the clamp gives, shape (s,);
-        all that are clamped do at first."""
+        """Return the body with another set of nodes at which a compliant clamp has springs: s indices, shape (s,). Default: all clamped nodes."""
         return replace(self, clamp_nodes=freeze(as_indices(nodes, len(self.mesh.nodes), "clamp_nodes"), np.int64))
 
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
-        """Return the body on a compliant clamp (see `femsense.fem.clamp`).
+        """Return the body on a compliant clamp: springs at its clamped nodes, and a plate that can rotate.
 
         Arguments:
-            stiffness: of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: none gives.
-            turn: of the plate about `clamp_center` [N m/rad]; inf: it does not turn. Both inf give the clamp back.
+            stiffness: stiffness of a spring in each direction at every node of `clamp_nodes` [N/m]. Default inf: these nodes cannot move.
+            turn: rotational stiffness of the clamped plate about `clamp_center` [N m/rad]. Default inf: it does not rotate. If both are inf, the clamp is rigid.
         """
         if np.isinf(stiffness) and np.isinf(turn):
             free_map = make_free_map(self.stencil, self.mesh, self.clamped)
