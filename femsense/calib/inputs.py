@@ -33,9 +33,9 @@ def input_tables(robot: Robot, recording: Recording, initial: FloatArray | None,
     """Return the initial inputs as tables.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         initial: [N] or [m], shape (a,); None where they are known.
-        covariance: of `initial`, shape (a, a); empty where they are known.
+        covariance: covariance of `initial`, shape (a, a); empty if they are known.
     """
     state = initial_state(robot, recording, initial)
     own, other = _input_std(robot, recording, state, covariance)

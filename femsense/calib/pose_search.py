@@ -96,7 +96,7 @@ def refine_names(
     A point is an outlier if that is more likely than a measurement error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
 
     Arguments:
-        model, seen, allowed: as of `search_poses`.
+        model, seen, allowed: the same arguments as of `search_poses`.
         T_robot_camera: the start, shape (4, 4).
         fixed: keep the pose.
         repeats: frames a state.

@@ -59,7 +59,7 @@ def find_pressure_zeros(robot: Robot, recording: Recording, fit: Fit) -> Pressur
         fit: fits what else is unknown.
 
     Raises:
-        DataError: as of `fit`.
+        DataError: `fit` raises it.
     """
     names = robot.body.chamber_names
     scale = np.maximum(np.ptp(recording.pressures, axis=0), 1.0)

@@ -83,10 +83,10 @@ class _Compared:
 
 
 def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *, rivals: Sequence[Reread] = ()) -> None:
-    """Refuse files that fit far better under an alternative reading; warn of those that fit better.
+    """Compare the files with alternative readings (hypotheses about one error in them), and refuse or warn if one fits better.
 
     Arguments:
-        fit: of the files as they stand.
+        fit: fit of the unchanged files.
         rereads: the kinds of readings.
         refit: fits another reading.
         rivals: further kinds, which compete where one of the first is promising.
@@ -150,7 +150,7 @@ def share_with(
     """Return the misfit of other markers as a fraction of the current one, both with free poses.
 
     Arguments:
-        fit: as it stands.
+        fit: fit of the unchanged files.
         modelled, measured: other places [m], robot frame, shape (k, 3).
         rows: which rows count, shape (k,); by default all.
     """
@@ -177,7 +177,7 @@ def first_order(fit: MarkerFit, columns: FloatArray, *, beside: FloatArray | Non
     """Return parameters fitted together with the undeclared poses and the unknown inputs.
 
     Arguments:
-        fit: with derivatives.
+        fit: fit of the unchanged files, with the derivatives of its residual.
         columns: derivative of the residual by the parameters, shape (k, 3, q).
         beside: the same of nuisance parameters, which the misfit without `columns` has too, shape (k, 3, n).
     """
