@@ -141,7 +141,7 @@ def at_step(records: Iterable[RefitRecord], step: int) -> list[RefitRecord]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Refit:
-    """A candidate after its joint fit."""
+    """A candidate effect after its refit: the nonlinear fit of the whole model with this effect in addition."""
 
     candidate: Candidate
     fitted: FittedModel
