@@ -155,13 +155,13 @@ def export_skin(
         skin: the surface.
         bones: number of bones; None: chosen on held-out frames.
         color_rgb: colour of a surface without colours.
-        name: of the body, in the file.
+        name: name of the body in the file.
 
     Returns:
         a report of the export; its errors are distances to the vertices embedded in the elements, over at most SHOWN frames.
 
     Raises:
-        InputError: as `gltf.export_states`, and if the surface is far from the body.
+        InputError: states that `gltf.export_states` refuses, or a surface that is far from the body.
     """
     ties = tie_skin(skin, mesh)
     frames = as_states(nodes_m, len(mesh.nodes))

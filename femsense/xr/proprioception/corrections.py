@@ -117,7 +117,7 @@ def is_better(errors: FloatArray, than: FloatArray) -> bool:
 
 
 def corrected(frames: Frames, name: str) -> Network:
-    """Return the network with a correction that is fitted to frames; see `CORRECTIONS`."""
+    """Return the network with one of the `CORRECTIONS`, fitted to frames."""
     now, steps = frames, [part.strip() for part in name.split(",")]
     for step in steps:
         if step == "channel":
@@ -129,7 +129,7 @@ def corrected(frames: Frames, name: str) -> Network:
 
 
 def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
-    """Return the channel and the shift that explain frames best; see `shifts_of`."""
+    """Return the channel and the shift with which the model fits frames best, the first result of `shifts_of`."""
     return shifts_of(frames, moved=moved)[0]
 
 

@@ -39,7 +39,7 @@ class Spread:
     root: FloatArray
     """L⁻¹ of p (FᵀF / n + λ I) = L Lᵀ, shape (p, p)."""
     kappa: float
-    """κ, see above."""
+    """κ: factor on the predictive standard deviation."""
     quantile: FloatArray
     """q of each marker [m], shape (m,)."""
 
@@ -104,7 +104,7 @@ def held_out(
 
     Arguments:
         train: returns the map of inputs (k, d) to coordinates (k, 3 m).
-        inputs, targets, part: of all rows, in order of time.
+        inputs, targets, part: inputs, marker coordinates and recording of all rows, in order of time.
     """
     found: list[HeldOut] = []
     for trained, predicted, group in splits(part):

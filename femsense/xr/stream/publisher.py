@@ -188,7 +188,7 @@ def play(
     """Send frames at their own times, the first at once, until they end or `stop` is set.
 
     Arguments:
-        publisher: of the twin that the frames are of.
+        publisher: publisher of the twin to which the frames belong.
         frames: in order of time.
         stop: ends it.
         clock: [s].
