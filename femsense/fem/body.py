@@ -131,13 +131,13 @@ class BodyModel:
         return replace(self, material=material)
 
     def with_stiffness_scale(self, scale: npt.ArrayLike) -> BodyModel:
-        """Return the body with its modulus scaled, by a number or an array (m,)."""
+        """Return the body with Young's modulus multiplied by a number, or by one factor per element, shape (m,)."""
         return replace(
             self, material=replace(self.material, young_modulus=freeze(self.material.young_modulus * np.asarray(scale)))
         )
 
     def with_cables(self, cables: tuple[Cable, ...]) -> BodyModel:
-        """Return the body with changed cables; their paths must stay, since the sparsity pattern holds them."""
+        """Return the body with changed cables. Their paths must be unchanged, because the sparsity pattern depends on them."""
         if [c.path for c in cables] != [c.path for c in self.cables]:
             raise InputError("the paths of the cables must stay", where="cables", hint="make_body builds a body with other paths")
         return replace(self, cables=cables)
@@ -172,7 +172,8 @@ class BodyModel:
 
         Arguments:
             stiffness: stiffness of a spring in each direction at every node of `clamp_nodes` [N/m]. Default inf: these nodes cannot move.
-            turn: rotational stiffness of the clamped plate about `clamp_center` [N m/rad]. Default inf: it does not rotate. If both are inf, the clamp is rigid.
+            turn: rotational stiffness of the clamped plate about `clamp_center` [N m/rad]. Default inf: it does not rotate.
+                If both are inf, the clamp is rigid.
         """
         if np.isinf(stiffness) and np.isinf(turn):
             free_map = make_free_map(self.stencil, self.mesh, self.clamped)

@@ -71,18 +71,21 @@ ADVICE = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Equilibrium:
-    """A static equilibrium: node positions, cable tensions, chamber pressures, and the residual that certifies it."""
+    """Result of `solve_equilibrium`: node positions, cable tensions, chamber pressures, and the residual force that shows whether it is an equilibrium.
+
+    The body has n nodes, a cables and c chambers; a cable has s segments.
+    """
 
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     tension: dict[str, float]
     """Tension of each cable at its motor [N]."""
     shortening: dict[str, float]
-    """Shortening of each cable against rest [m]."""
+    """Shortening of each cable relative to rest [m]."""
     pressure: dict[str, float]
     """Pressure in each chamber above the surroundings [Pa]."""
     volume: dict[str, float]
-    """How much each chamber has grown since rest [m³]."""
+    """Increase of the volume of each chamber since rest [m³]."""
     residual_n: float
     """Largest unbalanced nodal force under the whole load [N]."""
     status: SolveStatus
@@ -120,7 +123,7 @@ class Equilibrium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SolveOptions:
-    """Options of the solver, and the history of friction."""
+    """Options of `solve_equilibrium`: tolerances, number of steps, precision, and the cable tensions before the motion, on which friction depends."""
 
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables before the motion [N], one array (s,) a cable, on which friction depends. None: the tensions of `start`,

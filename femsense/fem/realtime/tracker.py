@@ -58,14 +58,14 @@ SINGLE_FROM = 10_000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tracked:
-    """One frame of a tracked body."""
+    """Result of `Tracker.step`: the state of a body in one frame."""
 
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     error_m: float
-    """How far any node may be from its equilibrium [m], estimated from how fast the terms shrink."""
+    """Estimated largest distance of a node from its equilibrium [m], from the convergence of the series."""
     motion_m: float
-    """How far the farthest node has moved since the frame before [m]."""
+    """Largest displacement of a node since the previous frame [m]."""
     residual_n: float
     """Largest unbalanced nodal force before the last term [N]."""
     factorisations: int
@@ -74,7 +74,19 @@ class Tracked:
 
 
 class Tracker:
-    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame; without friction and without held cables."""
+    """Tracks the equilibrium of a body in real time, for cable tensions and nodal forces that change little from frame to frame.
+
+    Each `step` expands the equilibrium in a power series about an earlier state, so that most frames need no new factorisation of the stiffness. Bodies with
+    chambers, cable friction or a compliant clamp, and cables with an imposed shortening, are not supported: `solve_equilibrium` with `start` handles them.
+
+    Example:
+        >>> import femsense as fs
+        >>> tracker = fs.Tracker(fs.load_robot("finger").body)
+        >>> for tension in (0.1, 0.2, 0.3):  # N
+        ...     frame = tracker.step(tension={"flexor": tension})
+        >>> round(1e3 * frame.motion_m, 1), frame.error_m < 1e-5  # largest displacement since the previous frame [mm]; estimated error [m]
+        (2.2, True)
+    """
 
     def __init__(
         self,
@@ -85,17 +97,17 @@ class Tracker:
         single: bool | None = None,
         most_factorisations: int = MOST,
     ) -> None:
-        """Prepare to track.
+        """Start from the body at rest.
 
         Arguments:
-            body: with its weight; cables with friction, chambers and a clamp that gives are for `solve_equilibrium`.
-            tolerance: largest error of a frame, as a share of its motion.
-            floor_m: an error that is always small enough, and never undercut by what is reported [m].
-            single: keep the factor in single precision; by default from SINGLE_FROM unknowns on.
-            most_factorisations: so many a frame, before the full solver takes over.
+            body: the body with its weight, a rigid clamp, and cables without friction.
+            tolerance: largest error of a frame relative to its motion [1].
+            floor_m: error below which the series ends in any case [m]; no smaller error is reported.
+            single: whether to keep the factor in single precision. Default: for bodies with at least SINGLE_FROM unknowns.
+            most_factorisations: maximum number of factorisations in a frame; then the full solver takes over.
 
         Raises:
-            InputError: the body has what a tracker does not know.
+            InputError: the body has chambers, cable friction or a compliant clamp.
         """
         if body.chambers or not body.clamp_is_rigid or any(c.friction > 0 for c in body.cables):
             raise InputError(
