@@ -33,20 +33,24 @@ EM_STEPS, EM_TOLERANCE = 8, 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nuisance:
-    """The prior N(μ, R Rᵀ) of η in the next frame."""
+    """The Gaussian prior of the nuisance parameters in the next frame.
+
+    There are c common parameters (pose steps of v cameras, softness, pulls) and v + 1 error fields with p centres each, one per camera and one of the model.
+    """
 
     first_mean: FloatArray
-    """Mean of (pose steps, softness, pulls) before any frame is used, shape (c,)."""
+    """Mean of the common parameters before any frame is used, shape (c,)."""
     first_covariance: FloatArray
     """Its covariance, shape (c, c)."""
     mean: FloatArray
-    """μ, shape (c + (v + 1) p,)."""
+    """Mean μ of all parameters, shape (c + (v + 1) p,)."""
     root: FloatArray
-    """R, shape (c + (v + 1) p, q)."""
+    """Root R of their covariance R Rᵀ, shape (c + (v + 1) p, q)."""
     centres: int
-    """p of the error field."""
+    """Number p of centres of each error field."""
     sizes: tuple[float, float, float] = (1e-4, 0.01, 0.0)
-    """s_b [m], s_m [1], a [1]."""
+    """Standard deviation of the cameras' error fields [m]; of the model's error field, relative to the displacement [1]; share of their variance that is common
+    to all frames [1]."""
 
     @property
     def common(self) -> int:
@@ -55,7 +59,7 @@ class Nuisance:
 
     @property
     def fields(self) -> IntArray:
-        """Standard deviation, s_b or s_m, of each parameter of the error fields, shape ((v + 1) p,)."""
+        """Index in `sizes` of the standard deviation of each parameter of the error fields (0: camera, 1: model), shape ((v + 1) p,)."""
         count = len(self.mean) - self.common
         return np.repeat([0, 1], [count - self.centres, self.centres])
 
