@@ -76,7 +76,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CloudPose:
-    """A pose and how it fits."""
+    """A candidate pose of a camera, and the quality of its fit."""
 
     T_robot_camera: FloatArray
     """shape (4, 4)."""

@@ -56,7 +56,7 @@ class Nameless:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Named:
-    """A reading of the unnamed markers."""
+    """An assignment of names to the unnamed markers, with the poses of the cameras."""
 
     marker: IntArray
     """Which marker each unnamed row of the recording is, shape (U,): −1 none of the robot's, or not distinguishable."""

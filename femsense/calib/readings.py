@@ -40,7 +40,7 @@ MOST = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Reading:
-    """An alternative reading of the same files."""
+    """An alternative interpretation (reading) of the same files: a hypothesis about one error in them, such as exchanged labels."""
 
     error: str | Callable[[MarkerFit], str]
     """The error in the files if this reading is right, as a clause; or that of the reading's fit."""
@@ -69,7 +69,7 @@ Refit = Callable[[Robot, Recording, IntArray], MarkerFit]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Compared:
-    """A reading that was fitted."""
+    """An alternative reading of the files after its fit."""
 
     kind: Reread
     reading: Reading
@@ -134,7 +134,7 @@ def _compared(fit: MarkerFit, kind: Reread, reading: Reading, refit: Refit) -> _
 
 
 def is_suspicious(fit: MarkerFit) -> bool:
-    """Return whether the markers of a camera leave more than `SUSPICIOUS`."""
+    """Return whether the residual of the markers of a camera exceeds the share `SUSPICIOUS` of their spread."""
     return any(fit.misfit_of(v) > SUSPICIOUS * fit.spread_of(v) for v in range(len(fit.poses)))
 
 
@@ -163,7 +163,7 @@ def share_with(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FirstOrder:
-    """Further parameters of a fit, to first order."""
+    """Result of `first_order`: further parameters of a fit, estimated to first order."""
 
     value: FloatArray
     """Shape (q,)."""
