@@ -131,7 +131,7 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
 
 
 def without_effect(data: Data, fitted: FittedModel, name: str, noise: Noise, *, worth: float = np.inf) -> FittedModel:
-    """Return a fitted model without one of its effects, refitted; see `keeping`."""
+    """Return a fitted model without one of its effects, all other parameters refitted."""
     return keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise, worth=worth)
 
 
@@ -154,7 +154,7 @@ def with_term(
 
 
 def with_values(fit: JointFit, values: Sequence[float] | FloatArray, *, at: int | None = None) -> FloatArray:
-    """Return the coordinates of a fit with those of one more term, or of another one in place of its `at`-th; see `with_term`."""
+    """Return the coordinates of a fit with those of one more term, or of another term that replaces its `at`-th."""
     span = span_at(fit, at)
     return np.concatenate([fit.coordinates[: span.start], values, fit.coordinates[span.stop :]])
 

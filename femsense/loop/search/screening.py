@@ -196,7 +196,8 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
 
     Arguments:
         data, fitted: the residual that is used.
-        fields: derivatives of the residual by the effects that the model may lack; they are projected out. None: the whole residual of the fitted model counts as noise, markers are
+        fields: derivatives of the residual by the effects that the model may lack; they are projected out.
+            None: the whole residual of the fitted model counts as noise, markers are
             limited to the prior of their places, and `before` gives the repeatability of a marker.
         before: an earlier estimate.
     """
