@@ -35,7 +35,7 @@ VERTEX_DATA, INDEX_DATA = 34962, 34963
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExportReport:
-    """The result of an export."""
+    """Result of `export_states`: size and accuracy of the written mesh."""
 
     path: Path
     """The file."""

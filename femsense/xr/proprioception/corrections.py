@@ -53,11 +53,11 @@ CORRECTIONS = (*SIMPLE, *LINEAR)
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """One channel that reads something else."""
+    """A constant offset of one channel."""
 
     channel: int
     by: float
-    """In the unit of the channel; > 0: it reads too much."""
+    """Offset in the unit of the channel; > 0: its readings are too high."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -50,12 +50,12 @@ class Labelled:
 
     @property
     def time_s(self) -> FloatArray:
-        """When each row was read [s], shape (n,)."""
+        """Time of each row [s], shape (n,)."""
         return self._of([course.time_s for course in self.courses])
 
     @property
     def readings(self) -> FloatArray:
-        """In the units of the sensors, shape (n, c)."""
+        """Readings of the c channels in the units of the sensors, shape (n, c)."""
         return self.inputs(())
 
     @property

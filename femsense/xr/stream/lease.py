@@ -70,7 +70,7 @@ class Lease:
         self._stops = 0
 
     def rule(self, claim: Claim, now: float) -> Ruling:
-        """Decide about a message that arrives at a time [s]."""
+        """Return whether a message that arrives at a time [s] is accepted."""
         who = (claim.way, claim.client)
         known = self._known.pop(who, _Known(-1))
         self._known[who] = known
