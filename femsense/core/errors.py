@@ -68,6 +68,6 @@ class DataError(FemsenseError):
 
 
 class MissingDependency(FemsenseError):
-    """An optional package or a system library is missing; the text holds the exact install line."""
+    """Raised when an optional package or a system library is missing. The message contains the exact install command."""
 
     exit_status = 2

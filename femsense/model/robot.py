@@ -138,11 +138,11 @@ class Robot:
 
     @property
     def glued_names(self) -> tuple[str, ...]:
-        """Names of the markers proper."""
+        """Names of the markers that are glued to the robot, without surface points."""
         return self.marker_names[: len(self.marker_names) - self.surface_points]
 
     def with_surface_points(self, points: FloatArray) -> Robot:
-        """Return the robot with points of its surface at rest [m], shape (p, 3), behind its markers."""
+        """Return the robot with p points of its surface at rest [m], shape (p, 3), appended to its markers."""
         names = tuple(f"surface {i + 1}" for i in range(len(points)))
         share = None if self.marker_share is None else np.concatenate([self.marker_share, np.ones(len(points))])
         more = replace(
@@ -151,7 +151,7 @@ class Robot:
         return more.with_marker_points(np.vstack([self.marker_points.reshape(-1, 3), points]))
 
     def without_surface_points(self) -> Robot:
-        """Return the robot with its markers proper only."""
+        """Return the robot without the surface points that were appended to its markers."""
         k = len(self.glued_names)
         share = None if self.marker_share is None else self.marker_share[:k]
         return replace(
@@ -164,11 +164,11 @@ class Robot:
         )
 
     def with_marker_points(self, points: FloatArray) -> Robot:
-        """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""
+        """Return the robot with its k markers at other positions at rest [m], shape (k, 3)."""
         return replace(self, marker_points=freeze(points), markers=self.tie_markers(points))
 
     def tie_markers(self, places: FloatArray) -> Embedding:
-        """Return the ties of all markers when they sit at places [m], shape (k, 3)."""
+        """Return the embedding of all k markers in the mesh, at given positions at rest [m], shape (k, 3)."""
         ties = embed_points(self.body.mesh, places)
         return ties if self.marker_share is None else ties.following(places, self.marker_share)
 
