@@ -31,15 +31,15 @@ class BodyModel:
     material: Material
     """Constitutive law and its parameters, per element."""
     clamped: IntArray
-    """Clamped nodes, shape (k,)."""
+    """Indices of the clamped nodes, shape (k,)."""
     clamp_stiffness: float
-    """A spring in each direction at every clamped node of the declared mesh instead of the clamp [N/m]; inf: clamped."""
+    """Stiffness of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: these nodes cannot move."""
     clamp_nodes: IntArray
-    """The clamped nodes that the declared mesh has (no added mid-edge nodes); these get the springs, shape (s,)."""
+    """Indices of the clamped nodes at which a compliant clamp has springs, shape (s,): those of the declared mesh, without added mid-edge nodes."""
     cables: tuple[Cable, ...]
     """Cables, tied to the mesh."""
     gravity: FloatArray
-    """[m/s²], shape (3,)."""
+    """Gravity in the axes of the mesh [m/s²], shape (3,)."""
     dead_forces: FloatArray
     """Dead nodal forces in addition to the weight [N], shape (n, 3)."""
     stencil: Stencil
@@ -49,7 +49,7 @@ class BodyModel:
     free_map: FreeMap
     """Map from free to all degrees of freedom."""
     clamp_turn_stiffness: float = np.inf
-    """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
+    """Rotational stiffness of the clamp, a rigid plate, about `clamp_center` [N m/rad]; inf: it does not rotate."""
     released: list[FreeMap] = field(default_factory=list)
     """The free map without the clamp, after the first use; bodies with the same mesh share this list."""
 

@@ -30,9 +30,9 @@ class TetMesh:
     nodes: FloatArray
     """Node positions [m], shape (n, 3): those of the linear mesh first, then the mid-edge nodes."""
     tets: IntArray
-    """Node indices, shape (m, 4) or (m, 10)."""
+    """Node indices of each element, shape (m, 4) for linear or (m, 10) for quadratic elements."""
     reach: float = field(init=False)
-    """Longest side of the box around it [m]."""
+    """Longest side of the bounding box of the mesh [m]."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", freeze(as_points(self.nodes, "nodes")))

@@ -75,13 +75,13 @@ class Robot:
     marker_names: tuple[str, ...]
     """Name of each marker."""
     marker_points: FloatArray
-    """Markers at rest [m], shape (k, 3)."""
+    """Positions of the k markers at rest [m], shape (k, 3)."""
     markers: Embedding
-    """The markers' ties to the body."""
+    """Embedding of the markers in the mesh: their elements and shape functions."""
     features: IntArray
     """Surface nodes that serve as feature points, spread evenly over the free surface, shape (e,)."""
     color_rgb: FloatArray | None
-    """Colour of the body for the segmentation, each in [0, 1], shape (3,)."""
+    """Colour of the body, used to segment images, sRGB from 0 to 1, shape (3,); None: unknown."""
     actuation: Actuation
     """Effects between recorded and true inputs: offsets, gains, friction."""
     observation: Observation
@@ -99,9 +99,9 @@ class Robot:
     by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
     """Effects whose values differ between recordings: (robot, label of a recording) → the robot in that recording, applied in order."""
     marker_looks: tuple[MarkerLook, ...] = ()
-    """Markers that colour images show, by name."""
+    """Appearance of the markers that are detected in colour images."""
     aruco_dictionary: str = "4X4_50"
-    """Of the tags, as OpenCV names it."""
+    """Dictionary of the ArUco tags, by its OpenCV name."""
     correction: Correction | None = None
     """Empirical correction of the markers beyond all effects; used on request."""
     surface_points: int = 0

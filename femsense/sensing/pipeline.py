@@ -89,8 +89,10 @@ def estimate(
         >>> robot = fs.load_robot("finger")
         >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[[0.088, 0.0, 0.014]])
-        >>> [(c.frame, round(c.force_n, 1), round(c.std_n, 1)) for c in run.contacts]  # frame, force and σ [N]: one point, pressed three times
-        [(9, 0.1, 0.0), (10, 0.3, 0.1), (11, 0.2, 0.3)]
+        >>> [(contact.frame, round(contact.force_n, 1)) for contact in run.contacts]  # force [N] at one point, pressed in three frames
+        [(9, 0.1), (10, 0.3), (11, 0.2)]
+        >>> round(run.contacts[2].std_n, 1)  # N: in frame 11 the standard deviation exceeds the force, which is not determined
+        0.3
     """
     if robot.softening:
         warnings.warn(

@@ -101,7 +101,7 @@ class LoopResult(Loop):
     """Result of `improve`: the verdict, the effects found, held-out errors (all keys of loop.json), and the improved robot."""
 
     entries: tuple[Entry, ...]
-    """The effects as tables of `[[effects]]`."""
+    """Accepted effects as tables `[[effects]]` of robot.toml."""
     robot: Robot
     """The improved robot."""
     declared: Robot

@@ -56,11 +56,11 @@ class LearnOptions:
     memories: tuple[tuple[float, ...], ...] = MEMORIES
     """Candidate time constants [s] of filters in addition to the readings; ((),): none."""
     end_to_end: bool = False
-    """Whether a second network predicts the bones directly from the readings, as in the paper."""
+    """Whether a second network predicts the bones directly from the readings."""
     bones: ArmatureOptions = field(default_factory=ArmatureOptions)
     """Placement of the bones along the markers."""
     rest_row: int = 0
-    """Row in which the robot is at rest: its bones are the skin's."""
+    """Row in which the robot is at rest: the bones of the skin are placed on its markers."""
     seed: int = 0
     """Seed of the random numbers of training."""
 
