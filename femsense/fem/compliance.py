@@ -64,14 +64,14 @@ class Tangent:
 
 
 def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = factorize) -> Tangent:
-    """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`.
-    Raises FemsenseError where it is unstable there."""
+    """Return the exact linearisation of a body at an equilibrium; `solver` factorises its stiffness.
+    Raises FemsenseError if the equilibrium is unstable."""
     return _with_held_drives(body, equilibrium, _factor_at(body, equilibrium, solver))
 
 
 def tangent_near(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
-    """Return the linearisation of a body at an equilibrium with the last stiffness that its solution has factorised, of a state close to it; the exact one
-    where none was kept. Raises FemsenseError where it is unstable there."""
+    """Return the linearisation of a body at an equilibrium with the last factorised stiffness of its solution, at a state close to it; the exact
+    linearisation if no factor was kept. Raises FemsenseError if the equilibrium is unstable."""
     factor = equilibrium.factor
     return tangent_at(body, equilibrium) if factor is None else _with_held_drives(body, equilibrium, factor)
 

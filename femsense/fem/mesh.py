@@ -77,7 +77,7 @@ class Embedding:
         return moved if self.still is None else moved + self.still
 
     def moves(self, field: FloatArray) -> FloatArray:
-        """Return how a displacement of the nodes (n, 3) moves the points, shape (p, 3)."""
+        """Return the displacements of the points, shape (p, 3), for displacements of the nodes, shape (n, 3), in the same unit."""
         return np.asarray(np.einsum("pk,pkc->pc", self.weights, field[self.nodes]))
 
     def following(self, points: FloatArray, share: FloatArray) -> Embedding:

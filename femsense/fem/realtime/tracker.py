@@ -242,7 +242,7 @@ class Tracker:
         return self.expansion.move(x, tension)
 
     def _look_ahead(self, T: FloatArray, motion: float) -> bool:
-        """Begin anew a little ahead on the way, where the series at hand will soon not do; return whether it was so."""
+        """Make a new expansion slightly ahead of the motion if the current series will soon not converge; return whether one was made."""
         start, terms = self.expansion, self._terms
         sizes, x = [_largest(term) for term in terms], start.positions
         if len(terms) < 2:
@@ -298,7 +298,7 @@ class Tracker:
 
 
 class Known:
-    """The compliance at some states, carried on to others (`combination`), and by how much that may be off."""
+    """The compliance at some states, its interpolation to others (`combination`), and the estimated error of that interpolation."""
 
     def __init__(self, length: float) -> None:
         """Know nothing; `length` [m] is that of `combination`."""
@@ -328,7 +328,7 @@ class Known:
         return np.asarray(np.tensordot(weights, self._stack[: len(weights)], 1))
 
     def doubt(self, state: FloatArray) -> float:
-        """Return by which share W may be off at a state; 0 where nothing is known, since nobody has asked."""
+        """Return the estimated relative error of W at a state; 0 if no compliance was requested before."""
         return self._scale * combination(state, self.states, self._length)[1] if self.states else 0.0
 
 
