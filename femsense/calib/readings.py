@@ -47,7 +47,7 @@ class Reading:
     predicted: float = np.inf
     """Misfit to first order, as a fraction of the current one; readings above 1/`reported` are not fitted."""
     recording: Recording | None = None
-    """As it is read now; None: as it stands, and so in the next two."""
+    """The recording under this reading; None: unchanged. The same holds for the robot and the frames below."""
     robot: Robot | None = None
     frames: IntArray | None = None
     """Indices of the frames that it applies to, shape (f,)."""
