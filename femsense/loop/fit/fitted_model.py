@@ -75,7 +75,7 @@ def fit_model(
     coordinates: FloatArray,
     **options: Unpack[FitOptions],
 ) -> FittedModel:
-    """Return the fit of a hypothesis with its held-out data; arguments as of `fit_jointly`."""
+    """Fit a hypothesis to the data and predict the held-out data; the arguments are those of `fit_jointly`."""
     fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **options)
     held = held_out(data, fit, noise)
     return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))

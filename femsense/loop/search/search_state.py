@@ -42,13 +42,13 @@ class SearchProgress:
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
-    """As of `Search`."""
+    """Name of each added effect with the model that added it, as `Search.history`."""
     given: int
     """Number of models in the history before the search began."""
     fitted: FittedModel
     """The current model, which the next effect extends."""
     base: FittedModel
-    """As of `Search`, from the first screening on."""
+    """Model of the first screening; defined from that screening on."""
     names: list[str]
     """Effects that are tried."""
     quadratic: bool
