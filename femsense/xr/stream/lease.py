@@ -96,7 +96,7 @@ class Lease:
         return Ruling.GRANTED
 
     def is_held(self, now: float) -> bool:
-        """Return whether somebody holds it at a time [s]."""
+        """Return whether a client holds the lease at a time [s]."""
         return bool(self.client) and now - self._renewed_at <= self.hold_s
 
     def expire(self, now: float) -> bool:

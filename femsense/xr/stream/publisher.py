@@ -136,7 +136,7 @@ class Publisher:
 
     @property
     def trouble(self) -> str:
-        """Why readings give no pose; empty if they do, or without readings."""
+        """Reason why the readings of the sensors give no pose; empty if they do, or if there are no readings."""
         with self._lock:
             return self._blind if self._said[0] in ("waiting", "stale") else ""
 
