@@ -217,7 +217,7 @@ def print_pairs(out: Path, data: Path) -> None:
 
 
 def print_fitted(rows: list[Asked]) -> None:
-    """Print what calibration within the loop leaves by both weights (docs/method/closing-the-loop.md, section 4)."""
+    """Print what calibration within the loop leaves by both weights (docs/reference/closing-the-loop-rules.md, section 4)."""
     print(
         "| variant | declared, held out [mm] | fitted; held out [mm] | modulus | weights with the model error: fitted; held out | modulus | corrected |"
     )

@@ -31,12 +31,12 @@ UNLIKELY = 3.0
 
 
 def direction_of_gravity(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield gravity along another axis."""
+    """Yield the reading of the files with gravity along another axis."""
     yield from _predicted(fit, _gravities(fit))
 
 
 def modulus(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield other moduli."""
+    """Yield readings with another Young's modulus."""
     yield from _predicted(fit, _moduli(fit))
 
 

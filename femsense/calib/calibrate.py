@@ -64,27 +64,29 @@ def usable_frames(recording: Recording) -> IntArray:
 
 @one_blas_thread()
 def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None, correct: bool = False) -> Calibration:
-    """Estimate the pose of each camera and, if the recording declares an unknown zero, the initial inputs.
+    """Estimate the pose of each camera and, if the recording declares an unknown zero, the initial inputs of cables and chambers.
 
-    The pose and the inputs minimise the distance between measured and modelled markers (and clouds) of the contact-free frames;
-    the normal matrix of this least-squares problem gives their covariance.
+    The poses and inputs minimise the distance between measured and modelled markers (and clouds, the surface points of depth images) in
+    contact-free frames. The normal matrix of this least-squares problem gives their covariance.
 
     Arguments:
-        robot: the declared robot.
-        recording: markers, clouds or images, and inputs.
+        robot: the declared robot, result of `load_robot`.
+        recording: markers, clouds or images, and inputs, result of `load_recording`.
         frames: indices of the frames to use. Default: at most 16 contact-free frames, evenly spaced.
-        correct: subtract the robot's empirical correction from the markers first.
+        correct: whether to subtract the robot's empirical correction (`femsense improve --correct`) from the markers first. Default: no.
 
     Returns:
-        the calibration, with standard deviations. Read its `status`: data that do not determine an input are named there.
+        the calibration: `poses`, one (4, 4) matrix per camera from camera to robot coordinates [m]; initial tensions [N] and shortenings [m]; their standard
+        deviations. `status` is "converged", or names the inputs that the data do not determine.
 
     Raises:
         InputError: `correct` for a robot without a correction.
         DataError: no contact-free frame, too few markers, or no equilibrium.
 
     Example:
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> calibration = fs.calibrate(robot, recording)
         >>> calibration.status, round(1e3 * calibration.rms_m, 1)  # mm; the declared finger lacks friction
         ('converged', 1.8)

@@ -14,9 +14,9 @@ class Calibration:
     """The result of `calibrate`: camera poses and initial inputs of cables and chambers, with their covariance."""
 
     T_robot_camera: FloatArray
-    """Pose of the first camera, shape (4, 4)."""
+    """Pose of the first camera, shape (4, 4), from camera to robot coordinates [m]."""
     poses: tuple[FloatArray, ...]
-    """Poses of all cameras, each (4, 4)."""
+    """Pose of each camera, shape (4, 4), from camera to robot coordinates [m]."""
     camera_names: tuple[str, ...]
     """Name of each camera."""
     cable_tension_n: dict[str, float]
@@ -28,7 +28,7 @@ class Calibration:
     marker_rms_m: dict[str, float]
     """Root mean square distance of each marker [m]."""
     history: tuple[float, ...]
-    """rms_m of each iteration [m]."""
+    """Value of `rms_m` after each iteration [m]."""
     pose_std: FloatArray
     """Standard deviation of the entries of T_robot_camera, shape (4, 4)."""
     pose_covariance: FloatArray
@@ -66,7 +66,7 @@ class Calibration:
 
     @property
     def settled(self) -> bool:
-        """Whether the fit came to an end; what has not settled is no calibration."""
+        """Whether the fit converged; a calibration that did not must not be used."""
         return not self.status.startswith("not settled")
 
     def __repr__(self) -> str:

@@ -21,7 +21,7 @@ WIDE = 0.2
 
 
 def declared_pose(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield the files with a declared pose left open: of one camera, or of all, which finds a displaced base of the robot."""
+    """Yield readings in which a declared pose is fitted: that of one camera, or those of all, which detects a displaced base of the robot."""
     recording = fit.scene.recording
     views = [v for v, T in enumerate(recording.T_robot_camera) if T is not None and _shows_pose(fit, v)]
     for free in [*((v,) for v in views), *([tuple(views)] if len(views) > 1 else [])]:
@@ -67,7 +67,7 @@ def pose_at_rest(fit: MarkerFit) -> Iterator[Reading]:
 
 
 def moved_camera(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield the files with a pose of its own for a camera from some frame on: that by which the misfit falls most."""
+    """Yield the reading in which a camera moved between two frames: those at which a second pose reduces the misfit most."""
     scene, recording = fit.scene, fit.scene.recording
     diagonal = float(np.linalg.norm(np.ptp(fit.robot.body.mesh.nodes, axis=0)))
     for v, name in enumerate(recording.camera_names):

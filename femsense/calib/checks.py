@@ -58,7 +58,7 @@ def relabelled(fit: MarkerFit, *, strict: bool = True) -> Recording | None:
     nothing changes.
 
     Arguments:
-        fit: of the markers as they are named.
+        fit: fit with the marker names in the files.
         strict: refuse labels that are swapped in most frames, but not in all.
 
     Raises:

@@ -76,7 +76,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CloudPose:
-    """A pose and how it fits."""
+    """A candidate pose of a camera, and the quality of its fit."""
 
     T_robot_camera: FloatArray
     """shape (4, 4)."""
@@ -118,10 +118,10 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
 
 
 def settle_cloud_pose(views: Sequence[View], T_robot_camera: FloatArray) -> CloudPose:
-    """Return the pose to which closest points of all views lead from a start, and how it fits.
+    """Refine a pose by ICP (closest points of all views) from a start; return the pose and the quality of its fit.
 
     Arguments:
-        views: one a frame.
+        views: the cloud of the camera in each frame.
         T_robot_camera: off by a tenth of the body's diagonal at most, shape (4, 4).
     """
     size = size_of(views[0].surface)
@@ -129,7 +129,7 @@ def settle_cloud_pose(views: Sequence[View], T_robot_camera: FloatArray) -> Clou
 
 
 def difference(T: FloatArray, other: FloatArray, surface: Surface) -> tuple[float, float]:
-    """Return by which angle [rad] two poses are turned, and how far apart they place the body's middle [m]."""
+    """Return the rotation angle between two poses [rad], and the distance between the positions of the body's centre under them [m]."""
     D = T @ invert_pose(other)
     middle = surface.positions.mean(axis=0)
     angle = float(np.arccos(np.clip((np.trace(D[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))

@@ -60,7 +60,7 @@ def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibratio
     """Return the calibration with poses of cameras without markers.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         calibration: calibration of the other cameras; the poses of `views` are replaced.
         views: the cameras.
 

@@ -28,9 +28,9 @@ def in_blocks(scan: Scan, noises: Sequence[CameraNoise], pixels: Sequence[float]
     Pixels are grouped in square blocks of the image of each camera. The mean of points of a plane is a point of the plane.
 
     Arguments:
-        noises: of the cameras.
+        noises: noise model of each camera.
         pixels: angle between neighbouring rays of each camera [rad].
-        side: of a block [pixels], see `block_side`.
+        side: side of a block of pixels [1], result of `block_side`.
     """
     if side == 1:
         return scan

@@ -61,7 +61,7 @@ def check_declared_by_clouds(robot: Robot, recording: Recording, found: Calibrat
     reduces the misfit as much, the warning names both causes.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         found: the calibration with the declared poses.
         views: cameras with a declared pose, contact-free clouds and no markers.
 

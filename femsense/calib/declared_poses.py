@@ -26,8 +26,8 @@ def pose_error(
     """Return a clause with the difference between declared and fitted poses.
 
     Arguments:
-        recording: with the names of the cameras.
-        views: of the cameras.
+        recording: the recording, with the names of its cameras.
+        views: indices of the cameras.
         declared, fitted: T_robot_camera of all cameras, shape (4, 4) each.
         middles: point at which the translation is stated, one per view [m], shape (3,).
     """

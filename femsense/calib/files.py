@@ -55,7 +55,14 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
-    """Write a calibration as calibration.json, and return the path.
+    """Write a calibration to a JSON file.
+
+    Arguments:
+        calibration: result of `calibrate`.
+        path: the file, by convention calibration.json. An earlier calibration there is replaced.
+
+    Returns:
+        the path.
 
     Raises:
         InputError: a folder, or a file of another kind, exists at that path.
@@ -76,12 +83,16 @@ def read_calibration(path: str | Path) -> Calibration:
     Arguments:
         path: the file, or the folder that contains it.
 
+    Returns:
+        the calibration, for `estimate` and `reach`.
+
     Raises:
         InputError: the file is missing, broken or of another kind. The error names the key, the value found and the value expected.
 
     Example:
         >>> import tempfile
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> import femsense as fs
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> calibration = fs.calibrate(fs.load_robot("finger"), recording)
         >>> path = fs.write_calibration(calibration, tempfile.mkdtemp() + "/calibration.json")
         >>> fs.read_calibration(path).status

@@ -72,7 +72,7 @@ def fit_clouds(robot: Robot, recording: Recording, calibration: Calibration, *, 
     """Fit undeclared poses, and initial inputs with an unknown zero, to the clouds of contact-free frames.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         calibration: calibration from markers, or an initial guess; its covariances are the prior (zero: flat prior).
         guessed: cameras whose pose is a guess: its covariance limits the steps and does not enter the posterior.
 
@@ -348,7 +348,7 @@ class _Fit:
         the points is then increased until the difference is expected (Mandel & Paule 1970).
 
         Arguments:
-            mean: of the prior, shape (c,).
+            mean: prior mean of the c parameters, shape (c,).
             damping: damping of the step, relative to the largest eigenvalue of the information.
         """
         values, vectors = np.linalg.eigh(self.prior)
@@ -439,7 +439,7 @@ def measured_noises(robot: Robot, recording: Recording, calibration: Calibration
     """Return the noise of each camera: as declared, or estimated from the scatter of contact-free clouds about their smooth part.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         calibration: calibration with the poses.
     """
     declared = [camera.noise if camera is not None else None for camera in recording.cameras]

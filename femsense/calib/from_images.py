@@ -83,7 +83,7 @@ def find_spots(robot: Robot, color: FloatArray, depth: FloatArray, camera: Camer
     """Return the tags and dots of an image.
 
     Arguments:
-        robot: with the appearance of its markers.
+        robot: the robot; its `appearance` describes the markers.
         color: red, green, blue in 0 … 1, shape (H, W, 3).
         depth: along the optical axis [m], registered to the colour, 0 where there is none, shape (H, W).
         camera: the lens.

@@ -32,11 +32,11 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
 
     Arguments:
         robot: the robot.
-        recording: as loaded.
+        recording: result of `load_recording`.
         calibration: calibration of this or another recording.
 
     Raises:
-        DataError: as for `calibrate`: markers or inputs that do not belong to the robot.
+        DataError: markers or inputs that do not belong to the robot.
     """
     frames = _telling(recording)
     if len(frames) < FEWEST or len(calibration.poses) != len(recording.camera_names):

@@ -68,7 +68,7 @@ class _Columns:
 
 
 def inputs_otherwise(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield other readings of the columns of inputs, predicted by the linear response of the markers."""
+    """Yield readings with another sign, unit, order or delay of the columns of inputs, predicted by the linear response of the markers."""
     scene, response, table = fit.scene, _response(fit), recorded_inputs(fit.scene.recording)
     names = (*fit.robot.body.cable_names, *fit.robot.body.chamber_names)
     if response is None:
@@ -137,7 +137,7 @@ def _delays(frames: IntArray, table: FloatArray) -> Iterator[_Columns]:
 
 
 def zero_of_inputs(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield known cable inputs that count from another zero."""
+    """Yield the reading in which absolute cable inputs have another zero."""
     recording = fit.scene.recording
     if fit.initial is not None or not fit.robot.body.cables:
         return

@@ -33,9 +33,9 @@ def input_tables(robot: Robot, recording: Recording, initial: FloatArray | None,
     """Return the initial inputs as tables.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         initial: [N] or [m], shape (a,); None where they are known.
-        covariance: of `initial`, shape (a, a); empty where they are known.
+        covariance: covariance of `initial`, shape (a, a); empty if they are known.
     """
     state = initial_state(robot, recording, initial)
     own, other = _input_std(robot, recording, state, covariance)
@@ -61,7 +61,7 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
 
 
 def most_different(rows: FloatArray, count: int) -> list[int]:
-    """Return indices of some of the rows (n, k), the largest first, each next one as far from the others as can be."""
+    """Return indices of some rows, shape (n, k): first the largest, then each time the one farthest from those chosen before."""
     chosen = [int(np.abs(rows).sum(axis=1).argmax())]
     while len(chosen) < min(count, len(rows)):
         distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
@@ -129,7 +129,7 @@ def _input_std(
 
 
 def weak_inputs(recording: Recording, std: dict[str, float | None]) -> str:
-    """Return the cables whose initial input is hardly determined, with how well, as text; empty where there are none."""
+    """Return a text that lists the cables whose initial input is poorly determined, with standard deviations; empty if there are none."""
     scale, unit = (0.25, "N") if recording.actuation == "tension" else (0.005, "m")
     weak = [f"{n} (± {'∞' if v is None else format(v, '.2g')} {unit})" for n, v in std.items() if v is None or v > scale]
     return ", ".join(weak)

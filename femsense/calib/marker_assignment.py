@@ -56,7 +56,7 @@ class Nameless:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Named:
-    """A reading of the unnamed markers."""
+    """An assignment of names to the unnamed markers, with the poses of the cameras."""
 
     marker: IntArray
     """Which marker each unnamed row of the recording is, shape (U,): −1 none of the robot's, or not distinguishable."""
@@ -79,10 +79,10 @@ def name_markers(
     """Return the recording with names for its unnamed markers in some frames; markers without an assignment are removed with a warning.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         frames: indices of the frames, shape (f,).
         allowed: which marker each unnamed row may be (by its colour), shape (U, markers); by default any.
-        poses: of the cameras where they are known, each (4, 4); by default as declared.
+        poses: pose of each camera, shape (4, 4), or None where it is unknown. Default: the declared poses.
         initial: initial inputs where they are known; by default found with the pose.
 
     Raises:

@@ -62,7 +62,7 @@ def scaled(recording: Recording, views: Sequence[int], scale: float | FloatArray
 
 
 def left_handed(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield mirrored markers: one axis of their frame points the other way."""
+    """Yield readings in which one axis of the markers' coordinates is reversed (left-handed axes)."""
     for views in cameras_of(fit):
         mine, off = np.isin(fit.scene.view, views), np.linalg.norm(fit.jet.residual, axis=1)
         if any(np.median(off[fit.rows_of(v)]) < SUSPICIOUS * fit.spread_of(v) for v in views):
@@ -78,7 +78,7 @@ def left_handed(fit: MarkerFit) -> Iterator[Reading]:
 
 
 def exchanged_labels(fit: MarkerFit) -> Iterator[Reading]:
-    """Yield markers under other names, the same in all frames."""
+    """Yield readings with exchanged marker labels, the same exchange in all frames."""
     scene, labels, own = fit.scene, fit.robot.marker_names, np.arange(len(fit.robot.marker_names))
     places = np.array([fit.robot.markers.positions(fit.jet.states[k].positions) for k in scene.frames.tolist()])
     true = {views[0]: _true_names(fit, views[0], places) for views in cameras_of(fit) if len(views) == 1}

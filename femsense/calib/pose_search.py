@@ -35,7 +35,7 @@ FAR = 1e3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedNames:
-    """A pose and its assignment."""
+    """A candidate pose of a camera, and the marker names of its points."""
 
     T_robot_camera: FloatArray
     """shape (4, 4)."""
@@ -96,7 +96,7 @@ def refine_names(
     A point is an outlier if that is more likely than a measurement error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
 
     Arguments:
-        model, seen, allowed: as of `search_poses`.
+        model, seen, allowed: the arguments of `search_poses` with these names.
         T_robot_camera: the start, shape (4, 4).
         fixed: keep the pose.
         repeats: frames a state.

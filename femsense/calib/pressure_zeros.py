@@ -30,7 +30,7 @@ Fit = Callable[[Robot], MarkerFit]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PressureZeros:
-    """What is added to recorded pressures."""
+    """Initial pressures, which are added to the recorded ones."""
 
     pressure: dict[str, float]
     """Initial pressure of each chamber [Pa]."""
@@ -39,7 +39,7 @@ class PressureZeros:
 
 
 def has_unknown_zeros(robot: Robot, recording: Recording) -> bool:
-    """Return whether the recorded pressures of a robot count from an unknown zero."""
+    """Return whether the recorded pressures of a robot have an unknown zero."""
     return recording.actuation_zero == "unknown" and bool(robot.body.chambers)
 
 
@@ -51,7 +51,7 @@ def with_initial_pressures(robot: Robot, pressure: dict[str, float]) -> Robot:
 
 
 def find_pressure_zeros(robot: Robot, recording: Recording, fit: Fit) -> PressureZeros:
-    """Return the zeros of all chambers by Gauss–Newton; poses and initial inputs are fitted anew in each round.
+    """Fit the initial pressures of all chambers by Gauss–Newton steps; poses and initial inputs are re-fitted in each step.
 
     Arguments:
         robot: the robot.
@@ -59,7 +59,7 @@ def find_pressure_zeros(robot: Robot, recording: Recording, fit: Fit) -> Pressur
         fit: fits what else is unknown.
 
     Raises:
-        DataError: as of `fit`.
+        DataError: `fit` raises it.
     """
     names = robot.body.chamber_names
     scale = np.maximum(np.ptp(recording.pressures, axis=0), 1.0)
@@ -77,7 +77,7 @@ def find_pressure_zeros(robot: Robot, recording: Recording, fit: Fit) -> Pressur
 
 
 def weak_zeros(recording: Recording, zeros: PressureZeros) -> str:
-    """Return the chambers whose zero is hardly determined, with how well, as text; empty where there are none."""
+    """Return a text that lists the chambers whose initial pressure is poorly determined, with standard deviations; empty if there are none."""
     ranges = dict(zip(recording.chamber_names, np.ptp(recording.pressures, axis=0)))
     weak = [(name, std) for name, std in zeros.std.items() if std is None or std > WEAK * ranges[name]]
     return ", ".join(f"{name} (± {'∞' if std is None else format(std, '.2g')} Pa)" for name, std in weak)

@@ -40,14 +40,14 @@ MOST = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Reading:
-    """An alternative reading of the same files."""
+    """An alternative interpretation (reading) of the same files: a hypothesis about one error in them, such as exchanged labels."""
 
     error: str | Callable[[MarkerFit], str]
     """The error in the files if this reading is right, as a clause; or that of the reading's fit."""
     predicted: float = np.inf
     """Misfit to first order, as a fraction of the current one; readings above 1/`reported` are not fitted."""
     recording: Recording | None = None
-    """As it is read now; None: as it stands, and so in the next two."""
+    """The recording under this reading; None: unchanged. The same holds for the robot and the frames below."""
     robot: Robot | None = None
     frames: IntArray | None = None
     """Indices of the frames that it applies to, shape (f,)."""
@@ -69,7 +69,7 @@ Refit = Callable[[Robot, Recording, IntArray], MarkerFit]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Compared:
-    """A reading that was fitted."""
+    """An alternative reading of the files after its fit."""
 
     kind: Reread
     reading: Reading
@@ -83,10 +83,10 @@ class _Compared:
 
 
 def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *, rivals: Sequence[Reread] = ()) -> None:
-    """Refuse files that fit far better under an alternative reading; warn of those that fit better.
+    """Compare the files with alternative readings (hypotheses about one error in them), and refuse or warn if one fits better.
 
     Arguments:
-        fit: of the files as they stand.
+        fit: fit of the unchanged files.
         rereads: the kinds of readings.
         refit: fits another reading.
         rivals: further kinds, which compete where one of the first is promising.
@@ -134,7 +134,7 @@ def _compared(fit: MarkerFit, kind: Reread, reading: Reading, refit: Refit) -> _
 
 
 def is_suspicious(fit: MarkerFit) -> bool:
-    """Return whether the markers of a camera leave more than `SUSPICIOUS`."""
+    """Return whether the residual of the markers of a camera exceeds the share `SUSPICIOUS` of their spread."""
     return any(fit.misfit_of(v) > SUSPICIOUS * fit.spread_of(v) for v in range(len(fit.poses)))
 
 
@@ -150,7 +150,7 @@ def share_with(
     """Return the misfit of other markers as a fraction of the current one, both with free poses.
 
     Arguments:
-        fit: as it stands.
+        fit: fit of the unchanged files.
         modelled, measured: other places [m], robot frame, shape (k, 3).
         rows: which rows count, shape (k,); by default all.
     """
@@ -163,7 +163,7 @@ def share_with(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FirstOrder:
-    """Further parameters of a fit, to first order."""
+    """Result of `first_order`: further parameters of a fit, estimated to first order."""
 
     value: FloatArray
     """Shape (q,)."""
@@ -177,7 +177,7 @@ def first_order(fit: MarkerFit, columns: FloatArray, *, beside: FloatArray | Non
     """Return parameters fitted together with the undeclared poses and the unknown inputs.
 
     Arguments:
-        fit: with derivatives.
+        fit: fit of the unchanged files, with the derivatives of its residual.
         columns: derivative of the residual by the parameters, shape (k, 3, q).
         beside: the same of nuisance parameters, which the misfit without `columns` has too, shape (k, 3, n).
     """

@@ -30,7 +30,7 @@ HUBER = 2.5
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cells:
-    """Means of the rows of a frame that lie and look alike."""
+    """Means of the rows of a frame in cells of similar position and normal."""
 
     residual: FloatArray
     """[m], shape (g,)."""
@@ -91,7 +91,7 @@ def likeliest_covariance(cells: Cells) -> FloatArray:
 
 
 def restricted_likelihood(values: FloatArray, fixed: FloatArray, covariance: FloatArray) -> float:
-    """Return the logarithm of the likelihood of what of the values the fixed effects cannot explain, up to a constant.
+    """Return the restricted log-likelihood of values, with the fixed effects projected out, up to a constant.
 
     Arguments:
         values: shape (g,).

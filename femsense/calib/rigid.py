@@ -46,7 +46,7 @@ def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray
 
 
 def fit_rigid_robust(points_a: FloatArray, points_b: FloatArray, *, rounds: int = 20) -> tuple[FloatArray, FloatArray]:
-    """Return T_a_b and weights (n,) in (0, 1] that make little of points that do not fit (Cauchy weights on the MAD scale)."""
+    """Return T_a_b, shape (4, 4), by robust registration, and the weight of each point in (0, 1], shape (n,): Cauchy weights on the MAD scale."""
     weights = np.ones(len(points_a))
     T = fit_rigid(points_a, points_b)
     if len(points_a) < 5:  # too few to identify the outlier
@@ -60,12 +60,12 @@ def fit_rigid_robust(points_a: FloatArray, points_b: FloatArray, *, rounds: int 
 
 
 def poses_apart(T: FloatArray, other: FloatArray, points: FloatArray) -> float:
-    """Return how far two poses of a camera put points that it sees apart, root mean square [m]; points (k, 3) are where the second has them."""
+    """Return the root mean square distance between the positions of points (k, 3) under two poses of a camera [m]; they are given under the second."""
     moved = transform_points(T @ invert_pose(other), points)
     return float(np.sqrt(((moved - points) ** 2).sum(axis=1).mean()))
 
 
 def rigid_residual(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a minus the best turned and shifted b [m], shape (n, 3); any number of points (n, 3), in any layout."""
+    """Return the residual of the best rigid registration of points b to points a [m], shape (n, 3)."""
     p, q = a - a.mean(axis=0), b - b.mean(axis=0)
     return np.asarray(p - q @ rotation_between(p, q).T)

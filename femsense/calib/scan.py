@@ -131,9 +131,9 @@ def read_scan(
     Colour separates the robot if robot and cloud have one. Otherwise all points may belong to the robot, and the residuals decide.
 
     Arguments:
-        robot, recording: as loaded.
+        robot, recording: results of `load_robot` and `load_recording`.
         k: index of the frame.
-        poses: of the cameras, each (4, 4).
+        poses: pose of each camera, shape (4, 4).
         positions: approximate nodes of the body [m], shape (n, 3).
         some: points of the background that are kept of each camera, about.
     """
@@ -216,8 +216,8 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     Arguments:
         scan: the measured points, without colour.
         surface: the deformed surface.
-        poses, noises: of the cameras.
-        reach: see `Surface.cast` [m].
+        poses, noises: pose, shape (4, 4), and noise model of each camera.
+        reach: largest distance between a measured point and the surface [m], as for `Surface.cast`.
     """
     rows = ray_rows(scan, surface, poses, noises, reach=reach)
     on = np.zeros(len(scan.view), dtype=bool)

@@ -60,7 +60,7 @@ def bare_from(surface: Surface, places: FloatArray, eye: FloatArray) -> BoolArra
     """Return which places of a surface the body does not hide from a direction, shape (p,).
 
     Arguments:
-        surface: of the body.
+        surface: surface of the body.
         places: on it [m], shape (p, 3).
         eye: unit vector to a camera far away, shape (3,).
     """

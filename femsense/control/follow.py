@@ -33,6 +33,8 @@ class Follower:
     step reduces the distance any more. The last state is the warm start for the next target.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
         >>> follower = fs.Follower(robot)
         >>> for height in (0.005, 0.010, 0.015):  # m, a moving target; nan: free

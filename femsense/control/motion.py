@@ -38,7 +38,7 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Motion:
-    """Inputs that bring points of the body to their targets, or as close as the limits allow."""
+    """Result of `reach`: inputs that bring points of the body to their targets, or as close as the limits allow."""
 
     inputs: dict[str, float]
     """Commands: tension [N] or shortening [m] of each cable, pressure [Pa] of each chamber."""

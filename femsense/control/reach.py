@@ -65,6 +65,8 @@ def reach(
         InputError: an unknown marker, cable or control, reversed limits, or a requested correction that the robot lacks.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> motion = fs.reach(fs.load_robot("finger"), {"tip": (np.nan, np.nan, 0.02)})
         >>> motion.status, round(motion.inputs["flexor"], 1)  # N
         ('reached', 1.0)

@@ -40,7 +40,7 @@ SURE_GAIN = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ReachOptions:
-    """Criteria to end a search for inputs."""
+    """Options of `reach`: tolerances and numbers of steps at which the search for inputs ends."""
 
     tolerance_m: float = 1e-10
     """Largest error of a reached target [m]."""

@@ -24,6 +24,7 @@ class InputError(FemsenseError):
         hint: a remedy.
 
     Example:
+        >>> import femsense as fs
         >>> try:
         ...     fs.load_robot("fingre")
         ... except fs.InputError as error:
@@ -67,6 +68,6 @@ class DataError(FemsenseError):
 
 
 class MissingDependency(FemsenseError):
-    """An optional package or a system library is missing; the text holds the exact install line."""
+    """Raised when an optional package or a system library is missing. The message contains the exact install command."""
 
     exit_status = 2

@@ -45,7 +45,7 @@ def internal(
     room: FloatArray | None = None,
     stretch: FloatArray | None = None,
 ) -> Internal:
-    """Return internal energy, forces and (if asked) stiffness of the body at the given node positions [m], shape (n, 3).
+    """Return internal energy [J], nodal forces [N] and, if `tangent`, stiffness blocks [N/m] of a body at node positions [m], shape (n, 3).
 
     The clamp's springs, where the body has them, belong to it; of a plate that turns, the blocks hold the sparse part only
     (see `clamp.with_turning_plate`). `room`, an array (nb, 9), takes the blocks; it may be of single precision.

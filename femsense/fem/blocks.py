@@ -21,20 +21,25 @@ def block_mesh(
     keep: Callable[[FloatArray], BoolArray] | None = None,
     place: Callable[[FloatArray], FloatArray] | None = None,
 ) -> TetMesh:
-    """Return the tetrahedra of a grid of blocks, six per cell; the same input gives the same mesh.
+    """Make a tetrahedral mesh from a grid of cuboid cells, with six tetrahedra per cell.
 
     Cells are split by Kuhn's rule, mirrored from each cell to the next, so that neighbours fit together and a grid with an even
     number of cells along an axis is its own mirror image across it (a symmetric body bends symmetrically).
 
     Arguments:
         levels: coordinates of the cells' sides along each of the three axes, increasing, in any unit.
-        keep: function of the centres of the cells (c, 3); returns whether each cell belongs to the body, shape (c,). Default: all.
-        place: function of the grid points (n, 3); returns the node positions [m], shape (n, 3). Default: the grid points.
+        keep: function of the centres of the c cells, shape (c, 3), that returns whether each belongs to the body, shape (c,). Default: all do.
+        place: function of the n grid points, shape (n, 3), that returns the node positions [m], shape (n, 3). Default: the grid points.
+
+    Returns:
+        the mesh of linear elements. Grid points without a cell are left out.
 
     Raises:
-        InputError: levels that do not rise, or no cell left.
+        InputError: coordinates that do not increase, or no cell left.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])  # m
         >>> mesh.nodes.shape, mesh.tets.shape  # ten by two by two cells of six tetrahedra
         ((99, 3), (240, 4))

@@ -21,22 +21,25 @@ FLAT = 1e-12
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BodyModel:
-    """A body with its clamp, cables and dead loads. A change makes a new object (`with_…`)."""
+    """A finite-element body with n nodes and m elements: mesh, material, clamp, cables, chambers and dead loads.
+
+    `make_body` and `load_robot` make one. Bodies are immutable: each method `with_…` returns a changed copy.
+    """
 
     mesh: TetMesh
     """Mesh at rest."""
     material: Material
     """Constitutive law and its parameters, per element."""
     clamped: IntArray
-    """Clamped nodes, shape (k,)."""
+    """Indices of the clamped nodes, shape (k,)."""
     clamp_stiffness: float
-    """A spring in each direction at every clamped node of the declared mesh instead of the clamp [N/m]; inf: clamped."""
+    """Stiffness of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: these nodes cannot move."""
     clamp_nodes: IntArray
-    """The clamped nodes that the declared mesh has (no added mid-edge nodes); these get the springs, shape (s,)."""
+    """Indices of the clamped nodes at which a compliant clamp has springs, shape (s,): those of the declared mesh, without added mid-edge nodes."""
     cables: tuple[Cable, ...]
     """Cables, tied to the mesh."""
     gravity: FloatArray
-    """[m/s²], shape (3,)."""
+    """Gravity in the axes of the mesh [m/s²], shape (3,)."""
     dead_forces: FloatArray
     """Dead nodal forces in addition to the weight [N], shape (n, 3)."""
     stencil: Stencil
@@ -46,7 +49,7 @@ class BodyModel:
     free_map: FreeMap
     """Map from free to all degrees of freedom."""
     clamp_turn_stiffness: float = np.inf
-    """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
+    """Rotational stiffness of the clamp, a rigid plate, about `clamp_center` [N m/rad]; inf: it does not rotate."""
     released: list[FreeMap] = field(default_factory=list)
     """The free map without the clamp, after the first use; bodies with the same mesh share this list."""
 
@@ -98,7 +101,7 @@ class BodyModel:
         return self.weight() + self.dead_forces
 
     def is_held(self) -> bool:
-        """Return whether clamp or springs stop every rigid motion of every part: three of its nodes there are not on a line."""
+        """Return whether the clamp or its springs prevent every rigid motion of every connected part: each has three held nodes that are not on a line."""
         held = self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes  # a plate holds all of them
         return all(_spread_out(self.mesh.nodes[held[self.parts[held] == part]]) for part in range(int(self.parts.max()) + 1))
 
@@ -128,29 +131,27 @@ class BodyModel:
         return replace(self, material=material)
 
     def with_stiffness_scale(self, scale: npt.ArrayLike) -> BodyModel:
-        """Return the body with its modulus scaled, by a number or an array (m,)."""
+        """Return the body with Young's modulus multiplied by a number, or by one factor per element, shape (m,)."""
         return replace(
             self, material=replace(self.material, young_modulus=freeze(self.material.young_modulus * np.asarray(scale)))
         )
 
     def with_cables(self, cables: tuple[Cable, ...]) -> BodyModel:
-        """Return the body with changed cables; their paths must stay, since the sparsity pattern holds them."""
+        """Return the body with changed cables. Their paths must be unchanged, because the sparsity pattern depends on them."""
         if [c.path for c in cables] != [c.path for c in self.cables]:
             raise InputError("the paths of the cables must stay", where="cables", hint="make_body builds a body with other paths")
         return replace(self, cables=cables)
 
     def with_cable_places(self, places: Mapping[str, FloatArray]) -> BodyModel:
-        """Return the body with points of some cables' paths elsewhere at rest, name → [m], shape (p, 3);
-        each keeps the element that carries it."""
+        """Return the body with other cable paths: name → p points at rest [m], shape (p, 3); each point stays embedded in its element."""
         paths = {c.name: tie_to_elements(self.mesh, places[c.name], c.path.element) for c in self.cables if c.name in places}
         return replace(self, cables=tuple(replace(c, path=paths.get(c.name, c.path)) for c in self.cables))
 
     def with_rest_nodes(self, nodes: FloatArray) -> BodyModel:
-        """Return the body of another shape at rest: its nodes elsewhere [m], shape (n, 3), free of stress there;
-        ties and patterns stay.
+        """Return the body with another stress-free shape: other node positions at rest [m], shape (n, 3). Embedded points and sparsity patterns are kept.
 
         Raises:
-            InputError: where an element would fold over.
+            InputError: an element would be inverted.
         """
         mesh = TetMesh(nodes, self.mesh.tets)
         stencil = reshaped(self.stencil, mesh)
@@ -163,16 +164,16 @@ class BodyModel:
         return replace(self, mesh=mesh, stencil=stencil, chambers=chambers)
 
     def with_clamp_nodes(self, nodes: npt.ArrayLike) -> BodyModel:
-        """Return the body with other nodes that springs replace where the clamp gives, shape (s,);
-        all that are clamped do at first."""
+        """Return the body with another set of nodes at which a compliant clamp has springs: s indices, shape (s,). Default: all clamped nodes."""
         return replace(self, clamp_nodes=freeze(as_indices(nodes, len(self.mesh.nodes), "clamp_nodes"), np.int64))
 
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
-        """Return the body on a compliant clamp (see `femsense.fem.clamp`).
+        """Return the body on a compliant clamp: springs at its clamped nodes, and a plate that can rotate.
 
         Arguments:
-            stiffness: of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: none gives.
-            turn: of the plate about `clamp_center` [N m/rad]; inf: it does not turn. Both inf give the clamp back.
+            stiffness: stiffness of a spring in each direction at every node of `clamp_nodes` [N/m]. Default inf: these nodes cannot move.
+            turn: rotational stiffness of the clamped plate about `clamp_center` [N m/rad]. Default inf: it does not rotate.
+                If both are inf, the clamp is rigid.
         """
         if np.isinf(stiffness) and np.isinf(turn):
             free_map = make_free_map(self.stencil, self.mesh, self.clamped)
@@ -212,29 +213,40 @@ def make_body(
     chambers: tuple[Chamber, ...] = (),
     gravity: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> BodyModel:
-    """Build a body.
+    """Build a finite-element body with n nodes and m elements from a mesh, its material, its clamp and its drives.
+
+    Three constitutive laws have the same small-strain moduli: the corotational law is linear elasticity in rotating elements, the neo-Hookean law
+    describes rubber at larger strains, and the Gent law also its stiffening near a limit of stretch.
 
     Arguments:
-        mesh: tet4 or tet10 mesh.
-        young_modulus: [Pa], a number or an array (m,).
-        poisson_ratio: [1], a number or an array (m,).
-        density: [kg/m³].
-        law: "corotational", "neo_hookean" or "gent".
-        clamped: indices of the clamped nodes, or a mask (n,); see also `BodyModel.with_clamp_nodes`.
-        cables: see `tie_cable`.
-        chambers: see `chambers.find_chamber`.
-        gravity: [m/s²], shape (3,).
+        mesh: mesh at rest [m], of linear (4 nodes) or quadratic (10 nodes) tetrahedra.
+        young_modulus: Young's modulus [Pa], above 0: a number, or one value per element, shape (m,).
+        poisson_ratio: Poisson's ratio [1], between −1 and 0.5 (0.49 for silicone): a number, or one value per element, shape (m,).
+        density: density [kg/m³], at least 0. Default 0: no weight.
+        law: constitutive law: "corotational" (default), "neo_hookean" or "gent".
+        clamped: indices of the nodes that cannot move, or a mask, shape (n,). Default: none. `BodyModel.with_clamp_stiffness` makes the
+            clamp compliant.
+        cables: results of `tie_cable`. Default: none.
+        chambers: closed cavities under pressure, results of `femsense.fem.cavities.find_chamber`. Default: none.
+        gravity: gravity in the axes of the mesh [m/s²], shape (3,). Default: none.
+
+    Returns:
+        the body at rest, for `solve_equilibrium`, `compliance` and `Tracker`.
 
     Raises:
-        InputError: a value is out of its range.
+        InputError: a value outside of the ranges above, an unknown law, a node that does not exist, or inverted elements.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> mesh = fs.block_mesh([np.linspace(0.0, 0.10, 11), np.linspace(0.0, 0.02, 3), np.linspace(0.0, 0.02, 3)])
         >>> bar = fs.make_body(mesh, young_modulus=1e6, poisson_ratio=0.45, clamped=mesh.nodes[:, 0] == 0.0)
+        >>> corner = np.argmax(mesh.nodes.sum(axis=1))  # of the tip
         >>> forces = np.zeros_like(mesh.nodes)
-        >>> forces[np.argmax(mesh.nodes.sum(axis=1)), 2] = -0.05  # N, at one corner of the tip
-        >>> fs.solve_equilibrium(bar, nodal_forces=forces).converged
-        True
+        >>> forces[corner, 2] = -0.05  # N
+        >>> bent = fs.solve_equilibrium(bar, nodal_forces=forces)
+        >>> round(1e3 * float(bent.positions[corner, 2] - mesh.nodes[corner, 2]), 1)  # deflection [mm]
+        -0.8
     """
     n, m = len(mesh.nodes), len(mesh.tets)
     E, nu = (np.broadcast_to(np.asarray(v, dtype=float), (m,)) for v in (young_modulus, poisson_ratio))
@@ -322,7 +334,26 @@ def tie_cable(
     max_tension: float = np.inf,
     friction: float = 0.0,
 ) -> Cable:
-    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, is embedded in an element (see `embed_points`)."""
+    """Tie a cable to a mesh: each point of its path is embedded in the element with the nearest centre, and moves with it.
+
+    Arguments:
+        mesh: mesh of the body at rest [m].
+        name: name of the cable, by which inputs refer to it.
+        path: p points of the cable in the body at rest [m], shape (p, 3), from the far end to the exit.
+        pull_point: fixed point outside of the body towards which the cable is pulled [m], shape (3,).
+        exit_direction: direction in which the cable leaves the pull point, shape (3,), of any length. Only friction depends on it.
+            Default: no bend at the pull point.
+        min_tension: smallest tension [N]. Default: 0.
+        max_tension: largest tension [N]. Default: no limit.
+        friction: capstan coefficient μ at each bend [1], at least 0: a bend by the angle φ changes the tension by a factor of up to exp(μ φ).
+            Default: 0.
+
+    Returns:
+        the cable, for the argument `cables` of `make_body`.
+
+    Raises:
+        InputError: negative friction, a direction of length 0, or arrays of another shape.
+    """
     if not (np.isfinite(friction) and friction >= 0):
         raise InputError("out of range", where=f"friction of cable {name}", found=friction, expected="≥ 0")
     embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")

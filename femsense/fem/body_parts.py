@@ -56,7 +56,7 @@ class Cable:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Chamber:
-    """A closed cavity of the body under pressure (see `chambers.find_chamber`)."""
+    """A closed cavity of the body under pressure; `femsense.fem.cavities.find_chamber` finds it in a mesh."""
 
     name: str
     faces: IntArray

@@ -74,7 +74,7 @@ def _pull(
 
 
 def pull_rows(body: BodyModel, positions: FloatArray, shares: list[FloatArray] | None = None) -> FloatArray:
-    """Return H_a: the nodal forces of unit tensions [1], shape (a, 3n); shares scale the segments of each cable (friction)."""
+    """Return the forces on the n nodes of each of a cables at a tension of 1 N [1], shape (a, 3 n); `shares` as for `drive_rows`."""
     n = len(body.mesh.nodes)
     rows = np.zeros((len(body.cables), 3 * n))
     for i, cable in enumerate(body.cables):

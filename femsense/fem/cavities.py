@@ -76,14 +76,17 @@ def curvature_map(chamber: Chamber, slots: IntArray, block_count: int, node_coun
 def find_chamber(
     mesh: TetMesh, name: str, seed: npt.ArrayLike, *, max_pressure: float = np.inf, where: str | None = None
 ) -> Chamber:
-    """Return the chamber whose closed inner surface encloses a seed.
+    """Find the chamber (a closed cavity) of a mesh that contains a given point, its seed.
 
     Arguments:
-        mesh: at rest.
-        name: of the chamber.
+        mesh: mesh of the body at rest [m].
+        name: name of the chamber, by which pressures refer to it.
         seed: any point inside the cavity [m], shape (3,).
-        max_pressure: [Pa].
-        where: location for messages.
+        max_pressure: largest pressure [Pa]. Default: no limit.
+        where: location that error messages state.
+
+    Returns:
+        the chamber, for the argument `chambers` of `make_body`.
 
     Raises:
         InputError: the seed lies in the material, outside of the body, or in a cavity that is open.

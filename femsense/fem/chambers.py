@@ -41,7 +41,7 @@ def volume_gradient(chamber: Chamber, positions: FloatArray) -> FloatArray:
 
 
 def volume_changes(body: BodyModel, positions: FloatArray) -> FloatArray:
-    """Return how much each chamber has grown since rest [m³], shape (c,)."""
+    """Return the increase of the volume of each chamber since rest [m³], shape (c,)."""
     rest = body.mesh.nodes
     return np.array([chamber_volume(c, positions) - chamber_volume(c, rest) for c in body.chambers])
 

@@ -34,7 +34,7 @@ TIE = 1e4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ties:
-    """The nodes that springs hold, and their springs."""
+    """The nodes of a compliant clamp that springs hold, and the stiffness of these springs."""
 
     nodes: IntArray
     """shape (k,)."""
@@ -60,7 +60,7 @@ class Followers:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plate:
-    """Where the plate rests for given node positions."""
+    """Position and rotation of the rigid plate of a compliant clamp, in equilibrium with given node positions."""
 
     turn: FloatArray
     """Rotation vector φ [rad], shape (3,)."""
@@ -71,7 +71,7 @@ class Plate:
 
 
 def ties_of(body: BodyModel) -> Ties | None:
-    """Return the springs of a body's clamp; None where it is rigid."""
+    """Return the springs of the clamp of a body; None if the clamp is rigid."""
     if body.clamp_is_rigid:
         return None
     nodes, stiffness = body.clamp_nodes, body.clamp_stiffness
@@ -123,7 +123,7 @@ def add_followers(followers: Followers, positions: FloatArray, forces: FloatArra
 
 
 def plate_at(body: BodyModel, ties: Ties, positions: FloatArray) -> Plate:
-    """Return where the plate rests for node positions [m], shape (n, 3). A plate that does not turn has J = inf."""
+    """Return the equilibrium of the plate for node positions [m], shape (n, 3). A plate that cannot rotate has J = inf."""
     rest, y = body.mesh.nodes[ties.nodes] - ties.center, positions[ties.nodes] - ties.center
     turn = np.zeros(3)
     if np.isinf(ties.turn_stiffness):
@@ -185,10 +185,10 @@ def with_turning_plate(body: BodyModel, positions: FloatArray, factor: Factoriza
 
 
 def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
-    """Return how the nodes of a rigid clamp would move [m], shape (n, 3), to first order in the compliance that `body` has.
+    """Return the displacements of all nodes [m], shape (n, 3), if a rigid clamp had the compliance of `body`, to first order.
 
     Arguments:
-        body: with springs that are stiff.
+        body: body with a compliant clamp whose springs are stiff.
         forces: that the rigid clamp takes up at its nodes [N], shape (n, 3).
             A clamped node that has no spring (in the middle of an edge) follows its neighbours: it gives its force to the nearest
             nodes with springs, and moves as they do.
@@ -213,8 +213,8 @@ def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> Fl
     compliance of `body`; None if the clamp is rigid, cannot carry the moment, or rotates by more than a radian.
 
     Arguments:
-        body: with the compliant clamp.
-        positions: with the rigid clamp [m], shape (n, 3).
+        body: body with the compliant clamp.
+        positions: node positions with the rigid clamp [m], shape (n, 3).
         forces: all forces on the body except those of the clamp [N], shape (n, 3), constant in space.
     """
     ties = ties_of(body)

@@ -31,7 +31,7 @@ Solver = Callable[[Pattern, FloatArray], Factorization | None]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tangent:
-    """The linearised body at an equilibrium: how it answers to small forces and inputs."""
+    """The linearised body at an equilibrium: its displacements under small forces and inputs. n nodes, f free unknowns, h held cables and chambers."""
 
     factor: Factorization
     dofs: npt.NDArray[np.int64]
@@ -64,14 +64,14 @@ class Tangent:
 
 
 def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = factorize) -> Tangent:
-    """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`.
-    Raises FemsenseError where it is unstable there."""
+    """Return the exact linearisation of a body at an equilibrium; `solver` factorises its stiffness.
+    Raises FemsenseError if the equilibrium is unstable."""
     return _with_held_drives(body, equilibrium, _factor_at(body, equilibrium, solver))
 
 
 def tangent_near(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
-    """Return the linearisation of a body at an equilibrium with the last stiffness that its solution has factorised, of a state close to it; the exact one
-    where none was kept. Raises FemsenseError where it is unstable there."""
+    """Return the linearisation of a body at an equilibrium with the last factorised stiffness of its solution, at a state close to it; the exact
+    linearisation if no factor was kept. Raises FemsenseError if the equilibrium is unstable."""
     factor = equilibrium.factor
     return tangent_at(body, equilibrium) if factor is None else _with_held_drives(body, equilibrium, factor)
 
@@ -108,25 +108,28 @@ def compliance(
     directions: npt.ArrayLike = (),
     tangent: Tangent | None = None,
 ) -> FloatArray:
-    """Return the compliance between directions at points of the body, then cables, then chambers.
+    """Return the compliance of a body: the small displacement of each of its points and drives under a small force at each other.
 
     Arguments:
-        body: the body.
-        equilibrium: the state at which it is linearised.
-        points: points of the body at rest [m], shape (k, 3).
-        directions: a direction at each point [1], shape (k, 3); used as they are, so unit vectors give m/N.
-        tangent: the linearisation, if it is already known.
+        body: body with a cables and c chambers.
+        equilibrium: result of `solve_equilibrium`, the state about which the body is linearised.
+        points: k points of the body at rest [m], shape (k, 3). Default: none.
+        directions: direction of force and displacement at each point, shape (k, 3); not normalised, so that unit vectors give m/N.
+        tangent: result of `femsense.fem.compliance.tangent_at` for this equilibrium. Default: computed here.
 
     Returns:
-        W [m/N], shape (k + a + c, k + a + c): displacement of row i along its direction (for a cable: its shortening, for a
-        chamber: its growth [m³]) under a unit force of column j (for a chamber: one pascal). Rows and columns of held cables and chambers
-        are those of the free ones, with tension or pressure as the input.
+        W, symmetric, shape (k + a + c, k + a + c), rows and columns in the order points, cables, chambers. Entry (i, j) is the displacement of
+        point i along its direction [m], the shortening of cable i [m] or the increase of volume of chamber i [m³], per newton of force at point j or of
+        tension in cable j, or per pascal in chamber j. Every cable and chamber counts as free here, also those that `equilibrium` holds at a
+        shortening or volume.
 
     Raises:
         InputError: points and directions have different shapes.
         FemsenseError: the body is not clamped.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> body = fs.load_robot("finger").body
         >>> tip = np.array([[0.092, 0.0, 0.007]])
         >>> W = fs.compliance(body, fs.solve_equilibrium(body), points=tip, directions=np.array([[0.0, 0.0, 1.0]]))
@@ -146,16 +149,25 @@ def compliance(
 
 
 def drive_rows(body: BodyModel, positions: FloatArray, shares: list[FloatArray] | None = None) -> FloatArray:
-    """Return H_a: the nodal forces of unit tensions of the cables and of unit pressures of the chambers, shape (a + c, 3n).
+    """Return the nodal forces of each drive: of each cable at a tension of 1 N, then of each chamber at a pressure of 1 Pa.
 
-    `shares` scale the segments of each cable (friction).
+    By virtual work these are also, without `shares`, the derivatives of cable shortening and of chamber volume by the node positions.
+
+    Arguments:
+        body: body with n nodes, a cables and c chambers.
+        positions: node positions at which the forces act [m], shape (n, 3).
+        shares: tension of each segment of each cable relative to that at the motor [1]: one array per cable, shape (s,) with s segments, far end first.
+            It differs from 1 where there is friction. Default: 1 everywhere.
+
+    Returns:
+        one row per drive, shape (a + c, 3 n): forces on the nodes (x, y, z of node 0, …) per newton [1] or per pascal [m²].
     """
     chambers = [volume_gradient(c, positions).reshape(1, -1) for c in body.chambers]
     return np.vstack([pull_rows(body, positions, shares), *chambers])
 
 
 def direction_rows(embedding: Embedding, directions: FloatArray, node_count: int) -> FloatArray:
-    """Return the rows of H that map node displacements to displacements of points along directions, shape (k, 3n)."""
+    """Return the matrix that maps node displacements to displacements of k embedded points along a direction each, shape (k, 3 n)."""
     k = len(embedding)
     rows = np.zeros((k, node_count, 3))
     values = embedding.weights[:, :, None] * directions[:, None, :]

@@ -16,7 +16,7 @@ def energy_density(body: BodyModel, positions: FloatArray) -> FloatArray:
 
     Arguments:
         body: its mesh at rest and its moduli.
-        positions: of its nodes [m], shape (n, 3).
+        positions: node positions [m], shape (n, 3).
     """
     stencil = body.stencil
     F = np.einsum("mai,mqca->mqic", positions[stencil.tets], stencil.gradients)

@@ -71,18 +71,21 @@ ADVICE = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Equilibrium:
-    """A static equilibrium: node positions, cable tensions, chamber pressures, and the residual that certifies it."""
+    """Result of `solve_equilibrium`: node positions, cable tensions, chamber pressures, and the residual force that shows whether it is an equilibrium.
+
+    The body has n nodes, a cables and c chambers; a cable has s segments.
+    """
 
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     tension: dict[str, float]
     """Tension of each cable at its motor [N]."""
     shortening: dict[str, float]
-    """Shortening of each cable against rest [m]."""
+    """Shortening of each cable relative to rest [m]."""
     pressure: dict[str, float]
     """Pressure in each chamber above the surroundings [Pa]."""
     volume: dict[str, float]
-    """How much each chamber has grown since rest [m³]."""
+    """Increase of the volume of each chamber since rest [m³]."""
     residual_n: float
     """Largest unbalanced nodal force under the whole load [N]."""
     status: SolveStatus
@@ -120,7 +123,7 @@ class Equilibrium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SolveOptions:
-    """Options of the solver, and the history of friction."""
+    """Options of `solve_equilibrium`: tolerances, number of steps, precision, and the cable tensions before the motion, on which friction depends."""
 
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables before the motion [N], one array (s,) a cable, on which friction depends. None: the tensions of `start`,
@@ -158,22 +161,25 @@ def solve_equilibrium(
 
     Arguments:
         body: the body with its weight and dead forces.
-        tension: name → tension at the motor [N]; cables that are named nowhere are slack.
-        shortening: name → imposed shortening of a cable [m]; such a cable never pushes unless `bilateral`.
-        pressure: name → pressure in a chamber above the surroundings [Pa]; 0 in chambers that are named nowhere.
-        volume: name → imposed increase of the volume of a chamber since rest [m³], as by a liquid pump; its pressure can be negative.
-        nodal_forces: nodal forces in addition to the weight [N], shape (n, 3).
-        start: an equilibrium as warm start (its positions, tensions and factor).
-        bilateral: held cables can push.
-        options: of the solver, and the history of friction.
+        tension: dict, name of a cable → its tension at the motor [N]. A cable in neither `tension` nor `shortening` is slack.
+        shortening: dict, name of a cable → its imposed shortening since rest [m]. Such a cable never pushes unless `bilateral`.
+        pressure: dict, name of a chamber → its pressure above the surroundings [Pa]. A chamber in neither `pressure` nor `volume` has 0 Pa.
+        volume: dict, name of a chamber → its imposed increase of volume since rest [m³], as by a liquid pump; its pressure can be negative.
+        nodal_forces: forces on the n nodes in addition to the weight [N], shape (n, 3). Default: none.
+        start: an equilibrium from which the iteration starts; its node positions, tensions and factorised stiffness are reused. Default: rest.
+        bilateral: whether cables with an imposed shortening can push. Default: no.
+        options: a `femsense.fem.equilibrium.SolveOptions`: tolerance, number of steps, and the tensions before the motion, on which friction
+            depends. Default: `SolveOptions()`.
 
     Returns:
-        the state; `status` states whether it is an equilibrium, `advice` the remedy if not.
+        the state: node positions [m], tensions [N], pressures [Pa]. `converged` is True if it is an equilibrium; otherwise `status` holds the
+        reason and `advice` the remedy.
 
     Raises:
-        InputError: unknown cable or chamber, one named twice, wrong shapes or values.
+        InputError: an unknown cable or chamber, one with two inputs, or arrays with other shapes or non-finite values.
 
     Example:
+        >>> import femsense as fs
         >>> body = fs.load_robot("finger").body
         >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})
         >>> pulled.converged, round(1e3 * pulled.shortening["flexor"], 1)  # mm

@@ -135,5 +135,5 @@ def hyperelastic_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def hyperelastic_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
-    """See `hyperelastic_tet4`."""
+    """As `hyperelastic_tet4`, for quadratic elements: ten nodes and four integration points."""
     return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)

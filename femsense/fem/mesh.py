@@ -25,14 +25,14 @@ FACE_EDGES = np.array([[1, 5, 4], [3, 5, 2], [0, 4, 3], [2, 1, 0]])  # middle of
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TetMesh:
-    """A tetrahedral mesh at rest."""
+    """A mesh of tetrahedra at rest, with n nodes and m elements."""
 
     nodes: FloatArray
     """Node positions [m], shape (n, 3): those of the linear mesh first, then the mid-edge nodes."""
     tets: IntArray
-    """Node indices, shape (m, 4) or (m, 10)."""
+    """Node indices of each element, shape (m, 4) for linear or (m, 10) for quadratic elements."""
     reach: float = field(init=False)
-    """Longest side of the box around it [m]."""
+    """Longest side of the bounding box of the mesh [m]."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", freeze(as_points(self.nodes, "nodes")))
@@ -77,7 +77,7 @@ class Embedding:
         return moved if self.still is None else moved + self.still
 
     def moves(self, field: FloatArray) -> FloatArray:
-        """Return how a displacement of the nodes (n, 3) moves the points, shape (p, 3)."""
+        """Return the displacements of the points, shape (p, 3), for displacements of the nodes, shape (n, 3), in the same unit."""
         return np.asarray(np.einsum("pk,pkc->pc", self.weights, field[self.nodes]))
 
     def following(self, points: FloatArray, share: FloatArray) -> Embedding:
@@ -258,10 +258,10 @@ def closest_in_triangle(corners: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "nearest_element") -> Embedding:
-    """Embed points in the elements that contain them at rest.
+    """Embed points in a mesh: find the element that contains each point at rest, and its shape functions there.
 
-    A point outside goes with one element through the first-order expansion of that element's shape functions at the
-    closest point of the element (for tet4 this is the element's affine map).
+    An embedded point moves with the deformed mesh. A point outside of the mesh moves with one element, by the first-order expansion of its
+    shape functions at the closest point of the element (for linear elements its affine map).
 
     Arguments:
         mesh: the mesh at rest.
@@ -273,6 +273,8 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
         the embedding: element and shape functions of each point, and its distance outside of the mesh.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> body = fs.load_robot("finger").body
         >>> tip = fs.embed_points(body.mesh, np.array([[0.092, 0.0, 0.007]]))
         >>> pulled = fs.solve_equilibrium(body, tension={"flexor": 1.0})

@@ -26,7 +26,7 @@ errors of the potential then hide any decrease."""
 
 
 def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> SolveStatus:
-    """Repeat Newton's method until the set of taut cables and the friction along cables change no more."""
+    """Repeat Newton's method until the set of taut cables and the friction along cables no longer change."""
     seen: set[bytes] = set()  # sets of taut cables: one that comes back would come back for ever
     for _ in range(MOST_ROUNDS):
         status = newton(body, loads, state, max_iterations)

@@ -17,7 +17,7 @@ from femsense.fem.linalg.factorization import Factorization
 
 
 class SolveStatus(StrEnum):
-    """How a solve ended; `ADVICE` of `femsense.fem.equilibrium` has the causes and remedies."""
+    """Reason for the end of a solve; `ADVICE` of `femsense.fem.equilibrium` lists causes and remedies."""
 
     CONVERGED = "converged"
     UNSTABLE = "unstable"
@@ -144,7 +144,7 @@ def kinematic_rows(body: BodyModel, state: State, rows: FloatArray) -> FloatArra
 
 
 def travel_of(body: BodyModel, positions: FloatArray) -> FloatArray:
-    """Return the shortening of each cable [m] and the growth of each chamber [m³] since rest, shape (a + c,)."""
+    """Return the shortening of each cable [m] and the increase of the volume of each chamber [m³] since rest, shape (a + c,)."""
     return np.concatenate([shortening(body, positions), volume_changes(body, positions)])
 
 

@@ -35,7 +35,7 @@ def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
 
 
 def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
+    """Return whether the energy of a balanced state decreases along some motion; the softest one is found by inverse iteration.
 
     The curvature along that motion is a difference of forces: a perturbed pivot of a factor alone cannot raise a false alarm.
     """

@@ -51,7 +51,7 @@ class Stencil:
     block_rows: IntArray
     """Block pattern in CSR: indptr, shape (n + 1,)."""
     block_columns: IntArray
-    """Block pattern in CSR: indices ≥ their row, shape (nb,); the last entry is −1 for the row that nobody reads."""
+    """Block pattern in CSR: indices ≥ their row, shape (nb,); the last entry is −1, for an unused row."""
     lanes: list[Lanes] = field(default_factory=list)
     """Cached result of `lanes_of`."""
 
@@ -96,7 +96,7 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
 
 
 def reshaped(stencil: Stencil, mesh: TetMesh) -> Stencil:
-    """Return the stencil of the same elements with their nodes elsewhere at rest; patterns stay."""
+    """Return the stencil of the same elements with other node positions at rest; the sparsity patterns are unchanged."""
     _, gradients, volumes, node_volume = _geometry(mesh)
     return replace(stencil, gradients=freeze(gradients), volumes=freeze(volumes), node_volume=freeze(node_volume), lanes=[])
 
@@ -130,7 +130,7 @@ def in_lanes(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def lanes_of(stencil: Stencil) -> Lanes:
-    """Return the elements of a mesh side by side, as processors take them."""
+    """Return the elements of a mesh in groups of LANES, for vector instructions."""
     if not stencil.lanes:
         m, q, _, a = stencil.gradients.shape
         gradients = in_lanes(stencil.gradients.transpose(0, 1, 3, 2).reshape(m, q, 3 * a))

@@ -91,8 +91,8 @@ class FactorKeeper:
 
         Arguments:
             here: internal forces of the state.
-            equations: of the next step.
-            length: of the last step [m]; inf before the first step.
+            equations: equations of the next Newton step.
+            length: length of the last step [m]; inf before the first step.
             follows: tensions along cables follow friction.
         """
         state, residual, tolerance = self._state, equations.residual, self._loads.tolerance

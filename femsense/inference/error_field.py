@@ -24,7 +24,7 @@ ACROSS_EDGES = 2.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ErrorField:
-    """Centres of the error field."""
+    """A smooth error along the surface of the body: a sum of kernels at p centres."""
 
     places: FloatArray
     """On the surface at rest [m], shape (p, 3)."""

@@ -57,7 +57,7 @@ class Others:
 
 @dataclass(frozen=True, slots=True)
 class Width:
-    """κ of the pixels and of all other rows."""
+    """Factors κ on the standard deviations of the rows [1], one for pixels and one for all others: large at the start of a fit, then reduced to 1."""
 
     pixels: float = 1.0
     others: float = 1.0

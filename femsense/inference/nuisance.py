@@ -33,20 +33,24 @@ EM_STEPS, EM_TOLERANCE = 8, 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nuisance:
-    """The prior N(μ, R Rᵀ) of η in the next frame."""
+    """The Gaussian prior of the nuisance parameters in the next frame.
+
+    There are c common parameters (pose steps of v cameras, softness, pulls) and v + 1 error fields with p centres each, one per camera and one of the model.
+    """
 
     first_mean: FloatArray
-    """Mean of (pose steps, softness, pulls) before any frame is used, shape (c,)."""
+    """Mean of the common parameters before any frame is used, shape (c,)."""
     first_covariance: FloatArray
     """Its covariance, shape (c, c)."""
     mean: FloatArray
-    """μ, shape (c + (v + 1) p,)."""
+    """Mean μ of all parameters, shape (c + (v + 1) p,)."""
     root: FloatArray
-    """R, shape (c + (v + 1) p, q)."""
+    """Root R of their covariance R Rᵀ, shape (c + (v + 1) p, q)."""
     centres: int
-    """p of the error field."""
+    """Number p of centres of each error field."""
     sizes: tuple[float, float, float] = (1e-4, 0.01, 0.0)
-    """s_b [m], s_m [1], a [1]."""
+    """Standard deviation of the cameras' error fields [m]; of the model's error field, relative to the displacement [1]; share of their variance that is common
+    to all frames [1]."""
 
     @property
     def common(self) -> int:
@@ -55,20 +59,38 @@ class Nuisance:
 
     @property
     def fields(self) -> IntArray:
-        """Standard deviation, s_b or s_m, of each parameter of the error fields, shape ((v + 1) p,)."""
+        """Index in `sizes` of the standard deviation of each parameter of the error fields (0: camera, 1: model), shape ((v + 1) p,)."""
         count = len(self.mean) - self.common
         return np.repeat([0, 1], [count - self.centres, self.centres])
 
 
 def first_nuisance(mean: FloatArray, covariance: FloatArray, centres: int, views: int) -> Nuisance:
-    """Return the prior before contact-free frames are used, with error fields for each camera and for the model."""
+    """Return the prior before contact-free frames are used.
+
+    Arguments:
+        mean: prior mean of pose steps, softness and pulls, shape (c,).
+        covariance: their prior covariance, shape (c, c).
+        centres: number of centres of each error field.
+        views: number of cameras; each has an error field, and the model has one.
+
+    Returns:
+        the prior, with error fields of mean zero and of the standard deviations `EXPECTED`.
+    """
     root = block_diag(root_of(covariance), np.diag(np.repeat(EXPECTED, [views * centres, centres])))
     full = freeze(np.append(mean, np.zeros((views + 1) * centres)))
     return Nuisance(freeze(mean), freeze(covariance), full, freeze(root), centres)
 
 
 def columns(rows: Rows, softening: FloatArray) -> FloatArray:
-    """Return C, shape (r, c + (v + 1) p); `softening`: node displacements for unit softness and pulls [m], shape (1 + a, n, 3)."""
+    """Return the derivative of the residual rows by the nuisance parameters: pose steps, softness and pulls, then error fields.
+
+    Arguments:
+        rows: r residual rows, with the poses of v cameras and error fields with p centres.
+        softening: node displacements for a unit of relative softness and of each of a pulls [m], shape (1 + a, n, 3) with n nodes.
+
+    Returns:
+        C, shape (r, c + (v + 1) p), with c = 6 v + 1 + a.
+    """
     by_camera = (rows.camera[:, :, None] * rows.field[:, None]).reshape(len(rows), -1)
     return np.hstack([rows.by_pose, rows.of(softening), by_camera, rows.way[:, None] * rows.field])
 
@@ -76,13 +98,21 @@ def columns(rows: Rows, softening: FloatArray) -> FloatArray:
 def fit_nuisance(
     rows: Rows, residual: FloatArray, N: FloatArray, eta: FloatArray, *, kappa: FloatArray | float = 1.0, steps: int = EM_STEPS
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return the whitened η̃ (unit prior) that minimises Φ by expectation maximisation, Φ, and the weights W of the rows [1/m²], shape (r,).
+    """Fit the nuisance parameters of one frame by expectation maximisation.
+
+    The parameters are whitened, with a standard normal prior: η = μ + R η̃. The objective Φ is the misfit of the rows, in which each row may belong to
+    another object, plus ‖η̃‖².
 
     Arguments:
-        residual: r − Cμ [m], shape (r,).
-        N: C R [m], shape (r, q).
-        eta: η̃ to start from, shape (q,).
-        kappa: widening of the noise.
+        rows: r residual rows.
+        residual: residual at the prior mean μ [m], shape (r,).
+        N: derivative of the residual by the q whitened parameters [m], shape (r, q).
+        eta: whitened parameters from which the iteration starts, shape (q,).
+        kappa: factor on the standard deviation of the noise [1], a number or shape (r,).
+        steps: maximum number of iterations.
+
+    Returns:
+        the whitened parameters, shape (q,); Φ; the weight of each row [1/m²], shape (r,).
     """
     last = np.inf
     for _ in range(steps):
@@ -99,17 +129,34 @@ def fit_nuisance(
 
 
 def gram_of(rows: Rows, C: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the inner products of (C, r) under weights W of the rows, one more than columns of C, squared."""
+    """Return the weighted inner products of the nuisance parameters' columns and the residual of one frame: its normal equations.
+
+    Arguments:
+        rows: the r residual rows of the frame.
+        C: derivative of the residual by each of the k nuisance parameters, result of `columns`, shape (r, k).
+        weight: weight of each row [1/m²], shape (r,).
+
+    Returns:
+        (C, residual)ᵀ diag(weight) (C, residual), shape (k + 1, k + 1).
+    """
     A = np.hstack([C, rows.residual[:, None]])
     return np.asarray((A * weight[:, None]).T @ A)
 
 
 def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[float, float, float] | None = None) -> Nuisance:
-    """Return the prior of the next frame from contact-free frames (see above).
+    """Estimate the prior of the nuisance parameters in the next frame from contact-free frames.
+
+    The nuisance parameters are pose steps, softness and pulls (c in all), which are common to all frames, and the error fields of v cameras and of the
+    model, each with p centres, of which a share is common to all frames and the rest is drawn independently for each frame.
 
     Arguments:
-        grams: of `gram_of`, one a frame.
-        sizes: (s_b, s_m, a), if known; by default those with the highest evidence.
+        nuisance: the prior before these frames.
+        grams: inner products of the residual rows of each contact-free frame, results of `gram_of`.
+        sizes: standard deviation of the cameras' error fields [m]; that of the model's error field relative to the displacement [1]; share of their variance
+            that is common to all frames, 0 … 1. Default: the values on a grid that maximise the evidence (marginal likelihood) of the frames.
+
+    Returns:
+        `nuisance` with the mean, shape (c + (v + 1) p,), and the root of the covariance of this prior, and with the sizes that were used.
     """
     if sizes is None:
         grid = ((b, m, a) for b in BIAS_M for m in MODEL_SHARE for a in (0.0, 0.8))
@@ -123,13 +170,18 @@ def learnt(nuisance: Nuisance, grams: Sequence[FloatArray], *, sizes: tuple[floa
 
 
 def without_poses(gram: FloatArray, pose_steps: int, common: int) -> FloatArray:
-    """Return inner products of a frame with the error field made orthogonal to the pose: the part that a pose can explain is attributed to
-    the pose (restricted spatial regression, Reich, Hodges & Zadnik 2006).
+    """Make the error fields of a frame orthogonal to the camera poses, in the inner products of its residual rows.
+
+    A smooth error field and a shift of the camera change the residual alike. With fields orthogonal to the poses, all that a pose can fit is
+    attributed to the pose (restricted spatial regression, Reich, Hodges & Zadnik 2006).
 
     Arguments:
-        gram: of `gram_of`.
-        pose_steps: 6 v.
-        common: c, columns before the field.
+        gram: inner products of the parameters' columns and the residual, result of `gram_of`, shape (k + 1, k + 1) with k nuisance parameters.
+        pose_steps: number of pose parameters, the first columns: six per camera (three rotations, three translations).
+        common: number of parameters before the error fields: pose steps, softness and pulls.
+
+    Returns:
+        the inner products with the changed columns of the fields, of the same shape.
     """
     pose, field = slice(0, pose_steps), slice(common, len(gram) - 1)
     change = np.eye(len(gram))

@@ -177,7 +177,7 @@ def rows_on(
 
     Arguments:
         triangle, weights: points of the surface, shapes (r,) and (r, 3).
-        direction, residual, std, log_other, share: as in `Rows`.
+        direction, residual, std, log_other, share: the attributes of `Rows` with these names, one value per row.
         points: measured [m], shape (r, 3); view: their cameras, shape (r,).
     """
     nodes = skin.triangles[triangle]

@@ -29,18 +29,22 @@ SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron",
 
 
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
-    """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
+    """Read a tetrahedral mesh from a file of any format that meshio reads (.msh, .vtu, .inp, …), or fill a closed surface (.stl, .obj, .ply, .off).
 
-    A closed surface is tetrahedralised on first use; the result is stored next to it (or in the cache folder).
-    Nodes that no tetrahedron uses are dropped with a warning.
-    If all elements are inverted, the file uses another node order, which is converted.
+    A surface is tetrahedralised on first use; the result is stored next to it (or in the cache folder). Nodes that no tetrahedron uses are
+    dropped with a warning. Some programs number the nodes of a tetrahedron in mirrored order, so that every volume is negative; these nodes are
+    reordered.
 
     Arguments:
         path: the file.
-        where: for messages; by default the file.
+        where: location that error messages state, such as a key of robot.toml. Default: the path.
+
+    Returns:
+        the mesh: `nodes` in the unit of the file, shape (n, 3), and `tets`, indices of the nodes of each element, corners first, shape (m, 4) for linear
+        or (m, 10) for quadratic elements.
 
     Raises:
-        InputError: no such file, not readable, no tetrahedra, other solid elements, an open surface.
+        InputError: the file is missing or not readable, it has no tetrahedra, it has other solid elements (hexahedra, …), or its surface is open.
     """
     where = where or str(path)
     _check_exists(path, where)
@@ -158,7 +162,12 @@ def _no_triangles(path: Path, where: str) -> InputError:
 
 
 def write_mesh(mesh: TetMesh, path: Path) -> None:
-    """Write a mesh in metres, in the format of the file extension; .vtu keeps all digits."""
+    """Write a tetrahedral mesh to a file, in metres.
+
+    Arguments:
+        mesh: the mesh; `TetMesh.nodes` are written as they are [m].
+        path: the file. Its suffix selects the format (any that meshio writes); .vtu keeps all digits.
+    """
     import meshio
 
     kind = "tetra10" if mesh.is_quadratic else "tetra"

@@ -65,6 +65,7 @@ def load_recording(path: str | Path) -> Recording:
         InputError: a file is missing or invalid; the error states file, row, value found and value expected.
 
     Example:
+        >>> import femsense as fs
         >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")  # or a path of your own
         >>> recording
         Recording(44 frames, 43 s; north, west, south, east [tension]; 16 markers; clouds)
@@ -155,18 +156,18 @@ def _check_depth(clouds: Any, cameras: Sequence[Camera | None], views: Sequence[
 
 
 def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[Path], None] | None = None) -> Path:
-    """Write a recording folder; a recording that stood there is replaced as a whole, and only when all is written.
+    """Write a recording to a folder. An earlier recording there is replaced as a whole, after all files are written.
 
     Arguments:
         recording: the recording; its cloud, depth and colour files are copied.
-        folder: the final place.
-        fill: called with the unfinished folder, to write further files there (clouds, truth) before it gets its name.
+        folder: the folder to create.
+        fill: function that is called with the path of the unfinished folder, to write further files (clouds, truth) into it. Default: none.
 
     Returns:
-        the folder.
+        the path of the folder.
 
     Raises:
-        InputError: a place that cannot be written, or files there that no recording has: an import is none of them.
+        InputError: the folder is not writable, or it contains files that do not belong to a recording.
     """
     final = Path(folder)
     check_target(final, folder=True)

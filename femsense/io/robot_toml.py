@@ -29,19 +29,20 @@ from femsense.model.robot import MarkerLook, Robot, plain_actuation
 
 
 def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
-    """Load a robot.
+    """Load a robot: its mesh, material, cables, chambers and markers, and the effects of its model.
 
     Arguments:
         path_or_name: a folder with robot.toml, that file, or the name of a robot of the package (`robot_names`).
-        effects: apply the `[[effects]]` of the file; False gives the plain model.
+        effects: whether to apply the physical effects that the file declares under `[[effects]]` (cable friction, creep, …). Default: yes.
 
     Returns:
         the robot, with its mesh in metres in the robot frame.
 
     Raises:
-        InputError: with file, key, found and expected value.
+        InputError: the file is missing or invalid; the error states the key, the value found and the values expected.
 
     Example:
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
         >>> robot.name, robot.body.cable_names
         ('finger', ('flexor',))
@@ -97,6 +98,7 @@ def robot_names() -> dict[str, Path]:
     """Return the robots that are installed with femsense: name → folder.
 
     Example:
+        >>> import femsense as fs
         >>> sorted(fs.robot_names())
         ['arm', 'finger', 'four-leg', 'gripper', 'pneu-finger']
     """
@@ -137,7 +139,7 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
     Arguments:
         robot: the robot.
         folder: created if missing; its other files are kept.
-        effects: the `[[effects]]` to write; by default those that the robot declares.
+        effects: list of dicts to write as `[[effects]]`, each with `name` and the parameters of an effect. Default: those that the robot declares.
 
     Returns:
         the path of robot.toml.
@@ -147,6 +149,7 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
 
     Example:
         >>> import tempfile
+        >>> import femsense as fs
         >>> path = fs.save_robot(fs.load_robot("finger"), tempfile.mkdtemp(), effects=[{"name": "stiffness", "scale": 0.9}])
         >>> fs.load_robot(path).document["effects"]
         [{'name': 'stiffness', 'scale': 0.9}]

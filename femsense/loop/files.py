@@ -37,10 +37,18 @@ def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Seque
 
 
 def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any] | None = None) -> Path:
-    """Write the result of `improve`: the improved robot, then loop.json. Return the folder.
+    """Write the result of `improve`: the improved robot, then loop.json.
+
+    Arguments:
+        loop: result of `improve`.
+        folder: created if missing; its other files are kept.
+        inputs: dict of the inputs of the search, which loop.json records. Default: none.
+
+    Returns:
+        the path of the folder.
 
     Raises:
-        InputError: see `check_loop_folder`.
+        InputError: the folder is not writable, or contains another kind of result.
     """
     check_loop_folder(folder, loop.declared)
     with results_folder(folder, "loop.json") as part:
@@ -87,7 +95,8 @@ def read_loop(path: str | Path) -> dict[str, Any]:
         path: the file, or the folder that contains it.
 
     Returns:
-        its content (docs/formats/results.md).
+        a dict with the content of the file: `verdict`, `effects` with parameters and standard deviations, held-out errors [m], … All keys are in
+        docs/formats/results.md.
 
     Raises:
         InputError: the file is missing or of another kind.

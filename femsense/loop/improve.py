@@ -1,6 +1,6 @@
 """Close the loop: screen all effects, refit the best candidates jointly, accept on held-out data, and return an improved robot.
 
-The steps and their reasons are in docs/method/closing-the-loop.md.
+The steps and their reasons are in docs/reference/closing-the-loop-rules.md.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MOST_STEPS = 3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ImproveOptions(SearchOptions):
-    """Options of `improve`: those of the search, its references, and how the work is done."""
+    """Options of `improve`: effects and measurements of the search, reference recordings, thresholds, and limits of the computation."""
 
     references: Sequence[Recording] = ()
     """Recordings of the same inputs without the load of interest (a weight, for example). Their residuals are subtracted from all other
@@ -79,8 +79,9 @@ def improve(
     """Identify the physical effects that the declared model lacks, by stepwise model selection.
 
     Candidates (cable friction, slack, creep, payload, …: docs/effects) are fitted one at a time by nonlinear least squares, together with
-    camera poses, modulus and inputs. One is accepted if its evidence (the decrease of χ² less the BIC penalty of its parameters) is
-    significant, and if sweeps that were not fitted do not contradict it. The method is in docs/method/closing-the-loop.md.
+    camera poses, modulus and inputs. One is accepted if its evidence (the decrease of χ² minus the BIC penalty of its parameters) is
+    significant, and if it also improves the prediction of held-out sweeps. A sweep is an excursion of the inputs from their lowest level and
+    back. docs/method/closing-the-loop.md describes the method.
 
     Arguments:
         robot: the declared robot.
@@ -89,18 +90,21 @@ def improve(
         effects: names of effects to try (docs/effects). Default: all.
         without: names of effects to leave out.
         progress: called every few seconds, possibly from another thread, with a text: step, share of the work, remaining time.
-        options: user-defined effects, which measurements are used, computation.
+        options: an `ImproveOptions`: user-defined effects, markers or clouds as measurements, checkpoint, limits of the computation.
+            Default: `ImproveOptions()`.
 
     Returns:
-        the verdict, accepted and rejected effects with their evidence, held-out errors, and the improved robot.
+        the result: `verdict`, accepted `effects` with their parameters and standard deviations, rejected ones with the reason, held-out errors [m], and
+        `robot`, the improved robot.
 
     Raises:
         InputError: an unknown effect, or no recording.
         DataError: the data do not allow a fit.
 
     Example:
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> loop = fs.improve(robot, [recording], effects=["cable_friction", "stiffness"])
         >>> [(effect.name, round(effect.parameters["coefficient"].value, 2)) for effect in loop.effects]  # the truth: 0.15
         [('cable_friction', 0.15)]

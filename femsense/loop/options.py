@@ -23,7 +23,7 @@ class Measured(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SearchOptions:
-    """The effects and measurements of a search."""
+    """Options of a search for effects: user-defined effects, and the measurements to use."""
 
     user_effects: Annotated[Sequence[Path], Flag("--user-effect", "FILE", "Try an effect of your own (femsense docs own).")] = ()
     """Python files with user-defined effects (docs/effects/own.md); "all" includes them."""

@@ -31,22 +31,22 @@ class CameraNoise:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Camera:
-    """A pinhole camera; the centre of the first pixel is (0, 0)."""
+    """Intrinsics of a pinhole camera with lens distortion. Pixel coordinates have their origin at the centre of the first pixel."""
 
     name: str
-    """"" where there is one camera."""
+    """Name of the camera; "" if there is only one."""
     width: int
-    """[px]."""
+    """Width of the image [px]."""
     height: int
-    """[px]."""
+    """Height of the image [px]."""
     fx: float
-    """[px]."""
+    """Focal length along x [px]."""
     fy: float
-    """[px]."""
+    """Focal length along y [px]."""
     cx: float
-    """[px]."""
+    """Principal point, x [px]."""
     cy: float
-    """[px]."""
+    """Principal point, y [px]."""
     distortion: FloatArray
     """OpenCV's k1, k2, p1, p2, k3, shape (5,), with k4, k5, k6 shape (8,); k1 … k4 and 0 where the model is "kannala_brandt"."""
     depth_unit: float

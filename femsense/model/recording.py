@@ -28,60 +28,63 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Recording:
-    """F frames in order of time, seen by one camera or several (views)."""
+    """A recording of one experiment: F frames in order of time, with the inputs of the robot and the observations of V cameras (views).
+
+    The robot has a cables and c chambers. `load_recording`, `recording_from_arrays` and `make_recording` make one.
+    """
 
     folder: Path | None
-    """Where it was read; None where it was made in Python."""
+    """Folder that it was loaded from; None: made in Python."""
     actuation: str
     """Kind of `inputs`: "tension" [N] or "displacement" [m, > 0 shortens]."""
     actuation_zero: str
     """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
     camera_names: tuple[str, ...]
-    """One a view; ("",) where there is one camera without a name."""
+    """Name of each camera; ("",) if there is one camera without a name."""
     cameras: tuple[Camera | None, ...]
-    """One a view; None where the lens is not known."""
+    """Intrinsics of each camera; None where they are unknown."""
     T_robot_camera: tuple[FloatArray | None, ...]
-    """One a view, shape (4, 4); None where the pose is not known."""
+    """Pose of each camera, shape (4, 4), from camera to robot coordinates; None where it is unknown."""
     frame_numbers: IntArray
-    """As in frames.csv, shape (F,)."""
+    """Number of each frame, as in frames.csv, shape (F,)."""
     time_s: FloatArray
-    """[s], increasing, shape (F,)."""
+    """Time of each frame [s], increasing, shape (F,)."""
     cable_names: tuple[str, ...]
     """Name of each cable, in the order of the columns of `inputs`."""
     inputs: FloatArray
-    """[N] or [m], shape (F, a)."""
+    """Input of each cable in each frame: tension [N] or displacement [m], shape (F, a)."""
     chamber_names: tuple[str, ...]
     """Name of each chamber, in the order of the columns of `pressures`."""
     pressures: FloatArray
-    """[Pa], shape (F, c)."""
+    """Pressure of each chamber in each frame above the surroundings [Pa], shape (F, c)."""
     free: BoolArray | None
-    """Frames in which nothing undeclared touches the robot, shape (F,); None where not known."""
+    """Whether each frame is free of undeclared contacts, shape (F,); None: unknown."""
     sweep: tuple[str, ...] | None
-    """Label of each frame; frames of one label are held out together. None if not given."""
+    """Label of the sweep of each frame; the frames of a sweep are held out together. None: not given."""
     gravity: FloatArray | None
-    """In the robot frame [m/s²], shape (F, 3); None: as the robot declares."""
+    """Gravity in each frame, robot coordinates [m/s²], shape (F, 3); None: that of the robot."""
     marker_names: tuple[str, ...]
-    """In the order of their first appearance."""
+    """Name of each marker, in the order of first appearance."""
     marker_frame: IntArray
-    """Frame of each marker observation, an index 0 … F − 1, shape (K,)."""
+    """Frame of each of K marker observations, an index from 0 to F − 1, shape (K,)."""
     marker_index: IntArray
-    """Its marker, an index into marker_names, shape (K,)."""
+    """Marker of each observation, an index into `marker_names`, shape (K,)."""
     marker_view: IntArray
-    """Its camera, an index into camera_names, shape (K,)."""
+    """Camera of each observation, an index into `camera_names`, shape (K,)."""
     marker_xyz: FloatArray
-    """Its place in that camera's frame [m], shape (K, 3)."""
+    """Position of each observed marker in the coordinates of that camera [m], shape (K, 3)."""
     rest: RestMarkers | None
     """Markers of the unloaded body; None: not measured."""
     load_frame: IntArray
-    """Frame of each known load, an index 0 … F − 1, shape (L,)."""
+    """Frame of each of L known loads, an index from 0 to F − 1, shape (L,)."""
     load_points: FloatArray
-    """Its place on the body at rest, robot frame [m], shape (L, 3)."""
+    """Point of the body at rest at which each load acts, robot coordinates [m], shape (L, 3)."""
     load_forces: FloatArray
-    """Its force, robot frame [N], shape (L, 3)."""
+    """Force of each load on the body, robot coordinates [N], shape (L, 3)."""
     cloud_files: tuple[tuple[Path | None, ...], ...]
     """Cloud or depth image of each frame and view; None where there is none."""
     color_files: tuple[tuple[Path | None, ...], ...]
-    """Colour image that goes with a depth image, the same shape."""
+    """Colour image of each frame and view; None where there is none."""
     marker_noise_m: float | None = None
     """Repeatability of a marker along each axis, one standard deviation [m]; None if not given."""
     session: str | None = None
@@ -89,11 +92,11 @@ class Recording:
     tools: tuple[Tool, ...] = ()
     """Objects of known shape that may touch the robot."""
     unnamed_frame: IntArray = field(default_factory=_no_indices)
-    """Frame of each marker that nobody named, an index 0 … F − 1, shape (U,); such rows are not among marker_xyz."""
+    """Frame of each of U observations of markers without names, an index from 0 to F − 1, shape (U,); they are not contained in `marker_xyz`."""
     unnamed_view: IntArray = field(default_factory=_no_indices)
-    """Its camera, an index into camera_names, shape (U,)."""
+    """Camera of each such observation, an index into `camera_names`, shape (U,)."""
     unnamed_xyz: FloatArray = field(default_factory=_no_points)
-    """Its place in that camera's frame [m], shape (U, 3)."""
+    """Position of each such observation in the coordinates of that camera [m], shape (U, 3)."""
 
     @property
     def label(self) -> str:
@@ -141,19 +144,22 @@ def make_recording(
     unnamed: UnnamedRows | None = None,
     about: About | None = None,
 ) -> Recording:
-    """Return a recording made of its parts; parts that are left out are empty or unknown.
+    """Make a recording from its parts. `recording_from_arrays` is simpler for one camera and named markers.
 
     Arguments:
-        timeline: the frames.
-        drives: inputs of the cables, pressures of the chambers.
-        markers: those with names.
-        loads: known loads.
-        views: cameras and their files.
-        unnamed: markers without names.
-        about: properties of the whole recording.
+        timeline: times and labels of the F frames.
+        drives: inputs of the cables, pressures of the chambers. Default: none.
+        markers: observations of markers with names. Default: none.
+        loads: known loads. Default: none.
+        views: cameras and their files. Default: one camera with unknown pose and no files.
+        unnamed: observations of markers without names. Default: none.
+        about: properties of the whole recording. Default: unknown.
+
+    Returns:
+        the recording.
 
     Raises:
-        InputError: where shapes do not fit, times do not increase, or an index points nowhere.
+        InputError: shapes that do not match, times that do not increase, or an index outside of its array.
     """
     seen = views or Views()
     times = freeze(np.asarray(timeline.time_s, dtype=np.float64).reshape(-1))
@@ -175,14 +181,18 @@ def make_recording(
 
 
 def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
-    """Return the recording of some of its frames, in order of time.
+    """Return a recording with some of the frames of another.
 
     Arguments:
-        recording: the recording.
-        which: a mask, shape (F,), or indices 0 … F − 1.
+        recording: a recording with F frames.
+        which: a mask, shape (F,), or indices from 0 to F − 1.
+
+    Returns:
+        the selected frames in order of time.
 
     Example:
-        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")
+        >>> import femsense as fs
+        >>> recording = fs.load_recording(fs.robot_names()["four-leg"] / "recordings" / "demo")  # installed with femsense
         >>> fs.select_frames(recording, range(36, 40)).frame_count
         4
     """

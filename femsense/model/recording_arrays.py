@@ -23,21 +23,27 @@ def recording_from_arrays(
     T_robot_camera: npt.ArrayLike | None = None,
     free: npt.ArrayLike | None = None,
 ) -> Recording:
-    """Return a recording of one camera made of arrays.
+    """Make a recording of F frames and one camera from arrays.
 
     Arguments:
-        time_s: of each frame [s], increasing, shape (F,).
-        inputs: cable → its absolute input [N or m], shape (F,).
-        actuation: kind of the inputs, "tension" or "displacement".
-        pressures: chamber → its pressure [Pa], shape (F,).
-        markers: marker → its places in the camera's frame [m], shape (F, 3), nan where it is hidden.
-        T_robot_camera: pose of the camera, shape (4, 4); None: unknown. The identity if markers are in the robot frame.
-        free: contact-free frames, shape (F,); None: unknown.
+        time_s: time of each frame [s], increasing, shape (F,).
+        inputs: dict, name of a cable → its absolute input in each frame [N or m], shape (F,). Default: none.
+        actuation: kind of the inputs: "tension" [N] (default) or "displacement" [m].
+        pressures: dict, name of a chamber → its pressure in each frame [Pa], shape (F,). Default: none.
+        markers: dict, name of a marker → its position in camera coordinates [m], shape (F, 3), nan where it is hidden. Default: none.
+        T_robot_camera: pose of the camera, shape (4, 4), from camera to robot coordinates; the identity if the markers are in robot coordinates.
+            Default: unknown.
+        free: whether each frame is free of contacts, shape (F,). Default: unknown.
+
+    Returns:
+        the recording, for `calibrate` and `estimate`.
 
     Raises:
-        InputError: no frame, shapes that do not fit, times that do not increase, values that are not finite.
+        InputError: no frame, shapes that do not match, times that do not increase, or values that are not finite.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> recording = fs.recording_from_arrays(
         ...     [0.0, 0.1], inputs={"flexor": [0.0, 0.5]}, actuation="tension", markers={"tip": np.zeros((2, 3))}
         ... )

@@ -49,40 +49,40 @@ class Drives:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MarkerRows:
-    """Observations of named markers, K rows."""
+    """Observations of named markers: K rows, one per marker that is visible in a frame."""
 
     names: Sequence[str]
     """Names of the markers."""
     frame: npt.ArrayLike
-    """An index 0 … F − 1, shape (K,)."""
+    """Frame of each row, an index from 0 to F − 1, shape (K,)."""
     index: npt.ArrayLike
-    """Into the names, shape (K,)."""
+    """Marker of each row, an index into `names`, shape (K,)."""
     xyz: npt.ArrayLike
-    """In the frame of the camera that sees it [m], shape (K, 3)."""
+    """Position of the marker in the coordinates of its camera [m], shape (K, 3)."""
     view: npt.ArrayLike | None = None
-    """That camera, an index into the views, shape (K,); None: the first."""
+    """Camera of each row, an index into `Views.names`, shape (K,); None: the first."""
     noise_m: float | None = None
     """Repeatability of a marker along each axis, one standard deviation [m]; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UnnamedRows:
-    """Observations of markers without names, U rows; calibration assigns them."""
+    """Observations of markers without names: U rows, one per point in a frame. `calibrate` assigns them to the markers of the robot."""
 
     frame: npt.ArrayLike = ()
-    """An index 0 … F − 1, shape (U,)."""
+    """Frame of each row, an index from 0 to F − 1, shape (U,)."""
     xyz: npt.ArrayLike = ()
-    """In the frame of the camera that sees it [m], shape (U, 3)."""
+    """Position of the marker in the coordinates of its camera [m], shape (U, 3)."""
     view: npt.ArrayLike | None = None
-    """That camera, an index into the views, shape (U,); None: the first."""
+    """Camera of each row, an index into `Views.names`, shape (U,); None: the first."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoadRows:
-    """Known loads, L rows."""
+    """Known loads on the body: L rows, one per load in a frame."""
 
     frame: npt.ArrayLike = ()
-    """An index 0 … F − 1, shape (L,)."""
+    """Frame of each row, an index from 0 to F − 1, shape (L,)."""
     points: npt.ArrayLike = ()
     """Point of the body at rest, robot frame [m], shape (L, 3)."""
     forces: npt.ArrayLike = ()
@@ -91,18 +91,18 @@ class LoadRows:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Views:
-    """V cameras and the files of their images or clouds."""
+    """The V cameras of a recording: poses, intrinsics, and the files of their images or clouds."""
 
     names: Sequence[str] = ("",)
     """Name of each camera; ("",) for a single one."""
     cameras: Sequence[Camera | None] | None = None
-    """One a view; None where the lens is not known."""
+    """Intrinsics of each camera; None where they are unknown."""
     T_robot_camera: Sequence[npt.ArrayLike | None] | None = None
-    """One a view, shape (4, 4); None where the pose is not known."""
+    """Pose of each camera, shape (4, 4), from camera to robot coordinates; None where it is unknown."""
     cloud_files: Sequence[Sequence[Path | None]] | None = None
     """Cloud or depth image of each frame and view; None where there is none."""
     color_files: Sequence[Sequence[Path | None]] | None = None
-    """Colour image that goes with a depth image, the same shape."""
+    """Colour image of each frame and view; None where there is none."""
 
 
 def _no_points() -> FloatArray:
@@ -111,9 +111,9 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tool:
-    """A body of known shape that may touch the robot.
+    """A rigid object of known shape that may touch the robot.
 
-    Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own.
+    The origin of its coordinates is the centre of a ball or cylinder (with axis z), or that of the file of a mesh.
     """
 
     name: str
@@ -121,42 +121,42 @@ class Tool:
     kind: str
     """"ball", "cylinder" or "mesh"."""
     radius: float = 0.0
-    """Of a ball or a cylinder [m]; 0 for a mesh."""
+    """Radius of a ball or cylinder [m]; 0 for a mesh."""
     length: float = 0.0
-    """Of a cylinder [m]; 0 for others."""
+    """Length of a cylinder [m]; 0 for others."""
     points: FloatArray = field(default_factory=_no_points)
-    """Of a mesh [m], shape (n, 3)."""
+    """Vertices of a mesh [m], shape (n, 3)."""
     triangles: IntArray = field(default_factory=lambda: freeze(np.zeros((0, 3)), np.int64))
-    """Of a mesh, a closed surface, outward, shape (t, 3)."""
+    """Triangles of a mesh: indices of vertices, normals outward, shape (t, 3). The surface is closed."""
     mesh_file: Path | None = None
-    """Where the mesh was read; None where it was made in Python."""
+    """File of the mesh; None: made in Python."""
     mesh_unit: str = "m"
     """Unit of the coordinates in that file."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RestMarkers:
-    """Markers measured with the body unloaded, camera frame."""
+    """Positions of markers measured on the unloaded body, in camera coordinates (rest.csv)."""
 
     names: tuple[str, ...]
     """Names of the markers."""
     positions: FloatArray
-    """[m], shape (r, 3)."""
+    """Position of each of r markers in the coordinates of its camera [m], shape (r, 3)."""
     std: FloatArray
-    """One standard deviation [m], shape (r,); NaN where it is not given."""
+    """Standard deviation of each position [m], shape (r,); NaN where it is not given."""
     view: IntArray
-    """Index of the camera, shape (r,)."""
+    """Camera of each marker, an index, shape (r,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class About:
-    """Properties of a whole recording."""
+    """Properties of a whole recording, such as its folder and session."""
 
     folder: Path | None = None
     """Folder that it was loaded from; None: made in Python."""
     session: str | None = None
     """Recordings of one session share values that are constant within a session; None if not given."""
     rest: RestMarkers | None = None
-    """Markers of the unloaded body."""
+    """Markers measured on the unloaded body; None: not measured."""
     tools: Sequence[Tool] = ()
     """Objects of known shape that may touch the robot."""

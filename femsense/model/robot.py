@@ -75,13 +75,13 @@ class Robot:
     marker_names: tuple[str, ...]
     """Name of each marker."""
     marker_points: FloatArray
-    """Markers at rest [m], shape (k, 3)."""
+    """Positions of the k markers at rest [m], shape (k, 3)."""
     markers: Embedding
-    """The markers' ties to the body."""
+    """Embedding of the markers in the mesh: their elements and shape functions."""
     features: IntArray
     """Surface nodes that serve as feature points, spread evenly over the free surface, shape (e,)."""
     color_rgb: FloatArray | None
-    """Colour of the body for the segmentation, each in [0, 1], shape (3,)."""
+    """Colour of the body, used to segment images, sRGB from 0 to 1, shape (3,); None: unknown."""
     actuation: Actuation
     """Effects between recorded and true inputs: offsets, gains, friction."""
     observation: Observation
@@ -99,9 +99,9 @@ class Robot:
     by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
     """Effects whose values differ between recordings: (robot, label of a recording) → the robot in that recording, applied in order."""
     marker_looks: tuple[MarkerLook, ...] = ()
-    """Markers that colour images show, by name."""
+    """Appearance of the markers that are detected in colour images."""
     aruco_dictionary: str = "4X4_50"
-    """Of the tags, as OpenCV names it."""
+    """Dictionary of the ArUco tags, by its OpenCV name."""
     correction: Correction | None = None
     """Empirical correction of the markers beyond all effects; used on request."""
     surface_points: int = 0
@@ -138,11 +138,11 @@ class Robot:
 
     @property
     def glued_names(self) -> tuple[str, ...]:
-        """Names of the markers proper."""
+        """Names of the markers that are glued to the robot, without surface points."""
         return self.marker_names[: len(self.marker_names) - self.surface_points]
 
     def with_surface_points(self, points: FloatArray) -> Robot:
-        """Return the robot with points of its surface at rest [m], shape (p, 3), behind its markers."""
+        """Return the robot with p points of its surface at rest [m], shape (p, 3), appended to its markers."""
         names = tuple(f"surface {i + 1}" for i in range(len(points)))
         share = None if self.marker_share is None else np.concatenate([self.marker_share, np.ones(len(points))])
         more = replace(
@@ -151,7 +151,7 @@ class Robot:
         return more.with_marker_points(np.vstack([self.marker_points.reshape(-1, 3), points]))
 
     def without_surface_points(self) -> Robot:
-        """Return the robot with its markers proper only."""
+        """Return the robot without the surface points that were appended to its markers."""
         k = len(self.glued_names)
         share = None if self.marker_share is None else self.marker_share[:k]
         return replace(
@@ -164,11 +164,11 @@ class Robot:
         )
 
     def with_marker_points(self, points: FloatArray) -> Robot:
-        """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""
+        """Return the robot with its k markers at other positions at rest [m], shape (k, 3)."""
         return replace(self, marker_points=freeze(points), markers=self.tie_markers(points))
 
     def tie_markers(self, places: FloatArray) -> Embedding:
-        """Return the ties of all markers when they sit at places [m], shape (k, 3)."""
+        """Return the embedding of all k markers in the mesh, at given positions at rest [m], shape (k, 3)."""
         ties = embed_points(self.body.mesh, places)
         return ties if self.marker_share is None else ties.following(places, self.marker_share)
 

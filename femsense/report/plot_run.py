@@ -15,9 +15,16 @@ if TYPE_CHECKING:
 
 
 def plot_run(run: Run) -> Any:
-    """Plot the contact forces of a run over time, and return the matplotlib figure.
+    """Plot the contact forces of a run [N] over time [s].
 
-    Bands show one and two standard deviations; hollow marks are frames that are not ok. A run without contacts shows its residual.
+    Bands show one and two standard deviations; hollow marks are frames whose status is not "ok". For a run without contacts the residual is plotted
+    instead.
+
+    Arguments:
+        run: result of `estimate` or `read_run`.
+
+    Returns:
+        a matplotlib figure.
     """
     contacts = [c for c in run.contacts if np.isfinite(c.force_n)]
     if contacts:

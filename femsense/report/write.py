@@ -27,14 +27,14 @@ def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
     """Write the figures and tables of a folder of results as one HTML file that needs nothing else.
 
     Arguments:
-        folder: of femsense improve, estimate or calibrate, or one that holds such folders.
-        path: the file; report.html in the folder if not given.
+        folder: output folder of `femsense improve`, `estimate` or `calibrate`, or a folder that contains such folders.
+        path: the HTML file. Default: report.html in the folder.
 
     Returns:
-        the file.
+        the path of the HTML file.
 
     Raises:
-        InputError: no such folder, no results in it, a broken file among them, or a folder or another file where it should be written.
+        InputError: the folder does not exist or contains no results, a result is broken, or `path` is a folder or a file of another kind.
     """
     root = Path(folder).expanduser()
     target = root / "report.html" if path is None else Path(path).expanduser()

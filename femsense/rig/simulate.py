@@ -64,6 +64,7 @@ def simulate(
 
     Example:
         >>> import tempfile
+        >>> import femsense as fs
         >>> bend = {"label": "bend", "cables": {"flexor": 1.0}}  # to 1 N and back, in six frames
         >>> script = {"format": "femsense-script-1", "sweeps": [bend], "truth": {"refinements": 0}, "scene": {"floor_z_m": -0.1}}
         >>> script["camera"] = {"eye_m": [0.05, -0.25, 0.1], "target_m": [0.05, 0.0, 0.0]}

@@ -31,7 +31,7 @@ class TrueContact:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Comparison:
-    """Errors of a run against the ground truth."""
+    """Result of `compare`: estimated contacts paired with true ones, and their errors. k contacts were found."""
 
     pairs: tuple[tuple[TrueContact, ContactForce], ...]
     """Found contacts: the true and the estimated one."""
@@ -69,19 +69,23 @@ class Comparison:
 
 
 def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
-    """Compare a run with the ground truth of a simulated recording.
+    """Compare a run with the ground truth of a simulated recording, frame by frame.
 
-    A contact is found if an estimated one lies within a tenth of the robot's size of it. Estimated forces below three σ, and true
-    forces of zero, do not count as contacts.
+    A true contact is found if an estimated one in the same frame lies within a tenth of the robot's size. Estimated forces below three standard
+    deviations, and true forces of zero, are ignored.
 
     Arguments:
         run: result of `estimate`.
-        truth: the folder of a recording of the virtual rig, or the true contacts.
+        truth: folder of a simulated recording, or a list of `femsense.sensing.comparison.TrueContact`.
+
+    Returns:
+        the pairs of true and estimated contacts, the errors of force [N] and contact point [m], and the number of false contacts.
 
     Raises:
         InputError: a recording without ground truth, or another recording than that of the run.
 
     Example:
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
         >>> folder = fs.robot_names()["finger"] / "recordings" / "press"
         >>> recording = fs.load_recording(folder)

@@ -60,33 +60,39 @@ def estimate(
 ) -> Run:
     """Estimate contacts and forces in every frame: from clouds, or from markers in recordings without clouds.
 
-    Known loads (loads.csv) act on the model. Those closer to a point of `at` than a fifth of the body's size are left out and
-    estimated instead; `Run.known_loads` compares.
+    A cloud is the set of points of a depth image, in metres; from clouds the contact points are found too. Known loads (loads.csv of the
+    recording) act on the model. If a known load acts within a fifth of the body's size of a point of `at`, it is not applied: the force there is
+    estimated, and `Run.known_loads` compares the two.
 
     Arguments:
         robot: the declared robot.
         recording: clouds or markers, and inputs.
         calibration: camera poses and initial inputs.
-        at: known contact points at rest [m], shape (g, 3); required for markers only.
-        options: assumptions on contacts, noise and smoothness.
-        progress: called with (frames done, number of frames).
+        at: known contact points on the body at rest, robot frame [m]: one point, shape (3,), or g points, shape (g, 3). One force is
+            estimated at each point in each frame. Required if the recording has markers only. Default: contact points are found in the clouds.
+        options: a `SensingOptions`: method, and assumptions on contacts, noise and smoothness. Default: `SensingOptions()`.
+        progress: a function, called with (frames done, number of frames).
         keep: (path, inputs) of a checkpoint. An interrupted estimate resumes from it if the stored inputs are the same. It is removed at the
             end.
         keep_every_s: interval between checkpoints [s].
 
     Returns:
-        contacts with forces and their standard deviations, the status of each frame, and the deformed states.
+        the run: `contacts` lists one `ContactForce` per contact and frame, with force and standard deviation [N]; `frames` the status of each
+        frame; `states` the deformed bodies.
 
     Raises:
         InputError: neither clouds nor `at`.
         DataError: no frame has a result.
 
     Example:
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
-        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
-        >>> [round(contact.force_n, 1) for contact in run.contacts]  # N
-        [0.1, 0.3, 0.2]
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
+        >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[[0.088, 0.0, 0.014]])
+        >>> [(contact.frame, round(contact.force_n, 1)) for contact in run.contacts]  # force [N] at one point, pressed in three frames
+        [(9, 0.1), (10, 0.3), (11, 0.2)]
+        >>> round(run.contacts[2].std_n, 1)  # N: in frame 11 the standard deviation exceeds the force, which is not determined
+        0.3
     """
     if robot.softening:
         warnings.warn(

@@ -76,13 +76,16 @@ def run_inputs(
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
 ) -> dict[str, Any]:
-    """Return the inputs of a run: path and SHA-256 of each input file, and the options.
+    """Describe the inputs of a run, so that its results can be traced to them: path and SHA-256 of each input file, and the options.
 
     Arguments:
-        robot, recording: as loaded.
-        calibration: None if the run calibrates itself.
-        at: known contact points at rest [m], shape (k, 3).
-        options: of the estimate.
+        robot, recording: results of `load_robot` and `load_recording`.
+        calibration: the calibration that `estimate` was given, or None if there was none.
+        at: known contact points at rest [m], shape (3,) or (g, 3), as for `estimate`.
+        options: the `SensingOptions` of the run. Default: `SensingOptions()`.
+
+    Returns:
+        a dict for the argument `inputs` of `write_run`.
     """
     own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
     places = None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()
@@ -120,8 +123,9 @@ def write_run(
 
     Example:
         >>> import tempfile
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> calibration = fs.calibrate(robot, recording)
         >>> run = fs.estimate(robot, recording, calibration, at=[0.088, 0.0, 0.014])
         >>> inputs = fs.run_inputs(robot, recording, calibration, at=[0.088, 0.0, 0.014])
@@ -157,6 +161,9 @@ def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
     Arguments:
         folder: the folder of the run.
         robot: the robot of the run. Default: loaded from the path in run.json.
+
+    Returns:
+        the run, as `estimate` returned it.
 
     Raises:
         InputError: files are missing or broken, or the robot no longer exists.

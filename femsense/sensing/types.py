@@ -28,7 +28,10 @@ from femsense.sensing.options import SensingOptions
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ContactForce:
-    """A contact in one frame of a recording: contact point, force, and their standard deviations, in the robot's coordinate system."""
+    """A contact in one frame of a recording: contact point, force, and their standard deviations, in the robot's coordinate system.
+
+    A contact that lasts six frames gives six objects with the same `track`.
+    """
 
     frame: int
     """Number of the frame as in frames.csv."""
@@ -49,7 +52,7 @@ class ContactForce:
     source: str
     """"cloud": visible contact, its object was observed; "shape": inferred from the deformation alone; "given": at a point of `at`."""
     track: int = 0
-    """Identity of the contact over the frames."""
+    """Number of the contact over the frames: contacts of different frames with one number are the same."""
     position_std_m: FloatArray = field(default_factory=lambda: np.zeros(3))
     """Standard deviation of the contact point along each axis [m], shape (3,)."""
     radius_m: float = 0.0

@@ -62,23 +62,30 @@ def poses_from_matrices(T_robot_bone: FloatArray) -> BonePoses:
 
 
 def local_poses(poses: BonePoses) -> BonePoses:
-    """Return each bone relative to the one before it, the first as it is: a hierarchical chain from a flat one."""
+    """Return the pose of each bone relative to the bone before it, as a hierarchical skeleton needs it.
+
+    Arguments:
+        poses: b bones in the robot frame, as an `Armature` returns them.
+
+    Returns:
+        b poses; the first one is unchanged.
+    """
     T = poses.T_robot_bone
     return poses_from_matrices(np.concatenate([T[:1], np.linalg.inv(T[:-1]) @ T[1:]]))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ArmatureOptions:
-    """How bones are placed on a chain of points."""
+    """Options of `make_armature`: number and positions of the bones on the chain of points, and their axes."""
 
     bones: int = 8
-    """How many, spread evenly over the length at rest, each in the middle of its share."""
+    """Number of bones; each is in the middle of an equal part of the length at rest."""
     at_m: tuple[float, ...] | None = None
-    """Alternatively their arc lengths at rest [m] from the first point, increasing."""
+    """Alternatively the arc lengths of the bones at rest [m] from the first point, increasing."""
     plane_normal: tuple[float, float, float] | None = None
-    """Of a body that bends in one plane; None: in space."""
+    """Normal of the plane in which the body bends; None: the body bends in space."""
     inextensible: bool = False
-    """Whether the line keeps its rest length: then only the directions are taken from the points."""
+    """Whether the line keeps its rest length: then only its direction is taken from the points."""
     start_normal: tuple[float, float, float] | None = None
     """Direction of the x axis of the first bone at rest, projected across the tangent; None: the robot axis most perpendicular to it."""
 
@@ -87,8 +94,9 @@ class ArmatureOptions:
 class Armature:
     """Bones along the backbone of a body: poses on a cubic spline through measured points.
 
-    `make_armature` places the bones at rest; a call `armature(points)` with the measured points [m], shape (m, 3), returns their poses. The z axis of
-    a bone is the tangent of the spline; its x axis is given by `normal` and transported along the curve without rotation about the tangent
+    `make_armature` places the bones at rest. A call `armature(points)` with the measured points [m], shape (m, 3), returns the poses of the b bones as
+    `BonePoses`: `positions` [m], shape (b, 3), and `T_robot_bone`, shape (b, 4, 4), from bone to robot coordinates. The z axis of a bone is the tangent
+    of the spline. The x axis of the first bone is set by `ArmatureOptions`; it is transported along the curve without rotation about the tangent
     (rotation-minimising frame). The poses animate a skinned mesh (`export_glb`, `femsense stream`).
     """
 
@@ -158,19 +166,26 @@ class Armature:
 
 
 def make_armature(rest_points: npt.ArrayLike, options: ArmatureOptions | None = None) -> Armature:
-    """Return bones on a chain of points.
+    """Place bones along a chain of points, for example markers along a robot, to animate a mesh.
 
     Arguments:
-        rest_points: the points at rest, in the order of the chain [m], shape (m ≥ 2, 3).
-        options: how many bones, and how they are placed.
+        rest_points: m points at rest, from base to tip [m], shape (m, 3) with m ≥ 2.
+        options: an `ArmatureOptions`: number of bones, or their arc lengths from the first point, and the direction of their x axes. Default: 8 bones,
+            evenly spaced.
+
+    Returns:
+        the armature; called with measured points [m], shape (m, 3), it returns the pose of each bone.
 
     Raises:
-        InputError: fewer than two points, neighbours that coincide, arc lengths beyond the chain, an impossible normal.
+        InputError: fewer than two points, neighbours that coincide, an arc length in `options.at_m` beyond the end of the chain, or a normal
+            parallel to the chain.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> chain = np.c_[np.linspace(0.0, 0.1, 6), np.zeros((6, 2))]  # m
         >>> armature = fs.make_armature(chain)
-        >>> armature(chain).T_robot_bone.shape
+        >>> armature(chain).T_robot_bone.shape  # eight bones by default, each a pose
         (8, 4, 4)
     """
     options = options or ArmatureOptions()
@@ -210,17 +225,31 @@ def rotation_minimising(positions: FloatArray, tangents: FloatArray, start: Floa
 
 
 def centreline_weights(rest_nodes: npt.ArrayLike, *, points: int, axis: npt.ArrayLike | None = None) -> FloatArray:
-    """Return weights that make a chain of points of the nodes of a slender body: chain = weights @ nodes, shape (m, n).
+    """Return weights W with which W @ nodes is a chain of points along the centreline of a slender body, at rest and deformed.
 
-    Each point is the mean of the nodes near a plane across the axis, with weights that fall linearly to the next plane.
+    The chain places the bones of an animated body (`make_armature`). Planes across the axis divide the body into equal parts; each point of the
+    chain is a weighted mean of the nodes, with a weight that is largest in its plane and falls linearly to zero at the next plane.
 
     Arguments:
         rest_nodes: nodes of the body at rest [m], shape (n, 3).
-        points: how many points, at least 2.
-        axis: direction from base to tip, shape (3,); None: the longest direction of the body, upwards in its largest component.
+        points: number p of points, at least 2.
+        axis: direction from base to tip, shape (3,). Default: the direction of the longest extent of the body, with the sign that makes its largest
+            component positive.
+
+    Returns:
+        W [1], shape (p, n); each row sums to 1.
 
     Raises:
-        InputError: a part of the axis that has no nodes.
+        InputError: no nodes near one of the planes (use fewer points).
+
+    Example:
+        >>> import numpy as np
+        >>> from femsense.xr.armature import centreline_weights
+        >>> bar = np.array([[x, y, 0.0] for x in (0.0, 0.05, 0.1) for y in (-0.01, 0.01)])  # m, six nodes
+        >>> centreline_weights(bar, points=3) @ bar
+        array([[0.  , 0.  , 0.  ],
+               [0.05, 0.  , 0.  ],
+               [0.1 , 0.  , 0.  ]])
     """
     x = as_points(rest_nodes, "rest_nodes")
     direction = _long_axis(x) if axis is None else _unit(np.asarray(axis, dtype=np.float64))

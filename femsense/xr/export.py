@@ -62,12 +62,12 @@ def export_glb(
     """Write a run as a skinned, animated mesh (binary glTF 2.0), or as `.usdz` if the path has that suffix.
 
     Arguments:
-        run: of `estimate`, or a folder that it was written to.
+        run: result of `estimate`, or the folder of a run.
         path: the `.glb` or `.usdz` file; its folder is created.
-        bones: number of bones; None: chosen on held-out frames.
-        color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's.
-        skin: a surface of your own that deforms with the body (`read_skin`).
-        arrows: add the contact forces as animated nodes (`glb_arrows`); `.glb` only.
+        bones: number of bones. Default: the number with the smallest error on held-out frames.
+        color_rgb: colour of the body, sRGB from 0 to 1, shape (3,). Default: that of the robot.
+        skin: a surface that deforms with the body, result of `read_skin`. Default: the surface of the finite-element mesh.
+        arrows: whether to add the contact forces as animated arrows; `.glb` only. Default: no.
 
     Returns:
         a report of the export, with the distance to the finite-element surface.
@@ -77,8 +77,9 @@ def export_glb(
 
     Example:
         >>> import tempfile
+        >>> import femsense as fs
         >>> robot = fs.load_robot("finger")
-        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")
+        >>> recording = fs.load_recording(fs.robot_names()["finger"] / "recordings" / "press")  # installed with femsense
         >>> run = fs.estimate(robot, recording, fs.calibrate(robot, recording), at=[0.088, 0.0, 0.014])
         >>> report = fs.export_glb(run, tempfile.mkdtemp() + "/finger.glb", bones=8)
         >>> report.bones, report.frames

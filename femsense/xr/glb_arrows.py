@@ -62,7 +62,7 @@ def with_arrows(glb: bytes, run: RunLike) -> bytes:
 
     Arguments:
         glb: content of a file that `gltf.write_glb` wrote.
-        run: of which it was written, frame by frame.
+        run: run of which the file was written, with the same frames.
 
     Raises:
         InputError: not a mesh of femsense.

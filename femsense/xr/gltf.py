@@ -35,7 +35,7 @@ VERTEX_DATA, INDEX_DATA = 34962, 34963
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ExportReport:
-    """The result of an export."""
+    """Result of `export_states`: size and accuracy of the written mesh."""
 
     path: Path
     """The file."""
@@ -82,7 +82,7 @@ def export_states(
         path: the `.glb` file; replaced in one step.
         bones: number of bones; None: chosen on held-out frames.
         color_rgb: colour of the body, sRGB in 0 … 1, shape (3,).
-        name: of the body, in the file.
+        name: name of the body in the file.
 
     Returns:
         a report of the export, with the distance to the finite-element surface.
@@ -135,7 +135,7 @@ def write_glb(
         time_s: time of each frame [s], shape (F,), strictly increasing; the file counts from the first.
         color_rgb: sRGB in 0 … 1: one colour (3,), or one per vertex (V, 3).
         texture: an image instead.
-        name: of the body.
+        name: name of the body in the file.
 
     Returns:
         the path.

@@ -31,7 +31,7 @@ class Landmarks:
 
 
 def landmarks_of_run(run: Path) -> Landmarks:
-    """Return the markers of the run's robot and the cameras of its calibration, as far as their files exist."""
+    """Return the markers of the robot of a run and the cameras of its calibration; those whose files are missing are left out."""
     calibration, told = _document(run / "calibration.json"), _markers(robot_table(run))
     seats = calibration.get("placements_m")
     if isinstance(seats, dict):

@@ -27,7 +27,7 @@ TURNED = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class McapReport:
-    """The result of an export."""
+    """Result of `export_mcap`."""
 
     frames: int
     clouds: int

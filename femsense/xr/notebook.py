@@ -39,17 +39,21 @@ class Shown:
 
 
 def show_run(run: Run, *, height: int = 480, page: Path = PAGE) -> Shown:
-    """Show a run in a notebook: the viewer page, as the last expression of a cell.
+    """Show a run as an interactive 3-D view in a notebook: the deformed body and its contact forces over time.
 
-    The page is served on 127.0.0.1: the browser has to run on the same machine as the notebook's kernel.
+    Write the call as the last expression of a cell. The page is served on 127.0.0.1, so the browser has to run on the same machine as the notebook's
+    kernel; for a remote kernel forward the port of its address `url`.
 
     Arguments:
-        run: result of `estimate`.
+        run: result of `estimate` or `read_run`.
         height: height of the view [px].
-        page: folder of the built page.
+        page: folder that contains the viewer's web page. Default: that of the installed package.
+
+    Returns:
+        the view, which Jupyter displays. The page is served as long as this object exists, or until its method `stop`.
 
     Raises:
-        MissingDependency: the page was not built into this installation.
+        MissingDependency: this installation does not contain the viewer's web page; the message states how to get it.
     """
     from femsense.sensing.run_files import write_run
 

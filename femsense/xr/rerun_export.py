@@ -22,7 +22,7 @@ UNCERTAIN = (0.9, 0.25, 0.15, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class RerunReport:
-    """The result of an export."""
+    """Result of `export_rerun`."""
 
     frames: int
     clouds: int

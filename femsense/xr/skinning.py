@@ -113,15 +113,16 @@ def prepare_poses(skin: Skin) -> PoseFit:
 
 
 def fit_poses(skin: Skin, states: npt.ArrayLike, *, sweeps: int = FIT_SWEEPS) -> FloatArray:
-    """Fit the bones to frames of the surface, each starting from the previous one.
+    """Fit the poses of B bones to F frames of a deformed surface with V vertices; the fit of each frame starts from the previous one.
 
     Arguments:
-        skin: the surface and its weights.
-        states: vertices of each frame, robot frame [m], shape (F, V, 3).
-        sweeps: passes over the bones in each frame; a live view needs fewer (`prepare_poses` gives the step alone).
+        skin: the surface at rest, and the weights of its bones.
+        states: vertices in each frame, robot frame [m], shape (F, V, 3).
+        sweeps: number of passes over the bones in each frame. A live view needs fewer; it computes the part that all frames share only
+            once (`prepare_poses`).
 
     Returns:
-        T_robot_bone of each frame, shape (F, B, 4, 4).
+        T_robot_bone, from bone to robot coordinates [m], in each frame, shape (F, B, 4, 4).
 
     Raises:
         InputError: the states are not finite or do not belong to this skin.

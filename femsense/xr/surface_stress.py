@@ -25,7 +25,7 @@ def nodal_strain(rest: FloatArray, tets: IntArray, nodes: npt.ArrayLike) -> Floa
     Arguments:
         rest: nodes at rest [m], shape (n, 3).
         tets: node indices, shape (m, 4) or (m, 10); corners first.
-        nodes: of each frame [m], shape (F, n, 3).
+        nodes: node positions in each of F frames [m], shape (F, n, 3).
     """
     corners = np.asarray(tets)[:, :4]
     edges = rest[corners[:, 1:]] - rest[corners[:, :1]]

@@ -45,16 +45,19 @@ class UserSkin:
 
 
 def read_skin(path: str | Path, *, unit: str | None = None, T_robot_skin: Any = None, budget: int = BUDGET) -> UserSkin:
-    """Read a surface: STL, OBJ, PLY or glTF.
+    """Read a surface to be deformed with the body in animations, instead of the surface of the finite-element mesh.
 
     Arguments:
-        path: the file.
-        unit: of its coordinates, "m", "cm" or "mm"; glTF is always in metres with Y up.
-        T_robot_skin: maps its coordinates [m] to the robot frame, shape (4, 4).
-        budget: maximum number of vertices. Beyond it the surface is simplified, and a texture becomes vertex colours.
+        path: an STL, OBJ, PLY or glTF file.
+        unit: unit of the coordinates in the file: "m", "cm" or "mm". Required except for glTF, which is always in metres with Y up.
+        T_robot_skin: transform from the coordinates of the surface [m] to those of the robot, shape (4, 4). Default: the identity.
+        budget: maximum number of vertices. A surface with more is simplified, and its texture becomes vertex colours.
+
+    Returns:
+        the surface, for the argument `skin` of `export_glb`.
 
     Raises:
-        InputError: no such file, no surface, or no unit.
+        InputError: the file is missing, it contains no surface, or `unit` is missing.
     """
     file = Path(path).expanduser()
     scale = _scale(file, unit)
@@ -152,13 +155,13 @@ def export_skin(
         skin: the surface.
         bones: number of bones; None: chosen on held-out frames.
         color_rgb: colour of a surface without colours.
-        name: of the body, in the file.
+        name: name of the body in the file.
 
     Returns:
         a report of the export; its errors are distances to the vertices embedded in the elements, over at most SHOWN frames.
 
     Raises:
-        InputError: as `gltf.export_states`, and if the surface is far from the body.
+        InputError: states that `gltf.export_states` refuses, or a surface that is far from the body.
     """
     ties = tie_skin(skin, mesh)
     frames = as_states(nodes_m, len(mesh.nodes))

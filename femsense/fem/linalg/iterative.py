@@ -263,7 +263,7 @@ def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANC
     """Prepare conjugate gradients for a symmetric matrix; None if the matrix is not positive definite.
 
     Arguments:
-        levels: of its pattern, from `make_levels`.
+        levels: coarse levels of the matrix pattern, result of `make_levels`.
         values: its entries in CSC order, shape (nnz,); kept, not copied.
         tolerance: share of √(rᵀM⁻¹r) that a solution may leave. With more than that of the test for being definite, the matrix is
             taken to be so until curvature says otherwise.

@@ -58,14 +58,14 @@ SINGLE_FROM = 10_000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tracked:
-    """One frame of a tracked body."""
+    """Result of `Tracker.step`: the state of a body in one frame."""
 
     positions: FloatArray
     """Node positions [m], shape (n, 3)."""
     error_m: float
-    """How far any node may be from its equilibrium [m], estimated from how fast the terms shrink."""
+    """Estimated largest distance of a node from its equilibrium [m], from the convergence of the series."""
     motion_m: float
-    """How far the farthest node has moved since the frame before [m]."""
+    """Largest displacement of a node since the previous frame [m]."""
     residual_n: float
     """Largest unbalanced nodal force before the last term [N]."""
     factorisations: int
@@ -74,7 +74,19 @@ class Tracked:
 
 
 class Tracker:
-    """Equilibria of a body in real time, for tensions and nodal forces that change little from frame to frame; without friction and without held cables."""
+    """Tracks the equilibrium of a body in real time, for cable tensions and nodal forces that change little from frame to frame.
+
+    Each `step` expands the equilibrium in a power series about an earlier state, so that most frames need no new factorisation of the stiffness. Bodies with
+    chambers, cable friction or a compliant clamp, and cables with an imposed shortening, are not supported: `solve_equilibrium` with `start` handles them.
+
+    Example:
+        >>> import femsense as fs
+        >>> tracker = fs.Tracker(fs.load_robot("finger").body)
+        >>> for tension in (0.1, 0.2, 0.3):  # N
+        ...     frame = tracker.step(tension={"flexor": tension})
+        >>> round(1e3 * frame.motion_m, 1), frame.error_m < 1e-5  # largest displacement since the previous frame [mm]; estimated error [m]
+        (2.2, True)
+    """
 
     def __init__(
         self,
@@ -85,17 +97,17 @@ class Tracker:
         single: bool | None = None,
         most_factorisations: int = MOST,
     ) -> None:
-        """Prepare to track.
+        """Start from the body at rest.
 
         Arguments:
-            body: with its weight; cables with friction, chambers and a clamp that gives are for `solve_equilibrium`.
-            tolerance: largest error of a frame, as a share of its motion.
-            floor_m: an error that is always small enough, and never undercut by what is reported [m].
-            single: keep the factor in single precision; by default from SINGLE_FROM unknowns on.
-            most_factorisations: so many a frame, before the full solver takes over.
+            body: the body with its weight, a rigid clamp, and cables without friction.
+            tolerance: largest error of a frame relative to its motion [1].
+            floor_m: error below which the series ends in any case [m]; no smaller error is reported.
+            single: whether to keep the factor in single precision. Default: for bodies with at least SINGLE_FROM unknowns.
+            most_factorisations: maximum number of factorisations in a frame; then the full solver takes over.
 
         Raises:
-            InputError: the body has what a tracker does not know.
+            InputError: the body has chambers, cable friction or a compliant clamp.
         """
         if body.chambers or not body.clamp_is_rigid or any(c.friction > 0 for c in body.cables):
             raise InputError(
@@ -125,7 +137,8 @@ class Tracker:
         """Return the state under new tensions [N] (cables that are not named are slack) and nodal forces [N], shape (n, 3).
 
         Raises:
-            InputError: wrong names or shapes; FemsenseError: no equilibrium.
+            InputError: an unknown cable or a wrong shape.
+            FemsenseError: no equilibrium was found.
         """
         names = self.body.cable_names
         given = dict(tension or {})
@@ -140,10 +153,9 @@ class Tracker:
         return tracked
 
     def compliance(self, *, points: npt.ArrayLike = (), directions: npt.ArrayLike = ()) -> FloatArray:
-        """Return W as `femsense.compliance` does [m/N], carried on from the states at which it is known.
+        """Return the compliance matrix [m/N] of the current state, as `femsense.compliance` defines it, extrapolated from states where it is exact.
 
-        The first call with other points takes longer:
-        the compliance is learnt there with a little more tension in each cable too.
+        The first call with other points takes longer: the compliance is then also computed at a slightly larger tension of each cable.
         """
         if not self._past:
             raise FemsenseError("nothing is tracked yet: call step first")
@@ -230,7 +242,7 @@ class Tracker:
         return self.expansion.move(x, tension)
 
     def _look_ahead(self, T: FloatArray, motion: float) -> bool:
-        """Begin anew a little ahead on the way, where the series at hand will soon not do; return whether it was so."""
+        """Make a new expansion slightly ahead of the motion if the current series will soon not converge; return whether one was made."""
         start, terms = self.expansion, self._terms
         sizes, x = [_largest(term) for term in terms], start.positions
         if len(terms) < 2:
@@ -286,7 +298,7 @@ class Tracker:
 
 
 class Known:
-    """The compliance at some states, carried on to others (`combination`), and by how much that may be off."""
+    """The compliance at some states, its interpolation to others (`combination`), and the estimated error of that interpolation."""
 
     def __init__(self, length: float) -> None:
         """Know nothing; `length` [m] is that of `combination`."""
@@ -316,7 +328,7 @@ class Known:
         return np.asarray(np.tensordot(weights, self._stack[: len(weights)], 1))
 
     def doubt(self, state: FloatArray) -> float:
-        """Return by which share W may be off at a state; 0 where nothing is known, since nobody has asked."""
+        """Return the estimated relative error of W at a state; 0 if no compliance was requested before."""
         return self._scale * combination(state, self.states, self._length)[1] if self.states else 0.0
 
 

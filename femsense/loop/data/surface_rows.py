@@ -103,9 +103,9 @@ def read_clouds(
 
     Arguments:
         robot: the declared robot.
-        recording: with clouds or depth images.
+        recording: a recording with clouds or depth images.
         states: model states of these frames.
-        poses: of the cameras.
+        poses: pose of each camera, shape (4, 4).
 
     Raises:
         InputError: a malformed file.
@@ -163,11 +163,11 @@ def make_rows(
     """Return the scene of a recording's clouds: one row per surface point whose normal crosses the measured surface.
 
     Arguments:
-        robot: with surface points.
+        robot: the robot, with surface points (`Robot.with_surface_points`).
         scene: provides the recording and its frames; its rows are ignored.
         seen: the measured surface.
         states: model states by frame.
-        poses: of the cameras.
+        poses: pose of each camera, shape (4, 4).
 
     Raises:
         DataError: too few points are found.

@@ -121,9 +121,9 @@ def next_element(
     """Return the candidate experiments that would help most with the open questions of the data, and by how much.
 
     Arguments:
-        data: of the loop, thinned to a few frames.
+        data: data of the search, thinned to a few frames.
         fit: the model.
-        noise: of the data.
+        noise: noise model of the data.
         confounded: pairs of effects that the data cannot distinguish.
         not_testable: effects that calibration absorbs in these data.
 

@@ -51,7 +51,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pull:
-    """One cable or chamber."""
+    """A cable or chamber, with the range of its input."""
 
     kind: str
     """"cables" or "chambers"."""

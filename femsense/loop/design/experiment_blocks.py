@@ -56,7 +56,7 @@ def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[
     Arguments:
         robot: the declared robot.
         control: "tension" or "displacement".
-        ranges: of the cables [N] or [m], shape (a,).
+        ranges: range of the input of each of a cables [N] or [m], shape (a,).
         names: effects to take; by default all.
     """
     result: list[Form] = []

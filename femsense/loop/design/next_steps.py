@@ -53,7 +53,7 @@ def next_steps(data: Data, fitted: FittedModel, noise: Noise, *, noise_is_measur
     """Return the next steps in words, the most beneficial first, each with its benefit.
 
     Arguments:
-        data: of the loop.
+        data: data of the search.
         fitted: the model with all effects that were found.
         noise: including the components that vary with the state, so that one more state is not overrated.
         noise_is_measured: whether states repeat or the noise is declared.

@@ -33,7 +33,7 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
     """Return the standard deviations of the coordinates of each effect.
 
     Arguments:
-        data, fitted, noise: of the final fit.
+        data, fitted, noise: data, model and noise of the final fit.
         seed_std: effect → scatter of its coordinates over seeds that fit equally well.
     """
     own = fitted.fit.own

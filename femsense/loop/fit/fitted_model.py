@@ -75,7 +75,7 @@ def fit_model(
     coordinates: FloatArray,
     **options: Unpack[FitOptions],
 ) -> FittedModel:
-    """Return the fit of a hypothesis with its held-out data; arguments as of `fit_jointly`."""
+    """Fit a hypothesis to the data and predict the held-out data; the arguments are those of `fit_jointly`."""
     fit = fit_jointly(hypothesis, prior, data.train, noise, data.placement_std, coordinates, **options)
     held = held_out(data, fit, noise)
     return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
@@ -131,7 +131,7 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
 
 
 def without_effect(data: Data, fitted: FittedModel, name: str, noise: Noise, *, worth: float = np.inf) -> FittedModel:
-    """Return a fitted model without one of its effects, refitted; see `keeping`."""
+    """Return a fitted model without one of its effects, all other parameters refitted."""
     return keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise, worth=worth)
 
 
@@ -154,7 +154,7 @@ def with_term(
 
 
 def with_values(fit: JointFit, values: Sequence[float] | FloatArray, *, at: int | None = None) -> FloatArray:
-    """Return the coordinates of a fit with those of one more term, or of another one in place of its `at`-th; see `with_term`."""
+    """Return the coordinates of a fit with those of one more term, or of another term that replaces its `at`-th."""
     span = span_at(fit, at)
     return np.concatenate([fit.coordinates[: span.start], values, fit.coordinates[span.stop :]])
 

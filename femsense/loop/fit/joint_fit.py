@@ -50,7 +50,7 @@ class Jets:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JointFit:
-    """The result of a joint fit."""
+    """Result of `fit_jointly`: poses, initial inputs and coordinates of a hypothesis, fitted to all trials."""
 
     hypothesis: Hypothesis
     prior: Prior

@@ -34,7 +34,7 @@ def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
 
 
 def with_errors_as_shown(data: Data, fitted: FittedModel) -> Data:
-    """Return the data with discretisation error and marker placements as a fitted model shows them; see `as_shown`, `with_turning_placements`."""
+    """Return the data with the discretisation error scaled, and the marker placements rotated, as in a fitted model (`as_shown`, `with_turning_placements`)."""
     return with_turning_placements(as_shown(data, fitted), fitted)
 
 

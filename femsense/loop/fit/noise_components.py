@@ -1,6 +1,6 @@
 """The noise of marker residuals: components common to a marker, a frame, a sweep and a repeated state, and white noise.
 
-The model (docs/method/closing-the-loop.md, section 4) is
+The model (docs/reference/closing-the-loop-rules.md, section 4) is
 
     Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 
@@ -180,10 +180,10 @@ def estimate_noise(
     """Return the components of the noise by restricted maximum likelihood.
 
     Arguments:
-        residuals: of each recording [m], shape (k, c): of markers (c = 3), or of clouds (c = 1).
+        residuals: residuals of each recording [m], shape (k, c) with k rows: of markers (c = 3) or of clouds (c = 1).
         nuisance: columns of the fitted parameters, shape (k, c, p), the same p everywhere.
         extra: columns of possible effects, shape (k, c, q), the best first; they are projected out.
-        groups: of each recording.
+        groups: groups of rows with common errors (marker, state, frame, sweep) in each recording.
         before: components [m] of an earlier estimate with a smaller model; prior of the new one (a factor of two).
         most: component → its upper bound [m].
     """
@@ -215,7 +215,7 @@ def starting_points(names: Sequence[str], scale: float, jitter: float, near: Flo
     """Return starting values of the maximisation: logarithms of standard deviations [m].
 
     Arguments:
-        names: of the components.
+        names: names of the noise components.
         scale: rms of the residuals [m].
         jitter: scatter of repeated states [m], 0 without any.
         near: logarithms of an earlier estimate.

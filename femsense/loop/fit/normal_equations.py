@@ -112,7 +112,7 @@ class NormalEquations:
         """Return R and s such that χ² = ‖R x + s‖² + const for a candidate with coordinates x, shape (q,), the shared parameters refitted.
 
         Arguments:
-            key: of the candidate; x is relative to its null.
+            key: key of the candidate; its coordinates count from its null.
             prior: 1/σ² of the shared parameters, shape (p,); they are at their optimum.
         """
         block = self.candidates[key]

@@ -98,10 +98,10 @@ class SavedLoop(Loop):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class LoopResult(Loop):
-    """The result of `improve`: the content of loop.json, and the robots."""
+    """Result of `improve`: the verdict, the effects found, held-out errors (all keys of loop.json), and the improved robot."""
 
     entries: tuple[Entry, ...]
-    """The effects as tables of `[[effects]]`."""
+    """Accepted effects as tables `[[effects]]` of robot.toml."""
     robot: Robot
     """The improved robot."""
     declared: Robot

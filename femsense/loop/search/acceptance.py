@@ -32,7 +32,7 @@ def acceptance_test(
     record: RefitRecord,
     noise: Noise,
 ) -> Refit:
-    """Decide whether an effect is accepted, from its refit: PASSES, or the first criterion that fails.
+    """Decide whether an effect is accepted, from its refit (the nonlinear fit of the model with this effect): PASSES, or the first criterion that fails.
 
     With Δχ² the decrease of χ² in the fitted data, Δχ²_held that in the held-out data, k the BIC penalty and p the prior cost (−2 log prior density):
 

@@ -196,7 +196,7 @@ def asked_elsewhere(spread: Spread, forms: Sequence[Effect], own: Sequence[str |
 
     Arguments:
         spread: runs the tasks.
-        forms: of all effects; `own`: files of a user's effects among them.
+        forms: forms of all effects; `own`: the files of user-defined ones.
         folder: for that file; workers on other machines must see it.
     """
 
@@ -215,7 +215,7 @@ def answer(file: str, digest: str, own: tuple[str, ...], recording: str) -> Norm
     """Return the normal equations of a recording, in a worker.
 
     Arguments:
-        file: with the question; `digest`: its hash.
+        file: file that contains the question; `digest`: its hash.
         own: files of a user's effects.
         recording: its folder.
     """

@@ -55,7 +55,7 @@ def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fields:
-    """Displacements of the markers by effects to first order, at a fitted model."""
+    """Fields of candidate effects: the derivative of the residual by their parameters, at a fitted model."""
 
     todo: list[Term]
     """The effects and seeds that can be evaluated, with their parameters."""

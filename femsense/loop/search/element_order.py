@@ -75,7 +75,7 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
 
     Arguments:
         data: the data.
-        search: with quadratic elements.
+        search: completed search with quadratic elements.
         names: effects that are tried.
     """
     candidate = _candidate(names, search.n_effective)

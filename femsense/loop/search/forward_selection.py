@@ -87,9 +87,20 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
 
 
 def polished(setting: Setting, fitted: FittedModel, refitted: Refit) -> Refit:
-    """Return a refit with an improved seed, tested again, and with the scatter of its coordinates over seeds that fit equally well.
+    """Improve the place or time of a candidate effect after its fit, and repeat the acceptance test.
 
-    If the refit passes the acceptance test with its present seed and fails it with the improved seed, the present seed is kept.
+    A *refit* is the nonlinear fit of the model with one candidate effect added. The *seed* of a candidate is a start value that this fit cannot change,
+    such as the place of a payload or a time; neighbouring values are tried here, and the best is kept. If the refit passes the acceptance test with its
+    present seed and fails it with the improved one, the present seed is kept.
+
+    Arguments:
+        setting: data, noise and penalties of this step of the search.
+        fitted: the model without the candidate.
+        refitted: the refit of the candidate.
+
+    Returns:
+        the refit with its best seed and the result of its test. `record.seed_std` is the standard deviation of each coordinate of the seed [m or s] over
+        the seeds that fit equally well.
     """
     made, scatter = _polish(setting, fitted, refitted)
     record = replace(refitted.record, seed_std=tuple(scatter))

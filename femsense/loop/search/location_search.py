@@ -174,7 +174,7 @@ def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) 
 def lies_on_body(
     robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, thresholds: Thresholds
 ) -> bool:
-    """Return whether each place among parameters lies in the body at rest, or outside it by at most `relevant` of its reach. Without this bound a fit may
+    """Return whether each point among parameters lies in the body at rest, or outside it by at most `relevant` of its reach. Without this bound a fit may
     place a force anywhere along its line of action."""
     places: dict[str, list[float]] = {}
     for p, v in zip(parameters, coordinates):

@@ -48,7 +48,9 @@ def refit(
     *,
     wanted: float | None = None,
 ) -> FittedModel:
-    """Joint fit with one more effect, started from its linear step. Raises DataError if no start improves the fit.
+    """Refit: fit the whole model with one more effect, nonlinearly, from the linear step of that effect.
+
+    Raises DataError if no start improves the fit.
 
     A fit whose dBIC would stay below `wanted` (by default `Thresholds.evidence`) is stopped early.
     """

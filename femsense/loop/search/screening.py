@@ -32,7 +32,7 @@ experiment does not distinguish."""
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """An effect with a seed, linearised at the current model."""
+    """An effect with a seed (a place, radius or time that a fit cannot change), linearised at the current model."""
 
     effect: Effect
     seed: Entry
@@ -54,7 +54,7 @@ class Candidate:
     score: float
     """dBIC: gain − cost."""
     cost: float
-    """BIC penalty, see `penalty`."""
+    """BIC penalty of its parameters and of the selection of its seed, result of `penalty`."""
     smallest: FloatArray
     """Smallest detectable size of each parameter, in its coordinate, shape (q,)."""
 
@@ -90,14 +90,17 @@ def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: floa
 def screen(
     base: JointFit, problem: JointProblem, fields: Fields, n_effective: float, *, wanted: float = DEFAULTS.evidence
 ) -> list[Candidate]:
-    """Return all candidates with their linear scores, the best first.
+    """Predict the evidence (dBIC) of every candidate effect to first order, as a score test does.
 
     Arguments:
         base: the current fit.
         problem: its problem (trials and noise).
-        fields: of the effects to try, at this fit or close to it.
+        fields: derivative of the residual by each effect to try, at this fit or close to it.
         n_effective: number of independent observations, for BIC.
         wanted: dBIC at which an effect counts as detectable.
+
+    Returns:
+        the candidates with their linear scores, the best first.
     """
     Q, inverse = basis_of(np.asarray(base.fit.jacobian))
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
@@ -193,7 +196,8 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noi
 
     Arguments:
         data, fitted: the residual that is used.
-        fields: of the effects that the model may lack; they are projected out. None: the whole residual of the fitted model counts as noise, markers are
+        fields: derivatives of the residual by the effects that the model may lack; they are projected out.
+            None: the whole residual of the fitted model counts as noise, markers are
             limited to the prior of their places, and `before` gives the repeatability of a marker.
         before: an earlier estimate.
     """

@@ -42,13 +42,13 @@ class SearchProgress:
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
-    """As of `Search`."""
+    """Name of each added effect with the model that added it, as `Search.history`."""
     given: int
     """Number of models in the history before the search began."""
     fitted: FittedModel
     """The current model, which the next effect extends."""
     base: FittedModel
-    """As of `Search`, from the first screening on."""
+    """Model of the first screening; defined from that screening on."""
     names: list[str]
     """Effects that are tried."""
     quadratic: bool
@@ -141,7 +141,7 @@ def at_step(records: Iterable[RefitRecord], step: int) -> list[RefitRecord]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Refit:
-    """A candidate after its joint fit."""
+    """A candidate effect after its refit: the nonlinear fit of the whole model with this effect in addition."""
 
     candidate: Candidate
     fitted: FittedModel

@@ -38,7 +38,7 @@ def gather(
         search: its record.
         back: the returned model; `shown`: that or the last model of the search, whose residual is reported.
         after_tests: tests of structure of the reported residual.
-        rng: of the bootstrap and the permutations.
+        rng: random generator of the bootstrap and the permutations.
     """
     before, noise = search.before, search.noise
     old, new = views_of(data, before), views_of(data, back)

@@ -72,6 +72,7 @@ def find_effect(name: str) -> Effect:
         InputError: no effect has this name; the most similar name is suggested.
 
     Example:
+        >>> import femsense as fs
         >>> fs.find_effect("cable_friction").lacks
         'loss where a cable bends or rubs; depends on the direction of motion'
     """
@@ -93,12 +94,16 @@ def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
 
     Arguments:
         robot: the robot; it does not change.
-        entries: tables as under `[[effects]]` of robot.toml: `name` and the parameters of the effect (docs/effects).
+        entries: list of dicts, each with `name` and the parameters of an effect, as in the tables `[[effects]]` of robot.toml (docs/effects).
+
+    Returns:
+        a new robot; its `body` has the changed properties.
 
     Raises:
         InputError: an unknown effect or parameter, or a value out of its bounds.
 
     Example:
+        >>> import femsense as fs
         >>> soft = fs.apply_effects(fs.load_robot("finger"), [{"name": "stiffness", "scale": 0.8}])
         >>> round(float(soft.body.material.young_modulus.max()) / 1e6, 2)  # MPa; 1.2 as declared
         0.96

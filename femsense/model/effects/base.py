@@ -160,7 +160,7 @@ class Alias:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """An effect that a plain model may lack."""
+    """A physical effect that a model may lack, such as the friction of a cable: its parameters, and how it changes a robot."""
 
     name: str
     lacks: str

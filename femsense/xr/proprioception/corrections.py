@@ -53,11 +53,11 @@ CORRECTIONS = (*SIMPLE, *LINEAR)
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """One channel that reads something else."""
+    """A constant offset of one channel."""
 
     channel: int
     by: float
-    """In the unit of the channel; > 0: it reads too much."""
+    """Offset in the unit of the channel; > 0: its readings are too high."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -117,7 +117,7 @@ def is_better(errors: FloatArray, than: FloatArray) -> bool:
 
 
 def corrected(frames: Frames, name: str) -> Network:
-    """Return the network with a correction that is fitted to frames; see `CORRECTIONS`."""
+    """Return the network with one of the `CORRECTIONS`, fitted to frames."""
     now, steps = frames, [part.strip() for part in name.split(",")]
     for step in steps:
         if step == "channel":
@@ -129,7 +129,7 @@ def corrected(frames: Frames, name: str) -> Network:
 
 
 def shift_of(frames: Frames, *, moved: bool = False) -> Shift:
-    """Return the channel and the shift that explain frames best; see `shifts_of`."""
+    """Return the channel and the shift with which the model fits frames best, the first result of `shifts_of`."""
     return shifts_of(frames, moved=moved)[0]
 
 

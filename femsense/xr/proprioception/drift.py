@@ -37,23 +37,24 @@ FEWEST = 8
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drift:
-    """Comparison of a model with other data."""
+    """Result of `drift`: errors of a model on other data, and the cause if they are too large."""
 
     verdict: str
     """"holds", or the cause: "one channel shifted", "base moved", "map changed", joined by "and"."""
     stated_mm: float
-    """The error of the model on the data that it is from."""
+    """Error of the model on held-out training data, as stated in its file: root mean square distance of the markers [mm]."""
     error_mm: float
-    """On these."""
+    """Error of the unchanged model on the new data [mm]."""
     rigid_mm: float
-    """After a rigid motion, on frames that it was not fitted to."""
+    """Error after a rigid motion of the predicted markers [mm], on frames to which the motion was not fitted."""
     shift_mm: float
-    """How far the middle of the markers moves by it."""
+    """Translation of the centre of the markers by this rigid motion [mm]."""
     turn_deg: float
+    """Angle of this rigid motion [°]."""
     shifts: dict[str, float]
-    """The channel with an offset and the offset in its unit; then others that fit equally well."""
+    """Channel → offset in the unit of its sensor: first the channel whose offset fits best, then others that fit equally well."""
     left_mm: float
-    """With all that explains the frames, on frames that it was not fitted to."""
+    """Error after correction of the causes in `verdict` [mm], on frames to which the correction was not fitted."""
     outside: float
     """Share of the rows with a channel outside of the training domain."""
     channels: dict[str, float]
@@ -75,10 +76,33 @@ class Drift:
 
 
 def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
-    """Test whether a model holds on other data with the same channels and markers, and find the cause if it does not.
+    """Test whether the error of a proprioceptive model on new data is still the one stated for it, and find the cause if it is not.
+
+    The error is the root mean square distance between predicted and measured markers. The model holds if the lower end of its 95 % interval is
+    at most 1.5 times the stated error. Otherwise an offset of one channel, a rigid motion of the base and a changed map are fitted to one part of
+    the frames and compared on the others.
+
+    Arguments:
+        model: result of `learn` or `load_model`.
+        data: result of `labelled`: sensor readings and measured markers of another day, with the channels and markers of the model.
+
+    Returns:
+        the errors with and without correction [mm], and `verdict`: "holds", or the causes.
 
     Raises:
-        DataError: fewer than 8 rows.
+        DataError: fewer than 8 rows with markers.
+
+    Example:
+        >>> import numpy as np
+        >>> import femsense as fs
+        >>> time_s = np.arange(400) / 50.0
+        >>> bend = np.sin(2.0 * time_s)[:, None]  # reading of one bend sensor
+        >>> tip = np.stack([0.1 * np.cos(bend), 0.0 * bend, 0.1 * np.sin(bend)], axis=2)  # one marker [m]
+        >>> model = fs.learn(fs.labelled(time_s, bend, tip, channels=("flex",), marker_names=("tip",)))
+        >>> later = fs.labelled(time_s, bend + 0.1, tip, channels=("flex",), marker_names=("tip",))  # the zero of the sensor has moved
+        >>> result = fs.drift(model, later)
+        >>> result.verdict, round(result.shifts["flex"], 2)
+        ('one channel shifted', 0.1)
     """
     frames = _frames(model, data)
     predicted = model.network(frames.inputs)
@@ -104,14 +128,21 @@ def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
 
 
 def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
-    """Return the model corrected by a few labelled frames of another day.
+    """Return a proprioceptive model corrected by a few frames of another day.
 
-    The correction is selected from `corrections.CORRECTIONS`; the report names it with its
-    error on held-out frames, which replaces that of the model, and so do the intervals. They are of one session: `growth` is the error of the
-    model before the correction, over the one stated for it.
+    The candidate corrections are offsets of channels, a rigid motion of the base, a linear addition to the map, and a new linear map
+    (`corrections.CORRECTIONS`). A more complex one is chosen only if its error on held-out frames is significantly smaller (5 % level).
+
+    Arguments:
+        model: result of `learn` or `load_model`.
+        few: result of `labelled`: sensor readings and measured markers of the new day.
+
+    Returns:
+        the corrected model. Its `report` names the correction and its error on held-out frames [mm], from which the 95 % intervals are
+        computed. These hold for one session; `growth` is the error before the correction divided by the stated one.
 
     Raises:
-        DataError: fewer than 8 rows.
+        DataError: fewer than 8 rows with markers.
     """
     frames = _frames(model, few)
     chosen, left = explain(frames)

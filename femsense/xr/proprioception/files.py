@@ -107,7 +107,7 @@ def with_directions(
     The direction of the body is that of the line through the rigid bodies at rest (the first complete frame), and rotates with each.
 
     Arguments:
-        names: of the m rigid bodies, from base to tip.
+        names: names of the m rigid bodies, from base to tip.
         places: [m], shape (n, m, 3).
         turns: their rotations, shape (n, m, 3, 3), nan where one is hidden.
         where: for messages.

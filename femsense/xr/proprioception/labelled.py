@@ -50,12 +50,12 @@ class Labelled:
 
     @property
     def time_s(self) -> FloatArray:
-        """When each row was read [s], shape (n,)."""
+        """Time of each row [s], shape (n,)."""
         return self._of([course.time_s for course in self.courses])
 
     @property
     def readings(self) -> FloatArray:
-        """In the units of the sensors, shape (n, c)."""
+        """Readings of the c channels in the units of the sensors, shape (n, c)."""
         return self.inputs(())
 
     @property
@@ -95,19 +95,26 @@ def labelled(
 ) -> Labelled:
     """Combine sensor readings and marker positions into training data for `learn`.
 
-    Rows without a finite reading are left out; those without a finite marker only enter filters.
+    One row holds the readings of all sensors in the body (channels) at one time, and the positions of the markers on it. Rows without a finite reading
+    are left out. Rows without a finite marker are not fitted; their readings only enter the low-pass filters.
 
     Arguments:
-        time_s: when each row was read [s], not decreasing, shape (n,).
-        readings: shape (n, c).
-        markers: [m], shape (n, m, 3).
-        channels, marker_names: names; numbers by default.
-        frame: of the markers: "robot", or "markers" for any other frame fixed to the base.
+        time_s: time of each of n rows [s], not decreasing, shape (n,).
+        readings: readings of c sensors in their own units, shape (n, c).
+        markers: positions of m markers [m], shape (n, m, 3).
+        channels: names of the sensors. Default: their numbers.
+        marker_names: names of the markers. Default: their numbers.
+        frame: coordinates of the markers: "robot", or "markers" (default) for any others that are fixed to the base.
+
+    Returns:
+        the training data, for `learn`, `drift` and `adapt`.
 
     Raises:
         InputError: shapes that do not match, decreasing times, or an unknown frame.
 
     Example:
+        >>> import numpy as np
+        >>> import femsense as fs
         >>> time_s = np.arange(100) / 50.0
         >>> bend = np.sin(2.0 * time_s)[:, None]  # one sensor
         >>> tip = np.stack([0.1 * np.cos(bend), 0.0 * bend, 0.1 * np.sin(bend)], axis=2)  # one marker [m]

@@ -49,18 +49,18 @@ DISTINCT = 20
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LearnOptions:
-    """Problems of the data."""
+    """Options of `learn`: candidate maps and memories, and the bones."""
 
     kinds: tuple[Kind, ...] = tuple(Kind)
     """Maps that are tried, simple ones first."""
     memories: tuple[tuple[float, ...], ...] = MEMORIES
     """Candidate time constants [s] of filters in addition to the readings; ((),): none."""
     end_to_end: bool = False
-    """Whether a second network predicts the bones directly from the readings, as in the paper."""
+    """Whether a second network predicts the bones directly from the readings."""
     bones: ArmatureOptions = field(default_factory=ArmatureOptions)
     """Placement of the bones along the markers."""
     rest_row: int = 0
-    """Row in which the robot is at rest: its bones are the skin's."""
+    """Row in which the robot is at rest: the bones of the skin are placed on its markers."""
     seed: int = 0
     """Seed of the random numbers of training."""
 
@@ -68,19 +68,24 @@ class LearnOptions:
 def learn(
     data: Labelled, *, test: Labelled | None = None, options: LearnOptions | None = None, progress: Progress | None = None
 ) -> ProprioceptiveModel:
-    """Return a model of readings.
+    """Learn a proprioceptive model: a map from the readings of sensors in the body to the positions of markers on it.
 
-    The kind of map, its memory and its channels are those with the smallest error on held-out blocks of time. The reported error
-    is that on three blocks of twenty that were used neither for training nor for selection.
+    Several kinds of map (linear, networks), memories (low-pass filters of the readings) and sets of channels are compared by their error on held-out
+    blocks of time; the simplest good one is returned. Three of twenty blocks are used neither for training nor for this selection, and give the
+    reported error.
 
     Arguments:
-        data: readings with markers, of one recording or several (`joined`).
-        test: another recording, whose error is reported in `test`.
-        options: candidate maps, and the bones.
-        progress: called with (steps done, all steps).
+        data: readings and markers of one or several recordings, result of `labelled`.
+        test: data of another recording, on which the error is reported in addition. Default: none.
+        options: a `LearnOptions`: candidate maps, candidate memories, and the bones. Default: `LearnOptions()`.
+        progress: a function, called with (steps done, number of steps).
+
+    Returns:
+        the model. `report["error_mm"]` is its root mean square marker error on the unused blocks [mm].
 
     Raises:
-        InputError: an unknown kind of map, a test in another frame of reference. DataError: too few rows, or constant readings.
+        InputError: an unknown kind of map, or `test` in other coordinates than `data`.
+        DataError: too few rows, or constant readings.
     """
     options = options or LearnOptions()
     _check(data, options)

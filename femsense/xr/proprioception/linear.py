@@ -30,7 +30,7 @@ def train_radial(x: FloatArray, y: FloatArray, *, penalty: float, length: float,
 
     Arguments:
         x, y: inputs (n, d) and outputs (n, o).
-        penalty: of the linear map, as in `train_ridge`.
+        penalty: ridge penalty of the linear map, as for `train_ridge`.
         length: ℓ, in spreads of the inputs times √d.
         noise: variance ν of the unexplained part, relative to the explained one.
     """

@@ -20,14 +20,18 @@ from femsense.xr.proprioception.spread import Spread
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProprioceptiveModel:
-    """A model from readings to markers (`markers`) and bones (`armature`), with a check of its inputs (`check`)."""
+    """A learnt map from the readings of c sensors in the body to the positions of m markers on it.
+
+    `markers` predicts the markers, `interval` their 95 % intervals and `armature` the bones; `check` lists readings outside of the training domain.
+    `learn` and `load_model` make one.
+    """
 
     channels: tuple[str, ...]
     """Names of the readings, in the order of a row."""
     marker_names: tuple[str, ...]
     """Names of the predicted markers."""
     network: Network
-    """From readings and their filters to the coordinates of the markers [m]."""
+    """Map from readings and their low-pass filters to the coordinates of the markers [m]."""
     memory_s: tuple[float, ...]
     """Time constants of the filters [s]; none: the readings of one moment are enough."""
     domain: Domain
@@ -39,9 +43,9 @@ class ProprioceptiveModel:
     report: dict[str, Any] = field(default_factory=dict)
     """Training report, with errors on held-out data."""
     frame: str = AS_MEASURED
-    """Of reference of markers and bones: "robot", or "markers", that in which they were measured."""
+    """Coordinates of markers and bones: "robot", or "markers", those in which the markers were measured."""
     spread: Spread | None = None
-    """Of its intervals; None in files of older versions."""
+    """Parameters of the 95 % intervals; None in files of older versions."""
 
     def __repr__(self) -> str:
         error = self.report.get("error_mm")
@@ -106,7 +110,7 @@ class ProprioceptiveModel:
 
     @property
     def needed(self) -> BoolArray:
-        """The channels without which there are no markers or bones, shape (c,); others never changed, or made things worse."""
+        """Whether each channel is required for a prediction, shape (c,). The others were constant in training, or made the prediction worse."""
         uses = self.network.uses if self.bones is None else self.network.uses | self.bones.uses
         return np.asarray(uses.reshape(-1, len(self.channels)).any(axis=0))
 
@@ -121,7 +125,7 @@ class ProprioceptiveModel:
         return self._chain().rest
 
     def live(self) -> LiveModel:
-        """Return a follower of a stream of readings."""
+        """Return an object that processes a stream of readings row by row and keeps the memory of the model."""
         return LiveModel(self)
 
     def _chain(self) -> Armature:
@@ -150,7 +154,7 @@ class ProprioceptiveModel:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LivePose:
-    """Prediction from one row of a stream."""
+    """Result of `LiveModel.step`: markers and bones predicted from one row of readings."""
 
     markers: FloatArray
     """[m], shape (m, 3)."""

@@ -39,7 +39,18 @@ CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
-    """Write a model as an ONNX file and return its path. Raises InputError if a foreign file exists there."""
+    """Write a proprioceptive model as an ONNX file.
+
+    Arguments:
+        model: result of `learn`, `adapt` or `load_model`.
+        path: the file, with the suffix .onnx. An earlier model there is replaced.
+
+    Returns:
+        the path.
+
+    Raises:
+        InputError: a file of another kind exists at that path.
+    """
     from onnx.helper import make_node
 
     check_target(path, folder=False, kind=MODEL)

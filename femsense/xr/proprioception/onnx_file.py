@@ -34,7 +34,7 @@ def write_onnx(
     """Write a graph with metadata, under a temporary name that is renamed at the end.
 
     Arguments:
-        path: of the file.
+        path: path of the file.
         nodes, numbers: operators in order, and their constants.
         inputs, outputs: name → width; every array is (rows, width).
         text: metadata.

@@ -39,7 +39,7 @@ class Spread:
     root: FloatArray
     """L⁻¹ of p (FᵀF / n + λ I) = L Lᵀ, shape (p, p)."""
     kappa: float
-    """κ, see above."""
+    """κ: weight of the leverage of an input in the predictive variance [1]."""
     quantile: FloatArray
     """q of each marker [m], shape (m,)."""
 
@@ -100,11 +100,11 @@ def splits(part: IntArray) -> Iterator[tuple[BoolArray, BoolArray, int]]:
 def held_out(
     train: Callable[[FloatArray, FloatArray], Network], inputs: FloatArray, targets: FloatArray, part: IntArray
 ) -> HeldOut:
-    """Return the cross-validation errors of a training function; see `splits`.
+    """Return the cross-validation errors of a training function, over the splits into training and held-out rows of `splits`.
 
     Arguments:
         train: returns the map of inputs (k, d) to coordinates (k, 3 m).
-        inputs, targets, part: of all rows, in order of time.
+        inputs, targets, part: inputs, marker coordinates and recording of all rows, in order of time.
     """
     found: list[HeldOut] = []
     for trained, predicted, group in splits(part):

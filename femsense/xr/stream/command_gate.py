@@ -10,7 +10,7 @@ from femsense.xr.stream.payloads import Input
 
 @dataclass(frozen=True, slots=True)
 class GateOptions:
-    """How commands may go out."""
+    """Limits of the commands that a `CommandGate` sends."""
 
     allowed: bool = False
     """Whether commands are sent at all."""

@@ -56,7 +56,7 @@ FAR = 2.0
 
 @dataclass(frozen=True, slots=True)
 class DragOptions:
-    """How wishes are answered."""
+    """Options of the drag server: how it answers requests to move a point of the robot."""
 
     gate: GateOptions = field(default_factory=GateOptions)
     tolerance_m: float = 1e-4
@@ -82,7 +82,7 @@ def handles_of(robot: Robot) -> tuple[Handle, ...]:
 
 
 class DragServer:
-    """Listens to a hub for wishes about one robot, and answers the newest."""
+    """Receives requests to move a point of one robot from a hub, and answers the newest one."""
 
     def __init__(
         self,

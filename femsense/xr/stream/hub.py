@@ -19,7 +19,7 @@ class Message:
 
     @property
     def retained(self) -> bool:
-        """Whether who comes late is to have it at once."""
+        """Whether a client that connects later receives the message immediately."""
         known = split_topic(self.topic)
         return known is not None and known[1] in RETAINED
 

@@ -70,7 +70,7 @@ class Lease:
         self._stops = 0
 
     def rule(self, claim: Claim, now: float) -> Ruling:
-        """Decide about a message that arrives at a time [s]."""
+        """Return whether a message that arrives at a time [s] is accepted."""
         who = (claim.way, claim.client)
         known = self._known.pop(who, _Known(-1))
         self._known[who] = known
@@ -96,7 +96,7 @@ class Lease:
         return Ruling.GRANTED
 
     def is_held(self, now: float) -> bool:
-        """Return whether somebody holds it at a time [s]."""
+        """Return whether a client holds the lease at a time [s]."""
         return bool(self.client) and now - self._renewed_at <= self.hold_s
 
     def expire(self, now: float) -> bool:

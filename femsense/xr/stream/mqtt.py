@@ -35,7 +35,7 @@ WANTED = tuple(f"{PREFIX}/+/{kind}" for kind in RECEIVED)
 
 @dataclass(frozen=True, slots=True)
 class BrokerAddress:
-    """A broker and how to be let in."""
+    """Address and credentials of a broker."""
 
     host: str
     port: int = PLAIN_PORT

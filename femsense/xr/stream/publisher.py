@@ -136,7 +136,7 @@ class Publisher:
 
     @property
     def trouble(self) -> str:
-        """Why readings give no pose; empty if they do, or without readings."""
+        """Reason why the readings of the sensors give no pose; empty if they do, or if there are no readings."""
         with self._lock:
             return self._blind if self._said[0] in ("waiting", "stale") else ""
 
@@ -188,7 +188,7 @@ def play(
     """Send frames at their own times, the first at once, until they end or `stop` is set.
 
     Arguments:
-        publisher: of the twin that the frames are of.
+        publisher: publisher of the twin to which the frames belong.
         frames: in order of time.
         stop: ends it.
         clock: [s].

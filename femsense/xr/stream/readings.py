@@ -122,7 +122,7 @@ class Readings(Iterator[Reading]):
 
     @property
     def trouble(self) -> str:
-        """Why no readings come; empty while they do and the source is there."""
+        """Reason why no readings arrive; empty while they do."""
         if why := self.away:
             return why
         if not np.isfinite(self._newest_at):

@@ -87,7 +87,7 @@ def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) ->
     """Yield frames at a rate; bones are interpolated between those of the run, all else is that of the nearest.
 
     Arguments:
-        stream: of `open_run`.
+        stream: result of `open_run`.
         rate_hz: frames a second.
         loop: begin again after a short pause, for ever.
     """
@@ -244,7 +244,7 @@ def with_residuals(points: FloatArray, nodes: npt.ArrayLike, tets: npt.ArrayLike
 
     Arguments:
         points: measured, robot frame [m], shape (n, 3); an even choice of them is kept.
-        nodes: of the body [m], shape (m, 3).
+        nodes: nodes of the body [m], shape (m, 3).
         tets: its tetrahedra, shape (t, 4) or (t, 10).
     """
     from femsense.fem.mesh import TetMesh, surface_triangles

@@ -29,8 +29,8 @@ def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = N
     """Return the streamed twin of a learnt model: a surface on its chain of bones.
 
     Arguments:
-        model: with a chain of bones.
-        name: of the robot in topics.
+        model: a proprioceptive model with a chain of bones.
+        name: name of the robot in topics.
         worn: the robot's surface, in the frame of reference of the model's markers; None: a tube.
 
     Raises:
@@ -69,7 +69,7 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
     """Return a skin whose vertices move with the two bones between which they lie, as shares of the way from one to the other.
 
     Arguments:
-        vertices: of a surface at rest [m], shape (v, 3).
+        vertices: vertices of a surface at rest [m], shape (v, 3).
         bones: places at rest, in their order along the body, same frame of reference [m], shape (b, 3).
 
     Raises:
@@ -143,7 +143,7 @@ def tube_around(places: FloatArray, across: FloatArray) -> tuple[Skin, IntArray]
     """Return a closed tube around a chain of bones, and its triangles, shape (t, 3).
 
     Arguments:
-        places: of the bones at rest, in their order along the body [m], shape (b, 3).
+        places: positions of the bones at rest, in their order along the body [m], shape (b, 3).
         across: two unit vectors across the body at each bone, shape (b, 3, 2).
 
     Returns:
