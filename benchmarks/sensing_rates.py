@@ -27,7 +27,7 @@ from femsense.sensing.types import SensedFrame
 DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
 FREE, TOUCHED = 4, 8
 PLACE = [0.0, -0.0429, 0.0906]
-STAGES = ("equilibrium", "read", "objects", "fit", "search", "state", "check")
+STAGES = ("equilibrium", "read", "objects", "fit", "search", "rms", "check")
 
 
 def print_rates(points: int, folder: Path) -> None:

@@ -56,10 +56,10 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     best, sensor = found.best, model.sensor
     began = time.perf_counter()
     status = camera_verdict(model, best, checked(model, best))
-    stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     covariances = covariances_of(model, best)
     places = best.place_covariance + elsewhere(model, best)
     contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, places, best.state, previous)
+    stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     report = FrameReport(
         int(sensor.recording.frame_numbers[k]),
         float(sensor.recording.time_s[k]),

@@ -11,7 +11,7 @@ from helpers import block_mesh
 
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.body import BodyModel
-from femsense.fem.compliance import compliance, direction_rows, tangent_at
+from femsense.fem.compliance import compliance, direction_rows, tangent_at, tangent_near
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
 
@@ -150,3 +150,13 @@ def test_a_body_that_nothing_holds_has_no_compliance() -> None:
     body = bar_body(MESH, clamped=False)
     with pytest.raises(FemsenseError, match="clamp more nodes"):
         compliance(body, solve_equilibrium(body))
+
+
+def test_the_kept_factor_answers_about_as_a_new_one_and_an_absent_one_exactly_so() -> None:
+    body = bar()
+    state = solve_equilibrium(body, tension=TENSION)
+    assert state.factor is not None
+    force = embed_points(body.mesh, POINTS[:1]).spread(DIRECTIONS[:1], len(MESH.nodes))[None]
+    exact = tangent_at(body, state).respond(force)
+    assert 0.0 < relative_error(tangent_near(body, state).respond(force), exact) < 0.02
+    np.testing.assert_array_equal(tangent_near(body, replace(state, factor=None)).respond(force), exact)

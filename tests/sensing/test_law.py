@@ -65,3 +65,11 @@ def test_a_robot_that_declares_its_law_keeps_it(tmp_path):
     model = learn(make_sensor(robot, recording, calibrate(robot, recording)))
     assert model.sensor.robot.body.material.law == "gent" and model.sensor.declares_law
     assert not moved_by_law(model, estimate_frame(model, 3, None).best).any()
+
+
+def test_without_contact_free_frames_a_warning_states_that_nothing_checks_the_frames(tmp_path):
+    recording = touched(tmp_path, np.array([0.0, 0.0, -0.3]), ball=True)
+    sensor = make_sensor(arm(), recording, calibrate(arm(), recording))
+    with pytest.warns(UserWarning, match="no contact-free frame can be used"):
+        model = learn(replace(sensor, recording=replace(recording, free=np.zeros(4, dtype=bool))))
+    assert model.limits is None
