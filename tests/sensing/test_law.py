@@ -45,9 +45,8 @@ def test_the_change_under_the_other_law_is_that_of_a_fit_with_the_other_law(push
     model, best = pushed
     there = with_law(model, "corotational")
     other = fit(there, best.frame, best.contacts, best.forces, best.state, tau=best.tau)
-    change = float(other.forces[0] @ best.axes[0][0] - best.forces[0] @ best.axes[0][0])
-    assert abs(change) > 0.01
-    assert float(moved_by_law(model, best) @ best.axes[0][0]) == pytest.approx(change, rel=0.15)
+    change = float(other.forces[0, 2] - best.forces[0, 2])  # across it the data hardly determine the force
+    assert abs(change) > 0.01 and moved_by_law(model, best)[2] == pytest.approx(change, rel=0.15)
 
 
 def test_the_difference_of_the_laws_is_part_of_the_covariance(pushed):
