@@ -251,6 +251,30 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
     return np.concatenate(scales), np.concatenate(at)
 
 
+def outward(at: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return the whitened gradient, halved, of λ log |f|² with λ = |f̃|², shape (3,): subtracted from f̃, it leaves no pull along the force.
+
+    Arguments:
+        at: f̃, shape (3,); scale: the prior scales of its components [N], shape (3,).
+    """
+    force = scale * at
+    return np.asarray((at @ at) * scale * force / (force @ force))
+
+
+def _freed(here: Point) -> list[int]:
+    """Return the contacts whose prior does not pull along the force: the visible ones whose τ the evidence chooses."""
+    return [i for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined and here.forces[i].any()]
+
+
+def _gained_along(here: Point, there: Point, at: FloatArray) -> float:
+    """Return Σ λ log(|f|²/|f₀|²) from one point to another, λ = |f̃₀|²; at: whitened parameters at the first one, shape (5m,)."""
+    return sum(
+        float(at[5 * i : 5 * i + 3] @ at[5 * i : 5 * i + 3])
+        * float(np.log(max(there.forces[i] @ there.forces[i], 1e-12) / (here.forces[i] @ here.forces[i])))
+        for i in _freed(here)
+    )
+
+
 def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
     """Return D: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
     n = len(here.state.positions)
@@ -275,6 +299,8 @@ class Step:
     """Decrease of Φ in the linear problem."""
     phi: float
     """Φ at the start of the step, with these prior scales."""
+    at: FloatArray
+    """Whitened forces and contact points there, shape (5m,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -303,7 +329,11 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
         scales = np.append(scale, np.ones(here.N.shape[1]))
         A = np.eye(len(scales)) + scales[:, None] * gram * scales
         covariance = np.linalg.inv(A)
-        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))))  # of the whitened parameters
+        pull = np.zeros(len(scales))
+        for i in _freed(here):
+            own = slice(5 * i, 5 * i + 3)
+            pull[own] = outward(at[own], scale[own])
+        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))) + pull)  # of the whitened parameters
         used = tau.copy()
         for i, contact in enumerate(here.contacts):
             own = slice(5 * i, 5 * i + 3)
@@ -315,7 +345,8 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
     change = minimum - np.append(at, eta)
     decrease = float(change @ A @ change)
     # The step belongs to the scales it was computed with; the next one is computed with those that follow from it.
-    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi + _prior(model, replace(here, tau=used)))
+    phi += _prior(model, replace(here, tau=used))
+    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi, at)
 
 
 def _descended(
@@ -333,7 +364,7 @@ def _descended(
         if there is None:
             continue
         eta, phi, _ = fit_nuisance(there.rows, there.residual, there.N, step.eta, kappa=kappa.of(there.rows.pixel))
-        phi += _prior(model, there)
+        phi += _prior(model, there) - _gained_along(here, there, step.at)
         if phi < step.phi:
             return Lower(there, eta, phi), False
         refused = True
@@ -366,7 +397,11 @@ def _finished(
     scale, at = whitened(model, here, trust=False)
     X = np.hstack([D * scale, here.N])
     A = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X
-    P = np.linalg.inv(A)
+    precision = A.copy()
+    for i in _freed(here):
+        own = slice(5 * i, 5 * i + 3)
+        precision[own, own] -= np.outer(at[own], at[own]) / float(at[own] @ at[own])
+    P = np.linalg.inv(precision)
     evidence = phi + _prior(model, here) + float(np.linalg.slogdet(A)[1])
     q = model.nuisance.root.shape[1]
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)

@@ -276,7 +276,7 @@ def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatA
     way = float(np.linalg.norm(state.positions[node] - sensor.robot.body.mesh.nodes[node]))
     shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way) * np.minimum(1.0, apart / sensor.error_field.length)
     tilt = np.sqrt(known.together) * shape.tilt_std(places - best)
-    return np.asarray(np.sqrt(max(0.5 * min(shape.std_m, FLOOR_STD), FACETS)**2 + shared**2 + tilt**2))
+    return np.asarray(np.sqrt(max(0.5 * min(shape.std_m, FLOOR_STD), FACETS) ** 2 + shared**2 + tilt**2))
 
 
 def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:
