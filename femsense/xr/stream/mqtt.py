@@ -22,7 +22,7 @@ from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.packet_limit import PacketLimit
-from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, STOP, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import PREFIX, RECEIVED, Kind, status_bytes, topic
 from femsense.xr.stream.server_thread import ServerThread
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ class MqttSink(MqttLink):
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
         super().__init__(address, WANTED)
         self.hub = hub
-        self._client.will_set(topic(robot, STATUS), status_bytes("lost"), qos=0, retain=True)
+        self._client.will_set(topic(robot, Kind.STATUS), status_bytes("lost"), qos=0, retain=True)
         self._waiting: dict[str, Message] = {}
         self._lock = Lock()
         self._packets = PacketLimit(f"{address.host}:{address.port}")
@@ -169,7 +169,7 @@ class MqttSink(MqttLink):
 
     def _hear(self, message: Message, *, kept: bool) -> None:
         """Pass on messages of others. Retained ones are no current requests and are ignored, except a stop."""
-        if not kept or message.topic.endswith(f"/{STOP}"):
+        if not kept or message.kind == Kind.STOP:
             self.hub.received(message, "MQTT")
 
     def _greet(self, *told: Any) -> None:
@@ -316,8 +316,7 @@ class EmbeddedBroker(ServerThread):
         await self._broker.shutdown()
 
     def _hear(self, message: Message, who: str) -> None:
-        known = split_topic(message.topic)
-        if known is not None and known[1] in RECEIVED:
+        if message.kind in RECEIVED:
             self._hub.received(message, who)
 
     def _take(self, messages: tuple[Message, ...]) -> None:

@@ -26,7 +26,7 @@ from femsense.core.errors import InputError
 from femsense.core.packages import needed
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import GLB, RECEIVED, split_topic, topic
+from femsense.xr.stream.payloads import RECEIVED, Kind, topic
 from femsense.xr.stream.quiet import stream_log
 from femsense.xr.stream.server_thread import ServerThread
 
@@ -186,7 +186,7 @@ class WebSocketServer(ServerThread):
         """Hand messages to all viewers; returns at once."""
         with self._lock:
             first = not self._fresh
-            self._fresh.update((message.topic, message) for message in messages if not message.topic.endswith(f"/{GLB}"))
+            self._fresh.update((message.topic, message) for message in messages if message.kind != Kind.GLB)
             first = first and bool(self._fresh)
         if first:
             self._call(self._hand_out)
@@ -233,7 +233,7 @@ class WebSocketServer(ServerThread):
             endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALLEST_BUFFER)
         viewer = _Viewer()
-        viewer.offer({name: message for name, message in self.hub.newest().items() if not name.endswith(f"/{GLB}")})
+        viewer.offer({name: message for name, message in self.hub.newest().items() if message.kind != Kind.GLB})
         self._viewers.add(viewer)
         self.visits += 1
         listening = asyncio.create_task(self._listen(connection, viewer))
@@ -297,7 +297,7 @@ class WebSocketServer(ServerThread):
     def _content(self, name: str) -> bytes | None:
         """Return a file of the page, or the mesh of a robot; no other file is read."""
         if name.startswith("robots/") and name.endswith(".glb"):
-            message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], GLB))
+            message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], Kind.GLB))
             return None if message is None else message.payload
         if name == "stream.json":
             return json.dumps({"format": "femsense-stream-1", "trouble": self.trouble()}).encode()
@@ -316,8 +316,7 @@ def _wanted(frame: str | bytes) -> Message | None:
         messages = list(unpack(frame))
     except InputError:
         return None
-    known = split_topic(messages[0].topic) if len(messages) == 1 else None
-    return messages[0] if known is not None and known[1] in RECEIVED else None
+    return messages[0] if len(messages) == 1 and messages[0].kind in RECEIVED else None
 
 
 def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = None) -> Response:
