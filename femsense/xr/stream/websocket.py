@@ -161,14 +161,8 @@ class WebSocketServer(ServerThread):
         self._fresh: dict[str, Message] = {}
         self._lock = Lock()
         self._tls = self.access.tls()
-        failed = self._start()
-        if failed is not None:
-            raise InputError(
-                "the stream cannot be served",
-                where=f"{self.access.host}, port {self.options.port}",
-                found=failed,
-                hint="port 0 takes a free one",
-            ) from None
+        where = f"{self.access.host}, port {self.options.port}"
+        self._start("the stream cannot be served", where=where, hint="port 0 takes a free one")
         hub.attach(self)
 
     @property
