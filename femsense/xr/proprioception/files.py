@@ -161,16 +161,15 @@ def _read_markers(
             expected=f"frames {frames[0]} … {frames[-1]}" if len(frames) else "rows",
             hint=did_you_mean(str(numbers[0]), [str(frame) for frame in frames[:50]]),
         )
-    poses_of_rows, turned = _poses_of_rows(table, poses, path), _turned(table, path)
+    T, turned = _poses_of_rows(table, poses, path), _turned(table, path)
+    places = np.einsum("kij,kj->ki", T[:, :3, :3], table.numbers(PLACE_COLUMNS)) + T[:, :3, 3]
     at = rows[known], np.array([names.index(label) for label in labels])[known]
     total, seen = np.zeros((len(frames), len(names), 3)), np.zeros((len(frames), len(names), 1))
-    np.add.at(
-        total, at, np.einsum("kij,kj->ki", poses_of_rows, np.insert(table.numbers(PLACE_COLUMNS), 3, 1.0, axis=1))[known, :3]
-    )
+    np.add.at(total, at, places[known])
     np.add.at(seen, at, 1.0)
     turns = None if turned is None else np.full((len(frames), len(names), 3, 3), np.nan)
     if turns is not None and turned is not None:
-        turns[at] = (poses_of_rows[:, :3, :3] @ turned)[known]
+        turns[at] = (T[:, :3, :3] @ turned)[known]
     return names, np.divide(total, seen, out=np.full_like(total, np.nan), where=seen > 0), turns
 
 

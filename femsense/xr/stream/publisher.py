@@ -41,8 +41,6 @@ class PublishOptions:
     """Of clouds and fields: they are large."""
     json_mirror: bool = False
     """Also `pose_json`, for clients that read only text."""
-    glb_url: str = ""
-    """Address of the mesh; by default next to the page."""
     waits_for: str = FIRST_POSE
     """What the stream waits for before the first pose, in words."""
 
@@ -90,8 +88,7 @@ class Publisher:
         """Send the description; also later, when it has changed."""
         self.twin = twin
         glb = topic(twin.name, Kind.GLB)
-        url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
-        model = Message(topic(twin.name, Kind.MODEL), model_bytes(twin, url))
+        model = Message(topic(twin.name, Kind.MODEL), model_bytes(twin, f"robots/{glb.split('/')[1]}.glb"))
         with self._lock:
             self.hub.publish([Message(glb, twin.glb), model, self._status(*self._said)])
 
