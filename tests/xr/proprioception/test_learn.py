@@ -64,11 +64,11 @@ def test_the_papers_network_finds_a_curved_map_and_is_not_misled_by_noise() -> N
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, size=(300, 3))
     clean = lambda x: np.stack([np.sin(x[:, 0]), x[:, 0] * x[:, 1]], axis=1)  # noqa: E731
-    network = train_bayesian(x, clean(x) + 0.1 * rng.normal(size=(300, 2)), rng=rng)
+    network = train_bayesian(x, clean(x) + 0.1 * rng.normal(size=(300, 2)), seed=1)
     fresh = rng.uniform(-2, 2, size=(500, 3))
     assert np.sqrt(((network(fresh) - clean(fresh)) ** 2).mean()) < 0.06
     # of pure noise almost nothing is learnt, where least squares with 62 weights would follow it
-    noise = train_bayesian(x, rng.normal(size=(300, 1)), rng=rng)
+    noise = train_bayesian(x, rng.normal(size=(300, 1)), seed=1)
     assert noise(fresh).std() < 0.25
 
 
@@ -78,7 +78,7 @@ def test_training_does_not_care_for_units() -> None:
     y = np.stack([np.tanh(x[:, 0]), x[:, 1]], axis=1)
     scale, shift = np.array([1e3, 1e-3]), np.array([7.0, -2.0])
     for train in (
-        lambda x, y: train_bayesian(x, y, rng=np.random.default_rng(5), steps=30),
+        lambda x, y: train_bayesian(x, y, seed=5, steps=30),
         lambda x, y: train_ridge(x, y, penalty=1e-3),
         lambda x, y: train_radial(x, y, penalty=1e-3, length=1.0, noise=1e-2),
     ):
