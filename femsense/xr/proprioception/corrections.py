@@ -14,6 +14,7 @@ the maps that it selected had errors up to 1.47 times as large as the best one, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,19 +79,19 @@ class Frames:
 
     def errors(self, name: str) -> FloatArray:
         """Return the errors of a correction on blocks in time that it was not fitted to [m], shape (n, 3 m)."""
-        errors = np.empty_like(self.targets)
-        for held in folds(len(self.targets), BLOCKS):
-            network = corrected(self.select(~held), name)
-            errors[held] = network(self.inputs[held]) - self.targets[held]
-        return errors
+        return np.concatenate([network(other.inputs) - other.targets for network, _, other in self._in_turn(name)])
 
     def held_out(self, name: str) -> HeldOut:
         """Return the same errors with the predictive variance of the corrected networks."""
-        found = []
-        for k, held in enumerate(folds(len(self.targets), BLOCKS)):
-            known, other = self.select(~held), self.select(held)
-            found.append(errors_of(corrected(known, name), known.inputs, other.inputs, other.targets, group=k))
-        return HeldOut.joined(found)
+        parts = enumerate(self._in_turn(name))
+        found = (errors_of(network, known.inputs, other.inputs, other.targets, group=k) for k, (network, known, other) in parts)
+        return HeldOut.joined(list(found))
+
+    def _in_turn(self, name: str) -> Iterator[tuple[Network, Frames, Frames]]:
+        """Yield the network with a correction, the frames that it was fitted to, and a block in time of others."""
+        for held in folds(len(self.targets), BLOCKS):
+            known = self.select(~held)
+            yield corrected(known, name), known, self.select(held)
 
 
 def explain(frames: Frames) -> tuple[str, dict[str, float]]:

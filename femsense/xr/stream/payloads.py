@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, freeze
-from femsense.core.errors import InputError
+from femsense.core.arrays import FloatArray
 from femsense.xr.landmarks import Landmarks
 
 PREFIX = "femsense"
@@ -60,17 +59,7 @@ FRAMES = {"robot": "robot: right-handed, Z up", "markers": "markers: as they wer
 POSE_HEAD = struct.Struct("<4sIdHH")
 CLOUD_HEAD = struct.Struct("<4sIdI")
 POSE_MAGIC, CLOUD_MAGIC, FIELD_MAGIC = b"FSP1", b"FSC1", b"FSV1"
-MOST_BONES, MOST_POINTS = 255, 20_000
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Pose:
-    """The bones of a robot at one time."""
-
-    seq: int
-    time_s: float
-    bones: npt.NDArray[np.float32]
-    """x y z [m] and the quaternion x y z w of each bone, robot frame, shape (B, 7)."""
+MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -157,7 +146,7 @@ class TwinFrame:
 
     time_s: float
     bones: npt.NDArray[np.float32]
-    """As in `Pose`, shape (B, 7)."""
+    """x y z [m] and the quaternion x y z w of each bone, shape (B, 7)."""
     contacts: tuple[Contact, ...] | None = ()
     """None: no estimator runs."""
     inputs: tuple[float, ...] = ()
@@ -206,20 +195,6 @@ def pose_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes
     """Return a pose message of bones, shape (B, 7)."""
     head = POSE_HEAD.pack(POSE_MAGIC, seq & 0xFFFFFFFF, time_s, len(bones), 0)
     return head + np.ascontiguousarray(bones, dtype="<f4").tobytes()
-
-
-def read_pose(payload: bytes) -> Pose:
-    """Return the pose in a message. Raises InputError."""
-    if len(payload) < POSE_HEAD.size:
-        raise InputError("not a pose", where="payload", found=f"{len(payload)} bytes", expected="a header of 20 bytes")
-    magic, seq, time_s, count, _ = POSE_HEAD.unpack_from(payload)
-    size = POSE_HEAD.size + 28 * count
-    if magic != POSE_MAGIC or len(payload) != size or count > MOST_BONES:
-        raise InputError(
-            "not a pose", where="payload", found=f"{magic!r}, {count} bones, {len(payload)} bytes", expected=f"FSP1, {size} bytes"
-        )
-    bones = np.frombuffer(payload, "<f4", 7 * count, POSE_HEAD.size).reshape(count, 7)
-    return Pose(seq, time_s, freeze(bones, np.float32))
 
 
 def cloud_bytes(seq: int, time_s: float, points: npt.ArrayLike) -> bytes:
