@@ -224,13 +224,8 @@ def _verdict(frames: Frames, chosen: str, stated: float) -> str:
         said.append("one channel shifted")
     if "base" in chosen and is_better(frames.errors("base"), errors):
         said.append("base moved")
-    if (
-        not said
-        or "zeros" in chosen
-        or "line" in chosen
-        or AFRESH in chosen
-        or 1e3 * error_interval(frames.errors(chosen))[0] > AS_BEFORE * stated
-    ):
+    is_map = any(word in chosen for word in ("zeros", "line", AFRESH))
+    if not said or is_map or 1e3 * error_interval(frames.errors(chosen))[0] > AS_BEFORE * stated:
         said.append("map changed")
     return " and ".join(said)
 

@@ -204,7 +204,7 @@ def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | No
         return True
     stranger = MqttSource(replace(address, user=None, password=None), lambda _: None)
     answered = stranger.answered.wait(timeout_s)
-    accepted = stranger.connected.is_set()
+    accepted = stranger.was_connected
     stranger.close()
     return accepted if answered else None
 
