@@ -10,7 +10,6 @@ import numpy as np
 
 from femsense.control.motion import CONVERGING, NEAREST, REACHED, Motion
 from femsense.core.arrays import FloatArray
-from femsense.xr.stream.lease import Claim
 from femsense.xr.stream.payloads import Input, read_document
 
 LONGEST = 4096
@@ -21,9 +20,16 @@ LONGEST_NAME = 64
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Wish:
-    """The requested position of a point."""
+    """The requested position of a point, and by whom."""
 
-    claim: Claim
+    way: str
+    """How it came: the connection of a WebSocket, the name of a broker's client, or the broker."""
+    client: str
+    seq: int
+    number: int
+    """Number of the lease; 0: a request for one."""
+    held: bool
+    armed: bool
     handle: str
     target_m: FloatArray | None
     """Robot frame, shape (3,)."""
@@ -37,8 +43,8 @@ def read_wish(payload: bytes, way: str) -> Wish | None:
     client, seq, number = told.get("client"), told.get("seq"), told.get("lease", 0)
     if not isinstance(client, str) or not 0 < len(client) <= LONGEST_NAME or type(seq) is not int or type(number) is not int:
         return None
-    claim = Claim(way, client, seq, number, told.get("held") is True, told.get("armed") is True)
-    return Wish(claim, str(told.get("handle")), place_of(told.get("target_m")))
+    held, armed = told.get("held") is True, told.get("armed") is True
+    return Wish(way, client, seq, number, held, armed, str(told.get("handle")), place_of(told.get("target_m")))
 
 
 def in_plain_words(motion: Motion) -> str:

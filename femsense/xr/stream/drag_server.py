@@ -179,7 +179,7 @@ class DragServer:
         if wish is None or not self._can_be_meant(wish):
             return
         with self._lock:
-            ruling = self.lease.rule(wish.claim, now)
+            ruling = self.lease.rule(wish, now)
             if ruling is Ruling.RELEASED:
                 self._let_go()
             elif ruling in (Ruling.GRANTED, Ruling.RENEWED):
@@ -187,7 +187,7 @@ class DragServer:
                     self._let_go()
                     self._grabbed = True
                 if ruling is Ruling.RENEWED:
-                    self.gate.hold(now, armed=wish.claim.armed)
+                    self.gate.hold(now, armed=wish.armed)
                 self._wish = wish
         if ruling is not Ruling.RENEWED:
             self._say_who_steers()
@@ -200,7 +200,7 @@ class DragServer:
 
     def _can_be_meant(self, wish: Wish) -> bool:
         """Return whether a wish is for a marker of the robot, and not far away from it."""
-        if not wish.claim.held:
+        if not wish.held:
             return True
         return wish.handle in self.robot.glued_names and wish.target_m is not None and self._is_near(wish.target_m)
 
@@ -229,7 +229,7 @@ class DragServer:
         begun, target = time.perf_counter(), np.asarray(target_m, dtype=np.float64)
         with self._lock:
             turn, grabbed, self._grabbed = self.gate.turn, self._grabbed, False
-            moves = self.options.gate.allowed and self._wish is not None and self._wish.claim.armed
+            moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
             current = {**self.gate.last, **self._current()} if moves else self._shown()
             last, since = self._motion, self._settled()
             wanted = self.feedback.target(

@@ -1,16 +1,16 @@
-"""A server with its asyncio loop in a thread of its own."""
+"""A server with its asyncio loop in a thread of its own, and the log of libraries on broken connections."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from threading import Thread
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.xr.stream.quiet import stream_log
 
 LEAVE_S = 3.0
 """Time that clients have to leave when a server ends [s]."""
@@ -71,3 +71,15 @@ class ServerThread(ABC):
 def _noted(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Log an exception of a background task, which would otherwise be printed."""
     stream_log().error(context["message"], exc_info=context.get("exception"))
+
+
+def stream_log() -> logging.Logger:
+    """Return the log `femsense.stream` of library messages on broken connections, which prints nothing by default.
+
+    A client that disconnects, or fails a handshake, is not an error of the program. `connecting` reports why there is no connection.
+    """
+    log = logging.getLogger("femsense.stream")
+    if not log.handlers:
+        log.addHandler(logging.NullHandler())
+        log.propagate = False
+    return log

@@ -26,8 +26,7 @@ from femsense.core.packages import needed
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import RECEIVED, Kind, topic
-from femsense.xr.stream.quiet import stream_log
-from femsense.xr.stream.server_thread import ServerThread
+from femsense.xr.stream.server_thread import ServerThread, stream_log
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
