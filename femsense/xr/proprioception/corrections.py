@@ -38,7 +38,8 @@ RESAMPLED = 12
 """Number of blocks in time for the bootstrap, because neighbouring frames are correlated."""
 ZERO_STD = 0.1
 """Of a sensor's zero, in spreads of its channel."""
-ZERO_STEPS = 3
+ZERO_STEPS = 5
+"""States at which the zeros of all sensors are judged, at most: the fit is nearly linear."""
 SCANNED = 12
 """Shifts of a channel that are tried, over its range to either side, before the best is refined."""
 SCAN_ROWS = 200
@@ -207,19 +208,17 @@ def _left(frames: Frames, shift: Shift, moved: bool) -> float:
 
 
 def _with_zeros(network: Network, inputs: FloatArray, targets: FloatArray) -> Network:
-    """Return the network whose sensors have other zeros, found by Gauss–Newton steps with a prior."""
+    """Return the network whose sensors have other zeros: the likeliest with a prior."""
+    from scipy.optimize import least_squares
+
     noise = max(marker_rms(network(inputs) - targets) / 10.0, 1e-6)
-    spread = np.where(network.scale > 0, 1.0 / np.where(network.scale > 0, network.scale, 1.0), 0.0)
+    spread = np.divide(1.0, network.scale, out=np.zeros_like(network.scale), where=network.scale > 0)
     if network.units == Units.RADIAL:
         spread = spread * np.median(np.abs(network.normalised(inputs)))
-    offset = np.zeros(len(spread))
-    for _ in range(ZERO_STEPS):
-        base = network(inputs - offset)
-        columns = [(network(inputs - offset - 1e-4 * step) - base).ravel() / 1e-4 for step in np.diag(spread)]
-        J = np.stack(columns, axis=1) / noise
-        left = (targets - base).ravel() / noise
-        share = np.divide(offset, spread, out=np.zeros_like(offset), where=spread > 0)
-        system = J.T @ J / len(inputs) + np.eye(len(spread)) / (ZERO_STD**2 * len(inputs))
-        gradient = J.T @ left / len(inputs) - share / (ZERO_STD**2 * len(inputs))
-        offset = offset + spread * np.linalg.solve(system, gradient)
-    return replace(network, centre=network.centre + offset)
+
+    def residuals(shares: FloatArray) -> FloatArray:
+        left = (network(inputs - shares * spread) - targets) / noise
+        return np.concatenate([left.ravel(), shares / ZERO_STD])
+
+    shares = least_squares(residuals, np.zeros(len(spread)), max_nfev=ZERO_STEPS).x
+    return replace(network, centre=network.centre + shares * spread)
