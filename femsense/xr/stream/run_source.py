@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
@@ -38,12 +38,10 @@ class RunStream:
 
     twin: Twin
     skin: AnimatedSkin
-    frames: tuple[Mapping[str, Any], ...]
-    """As `contacts_of_run` has them, one for each pose."""
+    frames: tuple[TwinFrame, ...]
+    """One for each pose, without its cloud."""
     clouds: MeasuredClouds
     """Measured points and residuals of each pose, if the recording still exists."""
-    field: npt.NDArray[np.uint8]
-    """Share of the largest stress at each vertex of each pose, 0 … 255, shape (F, v)."""
 
     @property
     def duration_s(self) -> float:
@@ -78,8 +76,8 @@ def open_run(folder: str | Path, *, clouds: bool = True) -> RunStream:
         duration_s=float(skin.time_s[-1]),
         field=FieldKind(**told["field"], largest=stress.largest),
     )
-    frames = tuple(told["frames"])
-    return RunStream(twin, skin, frames, MeasuredClouds(_clouds_of(run, frames) if clouds else ()), stress.shares)
+    frames = tuple(_frame(*pose) for pose in zip(told["frames"], skin.bones, stress.shares))
+    return RunStream(twin, skin, frames, MeasuredClouds(_clouds_of(run, frames) if clouds else ()))
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:
@@ -96,12 +94,12 @@ def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) ->
     while True:
         for k in range(count):
             t = min(k / rate_hz, stream.duration_s)
-            yield _frame(stream, t, offset + t, int(np.abs(times - t).argmin()))
+            yield _at(stream, t, offset + t, int(np.abs(times - t).argmin()))
         if not loop:
             return
         waiting = int(PAUSE_S * rate_hz)
         for k in range(waiting):
-            yield _frame(stream, stream.duration_s, offset + stream.duration_s + (k + 1) / rate_hz, len(times) - 1)
+            yield _at(stream, stream.duration_s, offset + stream.duration_s + (k + 1) / rate_hz, len(times) - 1)
         offset += stream.duration_s + (waiting + 1) / rate_hz
 
 
@@ -116,19 +114,23 @@ def between(times: FloatArray, bones: npt.NDArray[np.float32], t: float) -> npt.
     return np.asarray(rows)
 
 
-def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFrame:
-    told = stream.frames[nearest]
+def _at(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFrame:
+    """Return the frame of a time in the run [s], sent at a time of the stream [s]."""
+    bones = between(stream.skin.time_s, stream.skin.bones, t)
+    return replace(stream.frames[nearest], time_s=sent_at, run_s=t, bones=bones, cloud=stream.clouds.at(nearest))
+
+
+def _frame(told: Mapping[str, Any], bones: npt.NDArray[np.float32], field: npt.NDArray[np.uint8]) -> TwinFrame:
+    """Return a frame of `contacts_of_run` with the bones and the field of its pose."""
     return TwinFrame(
-        time_s=sent_at,
-        bones=between(stream.skin.time_s, stream.skin.bones, t),
+        time_s=told["time_s"],
+        bones=bones,
         contacts=tuple(_contact(c) for c in told["contacts"] if c["point_m"] and c["force_vector_n"]),
         inputs=tuple(_or_nan(value) for value in told["inputs"] or ()),
         residual_m=_or_nan(told["rms_after_m"]),
         status=told["status"] or "",
         frame=-1 if told["frame"] is None else told["frame"],
-        run_s=t,
-        cloud=stream.clouds.at(nearest),
-        field=stream.field[nearest],
+        field=field,
     )
 
 
@@ -185,7 +187,7 @@ class MeasuredClouds:
                 return
 
 
-def _clouds_of(run: Path, frames: Iterable[Mapping[str, Any]]) -> Iterator[Cloud | None]:
+def _clouds_of(run: Path, frames: Iterable[TwinFrame]) -> Iterator[Cloud | None]:
     """Yield the cloud of each pose of a run; nothing if its recording no longer exists."""
     from femsense.calib.files import read_calibration
     from femsense.io.recording_folder import load_recording
@@ -200,7 +202,7 @@ def _clouds_of(run: Path, frames: Iterable[Mapping[str, Any]]) -> Iterator[Cloud
         return
     numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
     for frame, nodes in zip(frames if recording.has_clouds else (), states.nodes_m):
-        number = numbers.get(frame["frame"])
+        number = numbers.get(frame.frame)
         points = None if number is None else _points(recording, number, poses)
         yield None if points is None else with_residuals(points, nodes, states.tets)
 
