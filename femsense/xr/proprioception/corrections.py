@@ -95,14 +95,14 @@ class Frames:
             yield corrected(known, name), known, self.select(held)
 
 
-def explain(frames: Frames) -> tuple[str, dict[str, float]]:
-    """Return the correction that explains labelled frames, and the error of each on frames it was not fitted to [m]."""
+def explain(frames: Frames) -> tuple[str, dict[str, FloatArray]]:
+    """Return the correction that explains labelled frames, and the errors of each on frames it was not fitted to [m], shape (n, 3 m)."""
     errors = {name: frames.errors(name) for name in CORRECTIONS}
     chosen = SIMPLE[0]
     for name in (*SIMPLE[1:], min(LINEAR, key=lambda name: float(marker_distances(errors[name]).mean()))):
         if is_better(errors[name], errors[chosen]):
             chosen = name
-    return chosen, {name: marker_rms(found) for name, found in errors.items()}
+    return chosen, errors
 
 
 def is_better(errors: FloatArray, than: FloatArray) -> bool:

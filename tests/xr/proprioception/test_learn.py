@@ -392,5 +392,5 @@ def test_two_frames_beyond_the_others_do_not_select_the_stiffest_map() -> None:
     bent = np.column_stack([np.where(np.abs(x[:, 0]) > 1, 0.2 * np.sign(x[:, 0]), x[:, 0]), x[:, 1]])
     y = bent @ np.array([[0.03, 0.0, 0.01], [0.01, 0.02, 0.0]]) + 2e-4 * rng.normal(size=(40, 3))
     other_day = train_ridge(rng.uniform(-1, 1, (50, 2)), 0.05 * rng.normal(size=(50, 3)), penalty=1.0)
-    chosen, left = explain(Frames(other_day, x, y, np.full(2, 2.0)))
-    assert chosen == "afresh 0.0001" and min(LINEAR, key=lambda name: left[name]) == "base, line 1.0"
+    chosen, errors = explain(Frames(other_day, x, y, np.full(2, 2.0)))
+    assert chosen == "afresh 0.0001" and min(LINEAR, key=lambda name: marker_rms(errors[name])) == "base, line 1.0"
