@@ -17,7 +17,7 @@ from femsense.xr.stream.access import Access, read_password, without_password
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, broker_address, lets_anybody_in
-from femsense.xr.stream.payloads import MEASURED, Twin, TwinFrame, measured_bytes, topic
+from femsense.xr.stream.payloads import Kind, Twin, TwinFrame, measured_bytes, topic
 from femsense.xr.stream.publisher import FIRST_POSE, Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 from femsense.xr.view import PAGE, live_page_files
@@ -224,7 +224,7 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path, say: Cal
 
     def run() -> None:
         for seq, (time_s, markers, why) in enumerate(markers_of_sensors(readings, model)):
-            message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers, why))
+            message = Message(topic(twin.name, Kind.MEASURED), measured_bytes(seq, time_s, markers, why))
             live.hub.publish([message])
             live.hub.received(message, "sensors")
             live.stop.wait(1.0 / MEASURED_HZ)

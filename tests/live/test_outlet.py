@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import write_block_robot
 from rich.console import Console
+from streams import bones_of
 
 from femsense.core.arrays import freeze
 from femsense.io.robot_toml import load_robot
@@ -25,7 +26,6 @@ from femsense.live.senser import Answer
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import read_pose
 
 SLOW = SessionEvent(Notice.SLOW_LINK, "use a USB 3 port", 92.0, float("inf"))
 JUMPS = SessionEvent(Notice.STAMPS_JUMP, "by 100.0 s", 93.0, 96.0, count=2)
@@ -139,7 +139,7 @@ def test_a_session_streams_poses_forces_and_its_state_and_never_an_old_force_as_
     now = time.monotonic()
     outlet.show(answer_of(robot, shift=0.01), now)
     newest = {name: message.payload for name, message in hub.newest().items()}
-    bones, rest = read_pose(newest["femsense/block/pose"]).bones, outlet.publisher.twin.T_robot_bone[:, :3, 3]
+    bones, rest = bones_of(newest["femsense/block/pose"]), outlet.publisher.twin.T_robot_bone[:, :3, 3]
     assert bones[:, :3] == pytest.approx(rest + np.array([0.01, 0.0, 0.0]), abs=2e-4)
     force = json.loads(newest["femsense/block/force"])
     assert force["contacts"][0]["size_n"] == pytest.approx(1.118, abs=1e-3) and force["status"] == "ok"

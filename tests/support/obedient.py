@@ -9,7 +9,7 @@ import numpy as np
 
 import femsense as fs
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import COMMAND, INPUTS, MEASURED, Input, inputs_bytes, measured_bytes, topic
+from femsense.xr.stream.payloads import Input, Kind, inputs_bytes, measured_bytes, topic
 
 
 class ObedientRobot:
@@ -32,7 +32,7 @@ class ObedientRobot:
 
     def send(self, messages: tuple[Message, ...]) -> None:
         for message in messages:
-            if message.topic == topic(self.name, COMMAND):
+            if message.topic == topic(self.name, Kind.COMMAND):
                 self.obey(json.loads(message.payload))
 
     def obey(self, told: dict[str, object]) -> None:
@@ -41,7 +41,7 @@ class ObedientRobot:
             self.inputs = {row["name"]: row["value"] for row in told["inputs"]}  # type: ignore[attr-defined, index, union-attr]
             self.heard.append((time.monotonic(), dict(self.inputs)))
         values = [self.inputs[one.name] for one in self.kinds]
-        self.hub.publish([Message(topic(self.name, INPUTS), inputs_bytes(0, 0.0, self.kinds, values))])
+        self.hub.publish([Message(topic(self.name, Kind.INPUTS), inputs_bytes(0, 0.0, self.kinds, values))])
 
     def place(self, marker: int) -> np.ndarray:
         """Where a marker rests under the inputs [m]."""
@@ -51,7 +51,7 @@ class ObedientRobot:
         """Say where the markers are, as motion capture would: to a tenth of a millimetre."""
         state = self.state()
         places = self.robot.markers.positions(state.positions) + 1e-4 * self._rng.normal(size=(len(names), 3))
-        self.hub.received(Message(topic(self.name, MEASURED), measured_bytes(0, 0.0, dict(zip(names, places)))), "capture")
+        self.hub.received(Message(topic(self.name, Kind.MEASURED), measured_bytes(0, 0.0, dict(zip(names, places)))), "capture")
 
     def state(self) -> fs.Equilibrium:
         """The equilibrium under the inputs; where there is a post, no node of the body's top rises above it."""

@@ -60,6 +60,11 @@ def read_frame(frame: bytes) -> dict[str, bytes]:
     return found
 
 
+def bones_of(pose: bytes) -> np.ndarray:
+    """The seven numbers of each bone of a pose message."""
+    return np.frombuffer(pose, "<f4", offset=20).reshape(-1, 7)
+
+
 def x_of(pose: bytes) -> float:
     """The x of the second bone of a pose message, by its offset in the bytes."""
     return float(struct.unpack_from("<f", pose, 20 + 28)[0])

@@ -42,19 +42,19 @@ class _Weights:
         return _Weights(self.hidden + step[:first].reshape(self.hidden.shape), self.out + step[first:].reshape(self.out.shape))
 
 
-def train_bayesian(x: FloatArray, y: FloatArray, *, rng: np.random.Generator, steps: int = STEPS) -> Network:
+def train_bayesian(x: FloatArray, y: FloatArray, *, seed: int, steps: int = STEPS) -> Network:
     """Return the paper's network.
 
     Arguments:
         x: inputs, shape (n, d).
         y: outputs, shape (n, o).
-        rng: for the weights at the start.
+        seed: of the weights at the start.
         steps: Levenberg–Marquardt steps at most.
     """
     centre, scale = x.mean(axis=0), inverse_spread(x)
     middle, size = y.mean(axis=0), 1.0 / float(inverse_spread(y.ravel()[:, None])[0])
     z = np.hstack([(x - centre) * scale, np.ones((len(x), 1))])
-    weights = _minimise(z, (y - middle) / size, _start(z, y.shape[1], rng), steps)
+    weights = _minimise(z, (y - middle) / size, _start(z, y.shape[1], np.random.default_rng(seed)), steps)
     A, d = size * weights.out[:, :-1], middle + size * weights.out[:, -1]
     return Network(
         Units.SIGMOID, centre, scale, weights.hidden[:, :-1], weights.hidden[:, -1], A, np.zeros((len(d), x.shape[1])), d

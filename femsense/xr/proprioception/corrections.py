@@ -14,6 +14,7 @@ the maps that it selected had errors up to 1.47 times as large as the best one, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +38,8 @@ RESAMPLED = 12
 """Number of blocks in time for the bootstrap, because neighbouring frames are correlated."""
 ZERO_STD = 0.1
 """Of a sensor's zero, in spreads of its channel."""
-ZERO_STEPS = 3
+ZERO_STEPS = 5
+"""States at which the zeros of all sensors are judged, at most: the fit is nearly linear."""
 SCANNED = 12
 """Shifts of a channel that are tried, over its range to either side, before the best is refined."""
 SCAN_ROWS = 200
@@ -78,29 +80,29 @@ class Frames:
 
     def errors(self, name: str) -> FloatArray:
         """Return the errors of a correction on blocks in time that it was not fitted to [m], shape (n, 3 m)."""
-        errors = np.empty_like(self.targets)
-        for held in folds(len(self.targets), BLOCKS):
-            network = corrected(self.select(~held), name)
-            errors[held] = network(self.inputs[held]) - self.targets[held]
-        return errors
+        return np.concatenate([network(other.inputs) - other.targets for network, _, other in self._in_turn(name)])
 
     def held_out(self, name: str) -> HeldOut:
         """Return the same errors with the predictive variance of the corrected networks."""
-        found = []
-        for k, held in enumerate(folds(len(self.targets), BLOCKS)):
-            known, other = self.select(~held), self.select(held)
-            found.append(errors_of(corrected(known, name), known.inputs, other.inputs, other.targets, group=k))
-        return HeldOut.joined(found)
+        parts = enumerate(self._in_turn(name))
+        found = (errors_of(network, known.inputs, other.inputs, other.targets, group=k) for k, (network, known, other) in parts)
+        return HeldOut.joined(list(found))
+
+    def _in_turn(self, name: str) -> Iterator[tuple[Network, Frames, Frames]]:
+        """Yield the network with a correction, the frames that it was fitted to, and a block in time of others."""
+        for held in folds(len(self.targets), BLOCKS):
+            known = self.select(~held)
+            yield corrected(known, name), known, self.select(held)
 
 
-def explain(frames: Frames) -> tuple[str, dict[str, float]]:
-    """Return the correction that explains labelled frames, and the error of each on frames it was not fitted to [m]."""
+def explain(frames: Frames) -> tuple[str, dict[str, FloatArray]]:
+    """Return the correction that explains labelled frames, and the errors of each on frames it was not fitted to [m], shape (n, 3 m)."""
     errors = {name: frames.errors(name) for name in CORRECTIONS}
     chosen = SIMPLE[0]
     for name in (*SIMPLE[1:], min(LINEAR, key=lambda name: float(marker_distances(errors[name]).mean()))):
         if is_better(errors[name], errors[chosen]):
             chosen = name
-    return chosen, {name: marker_rms(found) for name, found in errors.items()}
+    return chosen, errors
 
 
 def is_better(errors: FloatArray, than: FloatArray) -> bool:
@@ -206,19 +208,17 @@ def _left(frames: Frames, shift: Shift, moved: bool) -> float:
 
 
 def _with_zeros(network: Network, inputs: FloatArray, targets: FloatArray) -> Network:
-    """Return the network whose sensors have other zeros, found by Gauss–Newton steps with a prior."""
+    """Return the network whose sensors have other zeros: the likeliest with a prior."""
+    from scipy.optimize import least_squares
+
     noise = max(marker_rms(network(inputs) - targets) / 10.0, 1e-6)
-    spread = np.where(network.scale > 0, 1.0 / np.where(network.scale > 0, network.scale, 1.0), 0.0)
+    spread = np.divide(1.0, network.scale, out=np.zeros_like(network.scale), where=network.scale > 0)
     if network.units == Units.RADIAL:
         spread = spread * np.median(np.abs(network.normalised(inputs)))
-    offset = np.zeros(len(spread))
-    for _ in range(ZERO_STEPS):
-        base = network(inputs - offset)
-        columns = [(network(inputs - offset - 1e-4 * step) - base).ravel() / 1e-4 for step in np.diag(spread)]
-        J = np.stack(columns, axis=1) / noise
-        left = (targets - base).ravel() / noise
-        share = np.divide(offset, spread, out=np.zeros_like(offset), where=spread > 0)
-        system = J.T @ J / len(inputs) + np.eye(len(spread)) / (ZERO_STD**2 * len(inputs))
-        gradient = J.T @ left / len(inputs) - share / (ZERO_STD**2 * len(inputs))
-        offset = offset + spread * np.linalg.solve(system, gradient)
-    return replace(network, centre=network.centre + offset)
+
+    def residuals(shares: FloatArray) -> FloatArray:
+        left = (network(inputs - shares * spread) - targets) / noise
+        return np.concatenate([left.ravel(), shares / ZERO_STD])
+
+    shares = least_squares(residuals, np.zeros(len(spread)), max_nfev=ZERO_STEPS).x
+    return replace(network, centre=network.centre + shares * spread)

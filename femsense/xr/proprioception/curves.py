@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, spread_evenly
+from femsense.core.arrays import FloatArray, spread_evenly
 from femsense.xr.proprioception.linear import train_radial
 from femsense.xr.proprioception.network import Network
 from femsense.xr.proprioception.selection import MOST_ROWS, folds
@@ -39,10 +39,6 @@ class Curve:
     def deviation(self, z: FloatArray) -> FloatArray:
         """Return how far readings, shape (n, c), are off, shape (n,)."""
         return np.asarray(z[:, self.channel] - self.network(z)[:, 0])
-
-    def inside(self, z: FloatArray) -> BoolArray:
-        """Return which readings, shape (n, c), are near enough, shape (n,)."""
-        return np.asarray(np.abs(self.deviation(z)) <= self.half)
 
 
 def learn_curves(z: FloatArray, lines: FloatArray) -> tuple[Curve, ...]:

@@ -10,6 +10,7 @@ is more accurate (`curves`).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -96,11 +97,14 @@ class Domain:
         Channels that are not `needed`, shape (c,), and have no finite reading are ignored, and the others are judged without them.
         """
         lost = ~np.isfinite(row) & (True if needed is None else needed)
-        missing = [Outside(channels[i], Why.MISSING, float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost)]
-        if missing:
-            return tuple(missing)
-        found = self._range(row, channels) or self._joint(row, channels)
-        return tuple(sorted(found, key=lambda item: -item.far))
+        if lost.any():
+            return tuple(Outside(channels[i], Why.MISSING, float(row[i]), 0.0, 0.0, np.inf) for i in np.flatnonzero(lost))
+        found = [
+            Outside(name, Why.RANGE if np.isfinite(far) else Why.STILL, value, low, high, far)
+            for name, value, low, high, far in zip(channels, *(x.tolist() for x in (row, self.low, self.high, self._beyond(row))))
+            if far > MARGIN
+        ]
+        return tuple(sorted(found or self._off_together(row, channels), key=lambda item: -item.far))
 
     def filled(self, row: FloatArray) -> FloatArray:
         """Return a row, shape (c,), with the linear prediction from the other channels in place of values that are not finite.
@@ -118,14 +122,14 @@ class Domain:
     def inside(self, rows: FloatArray) -> BoolArray:
         """Return which rows, shape (n, c), are inside, shape (n,)."""
         inside = np.asarray(np.isfinite(rows).all(axis=1))
-        inside[inside] = (self._far(rows[inside]) <= MARGIN).all(axis=1)
+        inside[inside] = (self._beyond(rows[inside]) <= MARGIN).all(axis=1)
         z = self._normalised(rows[inside])
-        together = (np.abs(self._deviation(z)) <= JOINT_MARGIN * self.limit).all(axis=1)
-        inside[inside] = np.logical_and.reduce([together, *(curve.inside(z) for curve in self.curves)])
+        together = [np.abs(off) <= half for _, off, half in self._relations(z, np.ones(z.shape[1], dtype=bool))]
+        inside[inside] = np.all(together, axis=0)
         return inside
 
-    def _far(self, rows: FloatArray) -> FloatArray:
-        """Return how far the channels of rows, shape (n, c), are beyond their range, in its widths; of a channel that never moved
+    def _beyond(self, rows: FloatArray) -> FloatArray:
+        """Return how far the channels of rows, shape (…, c), are beyond their range, in its widths; of a channel that never moved
         infinitely far."""
         beyond, width = np.maximum(self.low - rows, rows - self.high), self.high - self.low
         least = SAME * (1.0 + np.abs(self.high))
@@ -135,39 +139,28 @@ class Domain:
     def _normalised(self, rows: FloatArray) -> FloatArray:
         return np.asarray((rows - self.centre) * self.scale)
 
-    def _deviation(self, z: FloatArray) -> FloatArray:
-        return np.asarray(z @ self.precision / np.sqrt(np.diag(self.precision)))
+    def _relations(self, z: FloatArray, known: BoolArray) -> Iterator[tuple[int, FloatArray, float]]:
+        """Yield a channel, how far rows are off the line or curve on which it depends on others, and how far they may be.
 
-    def _range(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
-        far = self._far(row[None])[0]
-        return [
-            Outside(
-                channels[i],
-                Why.RANGE if np.isfinite(far[i]) else Why.STILL,
-                float(row[i]),
-                float(self.low[i]),
-                float(self.high[i]),
-                float(far[i]),
-            )
-            for i in np.flatnonzero(far > MARGIN)
-        ]
+        Arguments:
+            z: normalised readings, shape (n, c).
+            known: which channels were read, shape (c,): the others are judged by no line, and curves over them are left out.
+        """
+        P_ii = np.diag(self.precision)
+        for i in np.flatnonzero(known).tolist():
+            yield i, z @ self.precision[i] / P_ii[i], float(JOINT_MARGIN * self.limit[i] / np.sqrt(P_ii[i]))
+        for curve in self.curves:
+            if known[curve.channel] and known[curve.network.uses].all():
+                yield curve.channel, curve.deviation(z), curve.half
 
-    def _joint(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
-        """Return the channels that are off their line or their curve; of both, the farther."""
-        known = np.isfinite(row)
-        z = self._normalised(self.filled(row)[None])
-        std = 1.0 / np.sqrt(np.diag(self.precision))
-        lines = zip(range(len(row)), np.where(known, self._deviation(z)[0], 0.0) * std, JOINT_MARGIN * self.limit * std)
-        told = [curve for curve in self.curves if known[curve.channel] and known[curve.network.uses].all()]
-        curves = [(curve.channel, float(curve.deviation(z)[0]), curve.half) for curve in told]
+    def _off_together(self, row: FloatArray, channels: tuple[str, ...]) -> list[Outside]:
+        """Return the channels of a row that are off their line or their curve; of both, the farther."""
         found: dict[int, Outside] = {}
-        for i, off, half in (*lines, *curves):
-            far = 0.5 * (abs(off) / half - 1.0)
+        for i, off, half in self._relations(self._normalised(self.filled(row)[None]), np.isfinite(row)):
+            far = 0.5 * (abs(float(off[0])) / half - 1.0)
             if far > (found[i].far if i in found else 0.0):
-                expected, width = row[i] - off / self.scale[i], half / self.scale[i]
-                found[i] = Outside(
-                    channels[i], Why.JOINT, float(row[i]), float(expected - width), float(expected + width), float(far)
-                )
+                expected, width = float(row[i] - off[0] / self.scale[i]), float(half / self.scale[i])
+                found[i] = Outside(channels[i], Why.JOINT, float(row[i]), expected - width, expected + width, far)
         return list(found.values())
 
 

@@ -107,21 +107,21 @@ def drift(model: ProprioceptiveModel, data: Labelled) -> Drift:
     frames = _frames(model, data)
     predicted = model.network(frames.inputs)
     stated = float(model.report.get("error_mm", 0.0))
-    chosen, left = explain(frames)
+    chosen, errors = explain(frames)
     T, middle = rigid_motion(predicted, frames.targets), predicted.reshape(-1, 3).mean(axis=0)
     shifts = shifts_of(frames, moved="base" in chosen) if "channel" in chosen else ()
     inside = model.domain.inside(data.readings)
     names = [item.channel for row in data.readings[~inside] for item in model.check(row)]
     counts = {name: names.count(name) / len(data) for name in dict.fromkeys(names)}
     return Drift(
-        verdict=_verdict(frames, chosen, stated),
+        verdict=_verdict(errors, chosen, frames.targets, stated),
         stated_mm=stated,
-        error_mm=1e3 * left["none"],
-        rigid_mm=1e3 * left["base"],
+        error_mm=1e3 * marker_rms(errors["none"]),
+        rigid_mm=1e3 * marker_rms(errors["base"]),
         shift_mm=1e3 * float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)),
         turn_deg=float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))),
         shifts={model.channels[shift.channel]: shift.by for shift in shifts},
-        left_mm=1e3 * left[chosen],
+        left_mm=1e3 * marker_rms(errors[chosen]),
         outside=float(1.0 - inside.mean()),
         channels=dict(sorted(counts.items(), key=lambda item: -item[1])),
     )
@@ -145,24 +145,24 @@ def adapt(model: ProprioceptiveModel, few: Labelled) -> ProprioceptiveModel:
         DataError: fewer than 8 rows with markers.
     """
     frames = _frames(model, few)
-    chosen, left = explain(frames)
+    chosen, errors = explain(frames)
     network = corrected(frames, chosen)
     held = frames.held_out(chosen)
     spread = make_spread(network, frames.inputs, held)
-    errors = frames.errors(chosen)
     radius = spread.radius(network, frames.inputs)
-    before, learnt = 1e3 * left["none"], float(model.report.get("error_mm", 0.0))
+    before, learnt = 1e3 * marker_rms(errors["none"]), float(model.report.get("error_mm", 0.0))
+    left = error_table(errors[chosen])
     report = {
         **{key: value for key, value in model.report.items() if key != "test"},
-        **error_table(errors),
-        "marker_error_mm": marker_errors_mm(errors, model.marker_names),
+        **left,
+        "marker_error_mm": marker_errors_mm(errors[chosen], model.marker_names),
         "sessions": 1,
         "interval": {
             "radius_mm": median_radius_mm(radius, model.marker_names),
             "coverage": spread.share_within(held),
             "growth": before / max(learnt, 1e-9),
         },
-        "adapted": {"by": chosen, "rows": len(few), "error_mm": 1e3 * left[chosen], "before_mm": before, "learnt_mm": learnt},
+        "adapted": {"by": chosen, "rows": len(few), "error_mm": left["error_mm"], "before_mm": before, "learnt_mm": learnt},
     }
     domain = model.domain
     if "channel" in chosen:
@@ -210,27 +210,22 @@ def _frames(model: ProprioceptiveModel, data: Labelled) -> Frames:
     return Frames(model.network, model_inputs(model, data), data.targets, model.domain.high - model.domain.low)
 
 
-def _verdict(frames: Frames, chosen: str, stated: float) -> str:
+def _verdict(errors: dict[str, FloatArray], chosen: str, targets: FloatArray, stated: float) -> str:
     """Return the meaning of the chosen correction; if the remaining error significantly exceeds the model's own, the map has changed too.
 
     Significant means that its whole 95 % interval lies above: a few rows outside of the training domain are no change.
     """
-    errors = frames.errors("none")
-    motion = marker_rms(frames.targets - frames.targets.mean(axis=0))
-    if 1e3 * error_interval(errors)[0] <= AS_BEFORE * stated and marker_rms(errors) < motion:
+    before = errors["none"]
+    motion = marker_rms(targets - targets.mean(axis=0))
+    if 1e3 * error_interval(before)[0] <= AS_BEFORE * stated and marker_rms(before) < motion:
         return "holds"
     said = []
     if "channel" in chosen:
         said.append("one channel shifted")
-    if "base" in chosen and is_better(frames.errors("base"), errors):
+    if "base" in chosen and is_better(errors["base"], before):
         said.append("base moved")
-    if (
-        not said
-        or "zeros" in chosen
-        or "line" in chosen
-        or AFRESH in chosen
-        or 1e3 * error_interval(frames.errors(chosen))[0] > AS_BEFORE * stated
-    ):
+    is_map = any(word in chosen for word in ("zeros", "line", AFRESH))
+    if not said or is_map or 1e3 * error_interval(errors[chosen])[0] > AS_BEFORE * stated:
         said.append("map changed")
     return " and ".join(said)
 

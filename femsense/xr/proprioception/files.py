@@ -17,7 +17,6 @@ import numpy as np
 from femsense.calib.files import read_calibration
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.core.pose import transform_points
 from femsense.core.text import did_you_mean
 from femsense.io.recording_tables import PLACE_COLUMNS
 from femsense.io.recording_toml import RecordingTable, views_of
@@ -151,58 +150,51 @@ def _read_markers(
     names = tuple(dict.fromkeys(labels))
     if not names or "" in names:
         raise InputError("a marker without a name", where=path, found=names or "no row", expected="a name in each row")
-    row_of = {int(frame): row for row, frame in enumerate(frames)}
-    unknown = [int(number) for number in numbers if int(number) not in row_of]
-    if len(unknown) == len(numbers):
-        hint = did_you_mean(str(unknown[0]), [str(frame) for frame in frames[:50]])
+    row_of = {frame: row for row, frame in enumerate(frames.tolist())}
+    rows = np.array([row_of.get(number, -1) for number in numbers.tolist()], dtype=np.int64)
+    known = rows >= 0
+    if not known.any():
         raise InputError(
             "no frame is in both files",
             where=path,
-            found=f"frames {unknown[0]} … {unknown[-1]}",
+            found=f"frames {numbers[0]} … {numbers[-1]}",
             expected=f"frames {frames[0]} … {frames[-1]}" if len(frames) else "rows",
-            hint=hint,
+            hint=did_you_mean(str(numbers[0]), [str(frame) for frame in frames[:50]]),
         )
+    T, turned = _poses_of_rows(table, poses, path), _turned(table, path)
+    places = np.einsum("kij,kj->ki", T[:, :3, :3], table.numbers(PLACE_COLUMNS)) + T[:, :3, 3]
+    at = rows[known], np.array([names.index(label) for label in labels])[known]
     total, seen = np.zeros((len(frames), len(names), 3)), np.zeros((len(frames), len(names), 1))
-    turned = _turned(table, poses, path)
+    np.add.at(total, at, places[known])
+    np.add.at(seen, at, 1.0)
     turns = None if turned is None else np.full((len(frames), len(names), 3, 3), np.nan)
-    for i, (label, number, place) in enumerate(zip(labels, numbers, _moved(table, poses, path))):
-        if int(number) in row_of:
-            at = row_of[int(number)], names.index(label)
-            total[at] += place
-            seen[at] += 1.0
-            if turns is not None and turned is not None:
-                turns[at] = turned[i]
+    if turns is not None and turned is not None:
+        turns[at] = (T[:, :3, :3] @ turned)[known]
     return names, np.divide(total, seen, out=np.full_like(total, np.nan), where=seen > 0), turns
 
 
-def _turned(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray | None:
-    """Return the rotation of each row, shape (k, 3, 3), through the pose of its camera; None without quaternions. Raises InputError."""
+def _turned(table: Table, path: Path) -> FloatArray | None:
+    """Return the rotation of each row, shape (k, 3, 3), in the frame of its camera; None without quaternions. Raises InputError."""
     given = [name for name in TURN if name in table.columns]
     if not given:
         return None
     if len(given) < len(TURN):
         raise InputError("not a whole quaternion", where=f"{path}, header", found=", ".join(given), expected=", ".join(TURN))
     numbers = table.numbers(TURN)
-    size = np.linalg.norm(numbers, axis=1)
-    if (np.abs(size - 1.0) > UNIT).any():
-        row = int(np.argmax(np.abs(size - 1.0)))
-        raise InputError(
-            "not a unit quaternion", where=f"{path}, row {row + 1}", found=f"length {size[row]:.3g}", expected="length 1"
-        )
+    off = np.abs(np.linalg.norm(numbers, axis=1) - 1.0)
+    if (off > UNIT).any():
+        row = int(np.argmax(off))
+        found = f"length {np.linalg.norm(numbers[row]):.3g}"
+        raise InputError("not a unit quaternion", where=f"{path}, row {row + 1}", found=found, expected="length 1")
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_quat(numbers[:, [1, 2, 3, 0]]).as_matrix()
+    return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]]).as_matrix())
+
+
+def _poses_of_rows(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray:
+    """Return the pose of the camera of each row, shape (k, 4, 4); the identity without poses. Raises InputError."""
     cameras = table.text("camera") if "camera" in table.columns else [""] * len(table)
-    alone = next(iter(poses.values())) if len(poses) == 1 else None
-    frames = [poses.get(name, np.eye(4)) if alone is None else alone for name in cameras]
-    return np.asarray(np.stack([T[:3, :3] for T in frames]) @ turns) if frames else np.asarray(turns)
-
-
-def _moved(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray:
-    """Return the places of markers, shape (k, 3), each through the pose of its camera."""
-    places = table.numbers(PLACE_COLUMNS)
-    cameras = np.array(table.text("camera") if "camera" in table.columns else [""] * len(table))
-    found = set(cameras.tolist())
+    found = set(cameras)
     if not poses and len(found) > 1:
         raise InputError(
             "markers of several cameras without their poses",
@@ -210,12 +202,10 @@ def _moved(table: Table, poses: dict[str, FloatArray], path: Path) -> FloatArray
             found=", ".join(sorted(found)),
             expected="-c CALIBRATION",
         )
-    if len(poses) == 1 and len(found) == 1:
-        return transform_points(next(iter(poses.values())), places)
-    if poses and not found <= set(poses):
+    if len(found) == 1 and len(poses) <= 1:  # one pose is that of the one camera, whatever its name
+        return np.tile(next(iter(poses.values()), np.eye(4)), (len(table), 1, 1))
+    if not found <= set(poses):
         raise InputError(
             "a camera without a pose", where=path, found=", ".join(sorted(found - set(poses))), expected=", ".join(poses)
         )
-    for name, pose in poses.items():
-        places[cameras == name] = transform_points(pose, places[cameras == name])
-    return places
+    return np.array([poses[name] for name in cameras])

@@ -18,16 +18,17 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.labelled import Labelled, check_frame
 from femsense.xr.proprioception.memory import longest_gap
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
+from femsense.xr.proprioception.network import Network
 from femsense.xr.proprioception.selection import (
     MEMORIES,
     MOST_ROWS,
+    Compared,
     Kind,
     Progress,
     compare_plans,
     marker_rms,
     rows_kept,
     simplest_good,
-    train,
 )
 from femsense.xr.proprioception.spread import coverage, growth, held_out, make_spread
 
@@ -95,63 +96,45 @@ def learn(
     kinds = tuple(Kind(kind) for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
     memories = tuple(taus for taus in options.memories if data.spacing_s <= longest_gap(taus)) or ((),)
     compared = compare_plans(work, kinds, memories, seed=options.seed, progress=progress)
-    chosen = simplest_good(compared)
+    trained, some = (work.select(spread_evenly(len(work), most)) for most in (TRAINED_ROWS, MOST_ROWS))
+    networks = {item.plan.kind: item.plan.train(trained.inputs(item.plan.memory_s), trained.targets) for item in compared}
+    plan = simplest_good(compared).plan
+    network, taus = networks[plan.kind], plan.memory_s
+    out = held_out(plan.train, some.inputs(taus), some.targets, some.part)
+    spread = make_spread(network, trained.inputs(taus), out)
     chain = _chain(data.markers[options.rest_row], options.bones)
-    rows = spread_evenly(len(work), TRAINED_ROWS)
-    networks = {
-        item.plan.kind: train(item.plan, work.inputs(item.plan.memory_s)[rows], work.targets[rows], options.seed)
-        for item in compared
-    }
-    table = {}
-    for item in compared:
-        errors = networks[item.plan.kind](kept.inputs(item.plan.memory_s)) - kept.targets
-        table[item.plan.kind] = error_table(errors) | {
-            "blocks_mm": 1e3 * item.rms,
-            "median_block_mm": 1e3 * item.typical,
-            "memory_s": list(item.plan.memory_s),
-            "channels": int(item.plan.used.sum()),
-        }
-    network, plan = networks[chosen.plan.kind], chosen.plan
-    inputs = kept.inputs(plan.memory_s)
-    some = spread_evenly(len(work), MOST_ROWS)
-    out = held_out(
-        lambda x, y: train(plan, x, y, options.seed), work.inputs(plan.memory_s)[some], work.targets[some], work.part[some]
+    bones = _bones(work, taus, chain, options.seed) if options.end_to_end and chain is not None else None
+    model = ProprioceptiveModel(
+        data.channels, data.marker_names, network, taus, learn_domain(work.readings), chain, bones, {}, data.frame, spread
     )
-    spread = make_spread(network, work.inputs(plan.memory_s)[rows], out)
+    own, inputs = errors_on(model, kept), kept.inputs(taus)
     report: dict[str, Any] = {
         "kind": plan.kind,
-        **{key: table[plan.kind][key] for key in ("error_mm", "error_ci_mm")},
-        "marker_error_mm": marker_errors_mm(network(inputs) - kept.targets, data.marker_names),
+        **{key: own[key] for key in ("error_mm", "error_ci_mm", "marker_error_mm")},
         "rows": len(work),
         "test_rows": len(kept),
         "motion_mm": 1e3 * marker_rms(data.targets - data.targets.mean(axis=0)),
         "sessions": len(np.unique(data.part)),
         "interval": {
             "radius_mm": median_radius_mm(spread.radius(network, inputs), data.marker_names),
-            "coverage": coverage(spread, network, inputs, kept.targets),
+            "coverage": own["coverage"],
             "growth": growth(out),
         },
-        "compared": table,
-        "importance_mm": importance(network, inputs, kept.targets, data.channels, len(plan.memory_s)),
+        "compared": {item.plan.kind: _comparison(item, networks[item.plan.kind], kept) for item in compared},
+        "importance_mm": importance(network, inputs, kept.targets, data.channels, len(taus)),
         "unused": [name for name, used in zip(data.channels, plan.used) if not used],
         "dead": dead_channels(data.readings, data.channels),
         "saturated": saturated_channels(data.readings, data.channels),
+        "test_outside": own["outside"],
     }
-    bones = None
-    if options.end_to_end and chain is not None:
-        some = spread_evenly(len(work), BONE_ROWS)
-        wanted = np.array([bone_numbers(chain(markers)) for markers in work.markers[some]])
-        bones = train_bayesian(work.inputs(plan.memory_s)[some], wanted, rng=np.random.default_rng(options.seed))
+    if bones is not None and chain is not None:
         report["bones_mm"] = _bone_error(bones(inputs), chain, kept)
-    domain = learn_domain(work.readings)
-    report["test_outside"] = float(1.0 - domain.inside(kept.readings).mean())
-    model = ProprioceptiveModel(
-        data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report, data.frame, spread
-    )
-    return model if test is None else replace(model, report={**report, "test": errors_on(model, test, report["error_mm"])})
+    if test is not None:
+        report["test"] = errors_on(model, test, report["error_mm"])
+    return replace(model, report=report)
 
 
-def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float) -> dict[str, Any]:
+def errors_on(model: ProprioceptiveModel, data: Labelled, stated_mm: float = float("nan")) -> dict[str, Any]:
     """Return the errors of a model on data that it was not made from, and whether its intervals hold there, as plain tables.
 
     `growth` is the error there over the stated one.
@@ -185,7 +168,7 @@ def error_interval(errors: FloatArray) -> tuple[float, float]:
 
 
 def importance(
-    network: Any, inputs: FloatArray, targets: FloatArray, channels: tuple[str, ...], filters: int
+    network: Network, inputs: FloatArray, targets: FloatArray, channels: tuple[str, ...], filters: int
 ) -> dict[str, float]:
     """Return the increase of the error when a channel is replaced by itself at other times [mm], by channel.
 
@@ -230,6 +213,24 @@ def _check(data: Labelled, options: LearnOptions) -> None:
         )
     if len(dead_channels(data.readings, data.channels)) == len(data.channels):
         raise DataError("no channel ever changes: " + ", ".join(data.channels))
+
+
+def _comparison(item: Compared, network: Network, kept: Labelled) -> dict[str, Any]:
+    """Return the report on one map: its error on rows kept from it, and on the blocks that were held out in turn."""
+    return {
+        **error_table(network(kept.inputs(item.plan.memory_s)) - kept.targets),
+        "blocks_mm": 1e3 * item.rms,
+        "median_block_mm": 1e3 * item.typical,
+        "memory_s": list(item.plan.memory_s),
+        "channels": int(item.plan.used.sum()),
+    }
+
+
+def _bones(data: Labelled, taus: tuple[float, ...], chain: Armature, seed: int) -> Network:
+    """Return an end-to-end network from readings to bones."""
+    some = data.select(spread_evenly(len(data), BONE_ROWS))
+    wanted = np.array([bone_numbers(chain(markers)) for markers in some.markers])
+    return train_bayesian(some.inputs(taus), wanted, seed=seed)
 
 
 def _chain(rest: FloatArray, options: ArmatureOptions) -> Armature | None:

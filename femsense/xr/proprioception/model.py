@@ -197,9 +197,7 @@ class LiveModel:
         self._memory, self._row, self._time_s = past, x, time_s
         inputs = np.concatenate([x, past.ravel()])[None]
         markers = model.network(inputs).reshape(-1, 3)
-        bones = None
-        if model.chain is not None:
-            bones = model.chain(markers) if model.bones is None else model.bones_of(inputs)
+        bones = None if model.chain is None else model.bones_of(inputs)
         return LivePose(markers, bones, outside, None if model.spread is None else model.spread.radius(model.network, inputs)[0])
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -49,7 +50,15 @@ class Kind(StrEnum):
     MLP = "mlp"
 
 
-CHEAP = {Kind.RIDGE, Kind.RADIAL}
+Trainer = Callable[[FloatArray, FloatArray], Network]
+"""Returns the map of inputs, shape (n, d), to outputs, shape (n, o)."""
+CHEAP: dict[Kind, tuple[Trainer, ...]] = {
+    Kind.RIDGE: tuple(partial(train_ridge, penalty=penalty) for penalty in PENALTIES),
+    Kind.RADIAL: tuple(
+        partial(train_radial, penalty=PENALTIES[1], length=length, noise=noise) for length, noise in product(LENGTHS, NOISES)
+    ),
+}
+"""Maps that cost little: memory and channels are chosen with them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,13 +69,13 @@ class Plan:
     memory_s: tuple[float, ...]
     used: BoolArray
     """Channels that it takes, shape (c,)."""
-    numbers: dict[str, float] = field(default_factory=dict)
-    """Penalty, length, noise."""
+    trainer: Trainer
+    """Trains it, with its own penalty, length, noise or seed, on the inputs that it uses."""
 
-    @property
-    def columns(self) -> BoolArray:
-        """The same for inputs with filters, shape ((1 + k) c,)."""
-        return np.tile(self.used, 1 + len(self.memory_s))
+    def train(self, inputs: FloatArray, targets: FloatArray) -> Network:
+        """Return the map, trained on inputs with filters, shape (n, (1 + k) c); it takes all of them, also those it does not use."""
+        columns = np.tile(self.used, 1 + len(self.memory_s))
+        return _widened(self.trainer(inputs[:, columns], targets), columns)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,14 +120,20 @@ def compare_plans(
     everything = np.ones(len(data.channels), dtype=bool)
     sets = {tuple(used): used for used in (everything, _needed(inputs[()], targets))}
     best: dict[Kind, Compared] = {}
-    jobs = list(product(memories, sets.values()))
-    for done, (taus, used) in enumerate(jobs):
+    pairs = list(product(memories, sets.values()))
+    for done, (taus, used) in enumerate(pairs):
+        if progress is not None:
+            progress(done, len(pairs))
+        for kind in [kind for kind in CHEAP if kind in kinds] or [Kind.RIDGE]:
+            for trainer in CHEAP[kind]:
+                _keep(best, compare_plan(Plan(kind, taus, used, trainer), inputs[taus], targets))
+    leader = min(best.values(), key=lambda item: item.rms).plan
+    networks = {Kind.NETWORK: partial(train_bayesian, seed=seed), Kind.MLP: partial(train_mlp, seed=seed)}
+    jobs = list(product((kind for kind in kinds if kind in networks), dict.fromkeys((leader.memory_s, ()))))
+    for done, (kind, taus) in enumerate(jobs):
         if progress is not None:
             progress(done, len(jobs))
-        for plan in _cheap_plans(taus, used, kinds if CHEAP & set(kinds) else (Kind.RIDGE,)):
-            _keep(best, compare_plan(plan, inputs[taus], targets, seed))
-    if not set(kinds) <= CHEAP:
-        _keep_networks(best, kinds, lambda plan: compare_plan(plan, inputs[plan.memory_s], targets, seed), progress)
+        _keep(best, compare_plan(Plan(kind, taus, leader.used, networks[kind]), inputs[taus], targets))
     return [best[kind] for kind in kinds if kind in best]
 
 
@@ -131,28 +146,12 @@ def simplest_good(found: list[Compared]) -> Compared:
     return chosen
 
 
-def compare_plan(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Compared:
+def compare_plan(plan: Plan, inputs: FloatArray, targets: FloatArray) -> Compared:
     """Return a map's error on blocks that were held out in turn."""
     blocks = []
     for held in folds(len(targets)):
-        blocks.append(marker_rms(train(plan, inputs[~held], targets[~held], seed)(inputs[held]) - targets[held]))
+        blocks.append(marker_rms(plan.train(inputs[~held], targets[~held])(inputs[held]) - targets[held]))
     return Compared(plan, float(np.sqrt(np.mean(np.square(blocks)))), float(np.median(blocks)))
-
-
-def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Network:
-    """Return the map of a plan, trained on inputs with filters, shape (n, (1 + k) c); it takes all of them,
-    also those it does not use."""
-    columns, rng, numbers = plan.columns, np.random.default_rng(seed), plan.numbers
-    x = inputs[:, columns]
-    if plan.kind is Kind.RIDGE:
-        network = train_ridge(x, targets, penalty=numbers["penalty"])
-    elif plan.kind is Kind.RADIAL:
-        network = train_radial(x, targets, penalty=numbers["penalty"], length=numbers["length"], noise=numbers["noise"])
-    elif plan.kind is Kind.NETWORK:
-        network = train_bayesian(x, targets, rng=rng)
-    else:
-        network = train_mlp(x, targets, seed=seed)
-    return _widened(network, columns)
 
 
 def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
@@ -186,15 +185,6 @@ def marker_rms(errors: FloatArray) -> float:
     return rms(errors.reshape(len(errors), -1, 3))
 
 
-def _cheap_plans(taus: tuple[float, ...], used: BoolArray, kinds: tuple[Kind, ...]) -> Iterator[Plan]:
-    if Kind.RIDGE in kinds:
-        for penalty in PENALTIES:
-            yield Plan(Kind.RIDGE, taus, used, {"penalty": penalty})
-    if Kind.RADIAL in kinds:
-        for length, noise in product(LENGTHS, NOISES):
-            yield Plan(Kind.RADIAL, taus, used, {"penalty": PENALTIES[1], "length": length, "noise": noise})
-
-
 def _keep(best: dict[Kind, Compared], found: Compared) -> None:
     """Keep the better one of a kind; a memory or another set of channels must bring `GAIN`."""
     before = best.get(found.plan.kind)
@@ -206,18 +196,6 @@ def _keep(best: dict[Kind, Compared], found: Compared) -> None:
         best[found.plan.kind] = found
 
 
-def _keep_networks(
-    best: dict[Kind, Compared], kinds: tuple[Kind, ...], compare: Callable[[Plan], Compared], progress: Progress | None
-) -> None:
-    leader = min(best.values(), key=lambda item: item.rms).plan
-    memories = dict.fromkeys((leader.memory_s, ()))
-    jobs = list(product((kind for kind in kinds if kind not in CHEAP), memories))
-    for done, (kind, taus) in enumerate(jobs):
-        if progress is not None:
-            progress(done, len(jobs))
-        _keep(best, compare(Plan(kind, taus, leader.used)))
-
-
 def _needed(x: FloatArray, targets: FloatArray) -> BoolArray:
     """Return the channels with which held-out blocks are predicted best: all but those that go, or those that come, one by one.
 
@@ -227,7 +205,7 @@ def _needed(x: FloatArray, targets: FloatArray) -> BoolArray:
     """
 
     def error(used: BoolArray) -> float:
-        return compare_plan(Plan(Kind.RIDGE, (), used, {"penalty": PENALTIES[1]}), x, targets, 0).rms
+        return compare_plan(Plan(Kind.RIDGE, (), used, partial(train_ridge, penalty=PENALTIES[1])), x, targets).rms
 
     starts = (np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1], dtype=bool))
     return min((_one_by_one(used, error) for used in starts), key=error)

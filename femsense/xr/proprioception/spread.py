@@ -43,17 +43,13 @@ class Spread:
     quantile: FloatArray
     """q of each marker [m], shape (m,)."""
 
-    def size(self, network: Network, inputs: FloatArray) -> FloatArray:
-        """Return s(x), shape (n,), of inputs of the network, shape (n, d)."""
-        return np.sqrt(1.0 + self.kappa * leverage(self.root, network, inputs))
-
     def share_within(self, held: HeldOut) -> float:
         """Return the share of marker positions on held-out rows that lie within their intervals."""
-        return float((held.distance <= np.sqrt(1.0 + self.kappa * held.leverage)[:, None] * self.quantile).mean())
+        return float((held.distance <= held.size(self.kappa) * self.quantile).mean())
 
     def radius(self, network: Network, inputs: FloatArray) -> FloatArray:
-        """Return the radius of the 95 % interval of each marker [m], shape (n, m)."""
-        return np.asarray(self.size(network, inputs)[:, None] * self.quantile)
+        """Return the radius of the 95 % interval of each marker [m], shape (n, m), of inputs of the network, shape (n, d)."""
+        return np.asarray(np.sqrt(1.0 + self.kappa * leverage(self.root, network, inputs))[:, None] * self.quantile)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,6 +63,10 @@ class HeldOut:
     group: IntArray
     """`BETWEEN` where rows before and after were trained on; else which of the groups that come later, or from another recording,
     shape (n,)."""
+
+    def size(self, kappa: float) -> FloatArray:
+        """Return s(x) of each row, shape (n, 1)."""
+        return np.asarray(np.sqrt(1.0 + kappa * self.leverage)[:, None])
 
     def pick(self, which: BoolArray) -> HeldOut:
         """Return some of the rows."""
@@ -126,7 +126,7 @@ def make_spread(network: Network, inputs: FloatArray, held: HeldOut) -> Spread:
     """
     kappa = likeliest_kappa(held)
     groups = [held, *(held.pick(held.group == g) for g in np.unique(held.group) if g != BETWEEN)]
-    quantiles = [_quantile(one.distance / np.sqrt(1.0 + kappa * one.leverage)[:, None]) for one in groups]
+    quantiles = [_quantile(one.distance / one.size(kappa)) for one in groups]
     return Spread(freeze(root_of(network, inputs)), kappa, freeze(np.max(quantiles, axis=0)))
 
 

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from femsense.core.errors import InputError
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import MqttSource, broker_address
-from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import RECEIVED, Kind, read_document, status_bytes, topic
 from femsense.xr.stream.web_source import WebSource
 from femsense.xr.stream.websocket import pack, unpack
 
@@ -75,22 +75,20 @@ class Bridge:
         self._close()
 
     def _back(self, message: Message, _who: str) -> None:
-        known = split_topic(message.topic)
-        if known is not None and known[1] in RECEIVED:
+        if message.kind in RECEIVED:
             self._send(message)
 
     def _from_broker(self, message: Message) -> None:
-        known = split_topic(message.topic)
-        if known is not None and known[1] not in RECEIVED:
-            self._robots.add(known[0])
+        if message.robot and message.kind not in RECEIVED:
+            self._robots.add(message.robot)
             self.hub.publish([message])
 
     def lost(self, robots: Collection[str], where: str) -> None:
         """Report the lost connection for all robots except those that have ended."""
-        newest = {robot: self.hub.newest().get(topic(robot, STATUS)) for robot in robots}
+        newest = {robot: self.hub.newest().get(topic(robot, Kind.STATUS)) for robot in robots}
         states = {robot: read_document(told.payload) or {} for robot, told in newest.items() if told is not None}
         gone = [robot for robot in robots if states.get(robot, {}).get("state") != "ended"]
-        self.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", where)) for robot in gone])
+        self.hub.publish([Message(topic(robot, Kind.STATUS), status_bytes("lost", where)) for robot in gone])
 
 
 class _Viewer:
@@ -114,9 +112,8 @@ class _Viewer:
     def take(self, frame: bytes) -> None:
         messages, meshes = list(unpack(frame)), []
         for message in messages:
-            known = split_topic(message.topic)
-            if known is not None and known[1] == MODEL:
-                meshes += self._mesh(known[0], message)
+            if message.kind == Kind.MODEL:
+                meshes += self._mesh(message.robot, message)
         self._bridge.hub.publish([*meshes, *messages])
 
     def _mesh(self, robot: str, model: Message) -> list[Message]:
@@ -128,4 +125,4 @@ class _Viewer:
         with urllib.request.urlopen(request, timeout=10, context=self._tls) as answer:
             glb = answer.read(LARGEST_MESH)
         self._known[robot] = digest
-        return [Message(topic(robot, GLB), glb)]
+        return [Message(topic(robot, Kind.GLB), glb)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +31,21 @@ class NewestToEach(Broker):  # type: ignore[misc]
         self._waiting: dict[str, dict[str, tuple[bytes, int]]] = {}  # client → topic → message and quality of service
         self._deliveries: set[asyncio.Task[None]] = set()
 
+    def hand_out(self, messages: tuple[Message, ...]) -> None:
+        """Start to deliver messages of this program."""
+        self._begin(self._hand_out(messages))
+
+    async def _hand_out(self, messages: tuple[Message, ...]) -> None:
+        for message in messages:
+            if message.retained:
+                await self.retain_message(None, message.topic, message.payload, 0)
+            await self.internal_message_broadcast(message.topic, message.payload, 0)
+
+    def _begin(self, delivery: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(delivery)
+        self._deliveries.add(task)
+        task.add_done_callback(self._deliveries.discard)
+
     async def _broadcast_message(self, _from: Session | None, topic: str, data: bytes | None, qos: int | None = None) -> None:
         """Start to deliver a message to the clients that have subscribed to it; while one is busy, its message waits."""
         targets = [pair for wanted, pairs in self._subscriptions.items() if self._matches(topic, wanted) for pair in pairs]
@@ -39,9 +55,7 @@ class NewestToEach(Broker):  # type: ignore[misc]
             is_idle = target.client_id not in self._waiting
             self._waiting.setdefault(target.client_id, {})[topic] = (bytes(data or b""), asked if qos is None else qos)
             if is_idle:
-                delivery = asyncio.create_task(self._deliver(target))
-                self._deliveries.add(delivery)
-                delivery.add_done_callback(self._deliveries.discard)
+                self._begin(self._deliver(target))
 
     async def _deliver(self, target: Session) -> None:
         waiting = self._waiting[target.client_id]

@@ -6,14 +6,16 @@ while the request is unchanged, replies continue until the search ends.
 
 from __future__ import annotations
 
-import json
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import count
 from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
 from femsense.control.follow import Follower
@@ -24,27 +26,10 @@ from femsense.fem.mesh import embed_points
 from femsense.model.robot import Robot
 from femsense.xr.skinning import Skin, prepare_poses
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
-from femsense.xr.stream.drag_messages import Wish, in_plain_words, is_number, place_of, read_wish, rows_of
+from femsense.xr.stream.drag_messages import Wish, in_plain_words, read_report, read_wish
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.lease import Lease, Ruling
-from femsense.xr.stream.payloads import (
-    COMMAND,
-    DRAG,
-    GHOST,
-    INPUTS,
-    LEASE,
-    MEASURED,
-    REACH,
-    STOP,
-    Handle,
-    Input,
-    bone_rows,
-    header,
-    pose_bytes,
-    read_document,
-    split_topic,
-    topic,
-)
+from femsense.xr.stream.payloads import Handle, Input, Kind, bone_rows, document_bytes, pose_bytes, topic
 from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
@@ -106,7 +91,9 @@ class DragServer:
         """
         self.hub, self.robot, self.options = hub, robot, options or DragOptions()
         self.name = name or robot.name
-        self.gate = CommandGate(drive_inputs(robot), self.options.gate)
+        self.gate, self.lease = CommandGate(drive_inputs(robot), self.options.gate), Lease(self.options.gate.hold_s)
+        self._size = diagonal(robot.body.mesh.nodes)
+        self.feedback = TipFeedback(self._size, self.options.feedback)
         self._follower = Follower(
             robot,
             limits={one.name: (one.low, one.high) for one in self.gate.inputs},
@@ -114,24 +101,19 @@ class DragServer:
             options=ReachOptions(tolerance_m=self.options.tolerance_m),
         )
         self._skin, self._fit = embed_points(robot.body.mesh, skin.rest), prepare_poses(skin)
-        self._size = diagonal(robot.body.mesh.nodes)
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None
         self._grabbed = False  # whether a point was grabbed since the last answer
-        self._wanted: tuple[str, tuple[float, float, float]] | None = None
+        self._wanted: tuple[str, tuple[float, ...]] | None = None
         self._still_since = 0.0
-        self.lease = Lease(self.options.gate.hold_s)
-        self._told: dict[str, float] = {}  # inputs reported by the robot
-        self._told_at = float("-inf")
-        self.feedback = TipFeedback(self._size, self.options.feedback)
-        self._handle = ""
-        self._settled_since: float | None = None
+        self._told: tuple[float, dict[str, float]] = (float("-inf"), {})  # when the robot reported its inputs, and which
+        self._unmeasured = (float("-inf"), "")  # when a reason came why it is not measured, and which
         self._measured_at: dict[str, float] = {}  # marker → when it was measured last
-        self._unmeasured, self._unmeasured_at = "", float("-inf")  # reason why the robot is not measured, and its time
+        self._settled_since: float | None = None
         self._answer: tuple[FloatArray, dict[str, Any]] | None = None
+        self._numbers: defaultdict[Kind, count[int]] = defaultdict(count)
         self._fresh, self._stop, self._lock, self._telling = Event(), Event(), Lock(), Lock()
-        self._seq = self._commands = self._leases = 0
         hub.listen(self._hear)
         self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
         for thread in self._threads:
@@ -144,33 +126,38 @@ class DragServer:
         for thread in self._threads:
             thread.join(2.0)
 
+    def _message(self, kind: Kind, **told: Any) -> Message:
+        """Return a document, numbered among those of its kind."""
+        return Message(topic(self.name, kind), document_bytes(next(self._numbers[kind]), time.time(), **told))
+
+    def _rows(self, values: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Return inputs as documents list them."""
+        return [{"name": one.name, "unit": one.unit, "value": values[one.name]} for one in self.gate.inputs if one.name in values]
+
     # ---- wishes
 
     def _hear(self, message: Message, who: str) -> None:
-        known = split_topic(message.topic)
-        if known is None or topic(known[0], DRAG) != topic(self.name, DRAG):
+        if topic(message.robot, message.kind) != topic(self.name, message.kind):
             return
-        if known[1] == MEASURED:
+        if message.kind == Kind.MEASURED:
             self._measure(message.payload)
-        elif known[1] == DRAG:
+        elif message.kind == Kind.DRAG:
             self._take(message, who)
-        elif known[1] == STOP:
+        elif message.kind == Kind.STOP:
             self.stop()
 
     def _measure(self, payload: bytes) -> None:
         """Store the measured position of the dragged marker, and the inputs that the robot reports."""
-        told, now = read_document(payload) or {}, time.monotonic()
-        places = {str(row.get("name")): place_of(row.get("position_m")) for row in rows_of(told, "markers")}
-        inputs = self._values(told)
+        report, now = read_report(payload, self.gate.inputs), time.monotonic()
         with self._lock:
-            place = places.get(self._handle)
-            self._measured_at.update((name, now) for name, there in places.items() if there is not None)
-            if why := str(told.get("detail", "")):
-                self._unmeasured, self._unmeasured_at = why, now
+            self._measured_at.update(dict.fromkeys(report.places_m, now))
+            if report.detail:
+                self._unmeasured = (now, report.detail)
+            place = report.places_m.get(self._wish.handle) if self._wish is not None else None
             if place is not None and self._is_near(place):
-                self.feedback.measured(now, np.array(place))
-            if inputs:
-                self._told, self._told_at = inputs, now
+                self.feedback.measured(now, place)
+            if report.inputs:
+                self._told = (now, report.inputs)
 
     def stop(self) -> None:
         """Stop all motion immediately, for every client; motion requires disarming first."""
@@ -185,47 +172,40 @@ class DragServer:
         """Discard the current request."""
         self.gate.release()
         self.feedback.forget()
-        self._wish, self._handle, self._grabbed = None, "", False
+        self._wish, self._grabbed = None, False
 
     def _take(self, message: Message, who: str) -> None:
         wish, now = read_wish(message.payload, who), time.monotonic()
         if wish is None or not self._can_be_meant(wish):
             return
         with self._lock:
-            ruling = self.lease.rule(wish.claim, now)
+            ruling = self.lease.rule(wish, now)
             if ruling is Ruling.RELEASED:
                 self._let_go()
             elif ruling in (Ruling.GRANTED, Ruling.RENEWED):
-                if ruling is Ruling.GRANTED or wish.handle != self._handle:
+                if ruling is Ruling.GRANTED or self._wish is None or wish.handle != self._wish.handle:
                     self._let_go()
                     self._grabbed = True
                 if ruling is Ruling.RENEWED:
-                    self.gate.hold(now, armed=wish.claim.armed)
-                self._wish, self._handle = wish, wish.handle
+                    self.gate.hold(now, armed=wish.armed)
+                self._wish = wish
         if ruling is not Ruling.RENEWED:
             self._say_who_steers()
         self._fresh.set()
 
     def _say_who_steers(self) -> None:
-        self._leases += 1
-        document = {
-            "header": header(self._leases, time.time(), "robot"),
-            "client": self.lease.client,
-            "number": self.lease.number,
-            "expires_s": self.lease.hold_s,
-            "stopped": self.lease.stopped,
-        }
-        self.hub.publish([Message(topic(self.name, LEASE), json.dumps(document).encode())])
+        held = self.lease
+        told = {"client": held.client, "number": held.number, "expires_s": held.hold_s, "stopped": held.stopped}
+        self.hub.publish([self._message(Kind.LEASE, **told)])
 
     def _can_be_meant(self, wish: Wish) -> bool:
         """Return whether a wish is for a marker of the robot, and not far away from it."""
-        if not wish.claim.held:
+        if not wish.held:
             return True
         return wish.handle in self.robot.glued_names and wish.target_m is not None and self._is_near(wish.target_m)
 
-    def _is_near(self, place_m: tuple[float, float, float]) -> bool:
-        middle = self.robot.body.mesh.nodes.mean(axis=0)
-        return float(np.linalg.norm(np.subtract(place_m, middle))) <= FAR * self._size
+    def _is_near(self, place_m: FloatArray) -> bool:
+        return float(np.linalg.norm(place_m - self.robot.body.mesh.nodes.mean(axis=0))) <= FAR * self._size
 
     # ---- answers
 
@@ -241,27 +221,28 @@ class DragServer:
             if wish is not None and wish.target_m is not None and not self._stop.is_set():
                 self.answer(wish.handle, wish.target_m)
 
-    def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
+    def answer(self, handle: str, target_m: npt.ArrayLike) -> Motion:
         """Advance the search for a request, publish the result, and set it as the target of the gate.
 
         Measurements of the point while the robot is at rest correct the model's target (see `tip_feedback`).
         """
-        begun = time.perf_counter()
+        begun, target = time.perf_counter(), np.asarray(target_m, dtype=np.float64)
         with self._lock:
             turn, grabbed, self._grabbed = self.gate.turn, self._grabbed, False
-            moves = self.options.gate.allowed and self._wish is not None and self._wish.claim.armed
-            current = {**self.gate.last, **self._current(time.monotonic())} if moves else self._shown()
-            last = self._motion
-            reached = None if last is None else last.reached_m.get(handle)
-            arrived = last is not None and last.status == REACHED
-            since = self._settled()
+            moves = self.options.gate.allowed and self._wish is not None and self._wish.armed
+            current = {**self.gate.last, **self._current()} if moves else self._shown()
+            last, since = self._motion, self._settled()
             wanted = self.feedback.target(
-                time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached, arrived=arrived
+                time.monotonic(),
+                target,
+                settled_since=since,
+                reached_m=None if last is None else last.reached_m.get(handle),
+                arrived=last is not None and last.status == REACHED,
             )
         if grabbed and len(current) == len(self.gate.inputs):
             self._follower.begin(current)
-        if (handle, target_m) != self._wanted:
-            self._wanted, self._still_since = (handle, target_m), begun
+        if (asked := (handle, tuple(target.tolist()))) != self._wanted:
+            self._wanted, self._still_since = asked, begun
         stays = begun - self._still_since >= self.options.rest_s
         motion = self._follower.step({handle: wanted}, seconds=self.options.answer_s, stays=stays)
         if motion.equilibrium.converged:
@@ -269,9 +250,10 @@ class DragServer:
             with self._lock:
                 self.gate.want(motion.inputs, turn=turn)
         self._bones = self._fit(self._skin.positions(motion.positions), start=self._bones)
-        off = float(np.linalg.norm(self.feedback.expected(motion.reached_m[handle]) - np.array(target_m)))
-        asked = replace(motion, error_m=off)  # the search used the corrected target
-        self._tell((self._bones, self._document(handle, asked, 1e3 * (time.perf_counter() - begun))))
+        off = float(
+            np.linalg.norm(self.feedback.expected(motion.reached_m[handle]) - target)
+        )  # the search used the corrected target
+        self._tell((self._bones, self._document(handle, replace(motion, error_m=off), 1e3 * (time.perf_counter() - begun))))
         return motion
 
     def _tell(self, answer: tuple[FloatArray, dict[str, Any]] | None = None) -> None:
@@ -280,12 +262,10 @@ class DragServer:
             self._answer = answer or self._answer
             if self._answer is None:
                 return
-            self._seq += 1
             bones, document = self._answer
-            document = {"header": header(self._seq, time.time(), "robot"), **document, "armed": self.gate.moving}
-            ghost = pose_bytes(self._seq, time.time(), bone_rows(bones))
-            found = json.dumps(document).encode()
-            self.hub.publish([Message(topic(self.name, GHOST), ghost), Message(topic(self.name, REACH), found)])
+            ghost = pose_bytes(next(self._numbers[Kind.GHOST]), time.time(), bone_rows(bones))
+            reach = self._message(Kind.REACH, **document, armed=self.gate.moving)
+            self.hub.publish([Message(topic(self.name, Kind.GHOST), ghost), reach])
 
     def _settled(self) -> float | None:
         """Return since when the commanded inputs are those of the newest answer, or None."""
@@ -295,30 +275,28 @@ class DragServer:
             self._settled_since = time.monotonic()
         return self._settled_since
 
-    def _why_not_measured(self, handle: str, now: float) -> str:
-        """Return in words why a point is not corrected at a time [s]; empty if it is measured, or was never measured."""
-        fresh, ago = self.options.feedback.fresh_s, now - self._measured_at.get(handle, float("-inf"))
-        if ago <= fresh or not (self._measured_at or self._unmeasured):
+    def _why_not_measured(self, handle: str) -> str:
+        """Return in words why a point is not corrected; empty if it is measured, or was never measured."""
+        fresh, now, (told_at, why) = self.options.feedback.fresh_s, time.monotonic(), self._unmeasured
+        ago = now - self._measured_at.get(handle, float("-inf"))
+        if ago <= fresh or not (self._measured_at or why):
             return ""
-        if now - self._unmeasured_at <= fresh:
-            return f"; not measured: {self._unmeasured}"
+        if now - told_at <= fresh:
+            return f"; not measured: {why}"
         return f"; not measured: {f'nothing for {ago:.1f} s' if np.isfinite(ago) else f'no measured position of {handle} is'}"
 
     def _document(self, handle: str, motion: Motion, ms: float) -> dict[str, Any]:
-        units = {one.name: one.unit for one in self.gate.inputs}
         missed = self.feedback.missed_m
-        unknown = self._why_not_measured(handle, time.monotonic())
-        measured = unknown if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm away from there"
-        known = {} if np.isnan(missed) else {"measured_error_m": missed}
-        begins = "" if self._is_known(time.monotonic()) else BEGINS
+        measured = self._why_not_measured(handle) if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm away from there"
+        is_known = self.gate.last or len(self._reported()) == len(self.gate.inputs) or not self.options.gate.allowed
         return {
             "status": motion.status,
-            "text": in_plain_words(motion) + measured + begins,
+            "text": in_plain_words(motion) + measured + ("" if is_known else BEGINS),
             "error_m": motion.error_m,
-            **known,
+            "measured_error_m": missed,
             "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
             "ms": ms,
-            "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in motion.inputs.items()],
+            "inputs": self._rows(motion.inputs),
         }
 
     # ---- commands
@@ -328,7 +306,7 @@ class DragServer:
         was_moving = False
         while not self._stop.wait(1.0 / self.options.gate.command_hz):
             with self._lock:
-                inputs = self.gate.step(time.monotonic(), self._current(time.monotonic()))
+                inputs = self.gate.step(time.monotonic(), self._current())
                 moving = self.gate.moving
                 expired = self.lease.expire(time.monotonic())
             if expired:
@@ -350,39 +328,25 @@ class DragServer:
         self._tell()
 
     def _command(self, inputs: Mapping[str, float], *, armed: bool) -> None:
-        units = {one.name: one.unit for one in self.gate.inputs}
-        document = {
-            "header": header(self._commands, time.time(), "robot"),
-            "armed": armed,
-            "expires_s": self.options.gate.hold_s,
-            "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in inputs.items()],
-        }
-        self._commands += 1
-        self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
+        told = {"armed": armed, "expires_s": self.options.gate.hold_s, "inputs": self._rows(inputs)}
+        self.hub.publish([self._message(Kind.COMMAND, **told)])
 
-    def _current(self, now: float) -> dict[str, float]:
-        """Return the robot's inputs at a time [s], as far as it reports them on `measured`.
+    def _reported(self) -> dict[str, float]:
+        """Return the inputs that the robot reports on `measured`, unless that is too long ago."""
+        at, inputs = self._told
+        return inputs if time.monotonic() - at <= self.options.feedback.fresh_s else {}
+
+    def _current(self) -> dict[str, float]:
+        """Return the robot's inputs, as far as it reports them.
 
         Before the first command the topic `inputs` is used too; after it this is not valid: a replayed run would report its recorded inputs.
         """
-        told = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
-        return told if self.gate.last else {**self._shown(), **told}
-
-    def _is_known(self, now: float) -> bool:
-        """Return whether the starting point of commands is known at a time [s]: reported by the robot, or its last command."""
-        fresh = self._told if now - self._told_at <= self.options.feedback.fresh_s else {}
-        return bool(self.gate.last) or len(fresh) == len(self.gate.inputs) or not self.options.gate.allowed
+        return self._reported() if self.gate.last else {**self._shown(), **self._reported()}
 
     def _shown(self) -> dict[str, float]:
         """Return the inputs of the displayed state."""
-        message = self.hub.newest().get(topic(self.name, INPUTS))
-        return self._values((message and read_document(message.payload)) or {})
-
-    def _values(self, told: Mapping[str, Any]) -> dict[str, float]:
-        """Return the inputs in a document, as far as they are in the units of commands."""
-        units = {one.name: one.unit for one in self.gate.inputs}
-        known = [(str(row.get("name")), row.get("unit"), row.get("value")) for row in rows_of(told, "inputs")]
-        return {name: float(v) for name, unit, v in known if unit == units.get(name, "") and is_number(v)}
+        message = self.hub.newest().get(topic(self.name, Kind.INPUTS))
+        return {} if message is None else read_report(message.payload, self.gate.inputs).inputs
 
 
 def _top(limit: float | None, unit: str) -> float:

@@ -18,10 +18,19 @@ class Message:
     payload: bytes
 
     @property
+    def robot(self) -> str:
+        """The robot of the topic; empty for a topic of others."""
+        return (split_topic(self.topic) or ("", ""))[0]
+
+    @property
+    def kind(self) -> str:
+        """Its kind, one of `Kind` or another program's; empty for a topic of others."""
+        return (split_topic(self.topic) or ("", ""))[1]
+
+    @property
     def retained(self) -> bool:
         """Whether a client that connects later receives the message immediately."""
-        known = split_topic(self.topic)
-        return known is not None and known[1] in RETAINED
+        return self.kind in RETAINED
 
 
 class Sink(Protocol):

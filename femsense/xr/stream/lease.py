@@ -14,6 +14,8 @@ import time
 from dataclasses import dataclass
 from enum import Enum
 
+from femsense.xr.stream.drag_messages import Wish
+
 KNOWN = 1000
 """Clients whose numbers are remembered."""
 GRACE = 4.0
@@ -39,20 +41,6 @@ class _Known:
     """Number of stops when it sent its last message that was not armed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """The sender information of a message."""
-
-    way: str
-    """How it came: the connection of a WebSocket, the name of a broker's client, or the broker."""
-    client: str
-    seq: int
-    number: int
-    """Number of the lease; 0: a request for one."""
-    held: bool
-    armed: bool
-
-
 class Lease:
     """The lease of one robot."""
 
@@ -69,30 +57,30 @@ class Lease:
         self._known: dict[tuple[str, str], _Known] = {}
         self._stops = 0
 
-    def rule(self, claim: Claim, now: float) -> Ruling:
+    def rule(self, wish: Wish, now: float) -> Ruling:
         """Return whether a message that arrives at a time [s] is accepted."""
-        who = (claim.way, claim.client)
+        who = (wish.way, wish.client)
         known = self._known.pop(who, _Known(-1))
         self._known[who] = known
         if len(self._known) > KNOWN:
             del self._known[next(iter(self._known))]
-        if claim.seq <= known.seq:
+        if wish.seq <= known.seq:
             return Ruling.OLD
-        known.seq = claim.seq
-        if not claim.armed:
+        known.seq = wish.seq
+        if not wish.armed:
             known.disarmed = self._stops
-        if not claim.held:
+        if not wish.held:
             return self._release(who)
-        if claim.number:
-            renewed = claim.number == self.number and who == self._holder and self.is_held(now)
+        if wish.number:
+            renewed = wish.number == self.number and who == self._holder and self.is_held(now)
             self._renewed_at = now if renewed else self._renewed_at
             return Ruling.RENEWED if renewed else Ruling.OLD
         if self._holder not in (None, who) and now - self._renewed_at <= GRACE * self.hold_s:
             return Ruling.REFUSED
-        if claim.armed and known.disarmed < self._stops:
+        if wish.armed and known.disarmed < self._stops:
             return Ruling.REFUSED
         self.number += 1
-        self.client, self._holder, self._renewed_at, self.stopped = claim.client, who, now, False
+        self.client, self._holder, self._renewed_at, self.stopped = wish.client, who, now, False
         return Ruling.GRANTED
 
     def is_held(self, now: float) -> bool:

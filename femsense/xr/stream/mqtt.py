@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import socket
@@ -22,7 +21,7 @@ from femsense.xr.stream.access import Access
 from femsense.xr.stream.connecting import NO_ANSWER, NO_BROKER, not_let_in, why_not
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.packet_limit import PacketLimit
-from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, STOP, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import PREFIX, RECEIVED, Kind, status_bytes, topic
 from femsense.xr.stream.server_thread import ServerThread
 
 if TYPE_CHECKING:
@@ -61,34 +60,6 @@ def broker_address(text: str, *, password: str | None = None, authority: Path | 
     return BrokerAddress(parts.hostname, port or (TLS_PORT if tls else PLAIN_PORT), user, known, tls, authority)
 
 
-class Refusal:
-    """Why a client is not connected to a broker."""
-
-    def __init__(self, client: Client, address: BrokerAddress) -> None:
-        """Register for failures before the broker answers."""
-        self.text = NO_ANSWER
-        self._address, self._said = address, False
-        client.on_connect_fail = self._failed
-
-    def refused(self, reason: Any) -> bool:
-        """Return whether the broker's answer to a client is that it may not come in."""
-        self._said = bool(reason.is_failure)
-        if self._said:
-            is_password = any(word in str(reason).lower() for word in ("password", "not authorized"))
-            self.text = not_let_in(password=self._address.password is not None) if is_password else str(reason)
-        return self._said
-
-    def closed(self, *, was_connected: bool) -> None:
-        """Take note of the end of a connection."""
-        if was_connected or not self._said:
-            self.text = NO_ANSWER if was_connected or self._address.tls else NO_BROKER
-        self._said = False
-
-    def _failed(self, _client: Any, _data: Any) -> None:
-        error = sys.exc_info()[1]  # paho calls this while it handles the system's exception
-        self.text = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
-
-
 class MqttLink(ABC):
     """A client of a broker that reconnects by itself."""
 
@@ -96,10 +67,12 @@ class MqttLink(ABC):
         """Prepare a client that listens to the topics that filters name. Raises MissingDependency."""
         self._address, self._topics = address, topics
         self._client = make_client(address)
-        self._refusal = Refusal(self._client, address)
-        self.connected = Event()
-        self.was_connected = False
-        self._client.on_connect = self._greet
+        self.connected, self.was_connected = Event(), False
+        self.answered = Event()
+        """Set when the broker has accepted or refused the client."""
+        self._why = NO_ANSWER
+        self._is_refused = False
+        self._client.on_connect, self._client.on_connect_fail = self._greet, self._fail
         self._client.on_disconnect = self._leave
         self._client.on_message = lambda _c, _d, got: self._hear(Message(got.topic, bytes(got.payload)), kept=bool(got.retain))
 
@@ -111,7 +84,7 @@ class MqttLink(ABC):
     @property
     def trouble(self) -> str:
         """Why there is no connection; empty with one."""
-        return "" if self.connected.is_set() else self._refusal.text
+        return "" if self.connected.is_set() else self._why
 
     def close(self) -> None:
         """Disconnect cleanly, so that the last will is not sent."""
@@ -123,14 +96,24 @@ class MqttLink(ABC):
         """Take a message; `kept`: the broker had it from earlier."""
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if self._refusal.refused(reason):
-            return
-        client.subscribe([(one, 0) for one in self._topics])
-        self.connected.set()
-        self.was_connected = True
+        self._is_refused = bool(reason.is_failure)
+        if self._is_refused:
+            is_password = any(word in str(reason).lower() for word in ("password", "not authorized"))
+            self._why = not_let_in(password=self._address.password is not None) if is_password else str(reason)
+        else:
+            client.subscribe([(one, 0) for one in self._topics])
+            self.connected.set()
+            self.was_connected = True
+        self.answered.set()
+
+    def _fail(self, _client: Any, _data: Any) -> None:
+        error = sys.exc_info()[1]  # paho calls this while it handles the system's exception
+        self._why = NO_ANSWER if error is None else why_not(error, tls=self._address.tls, password=False)
 
     def _leave(self, *_: object) -> None:
-        self._refusal.closed(was_connected=self.connected.is_set())
+        if not self._is_refused:
+            self._why = NO_ANSWER if self.connected.is_set() or self._address.tls else NO_BROKER
+        self._is_refused = False
         self.connected.clear()
 
 
@@ -145,7 +128,7 @@ class MqttSink(MqttLink):
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
         super().__init__(address, WANTED)
         self.hub = hub
-        self._client.will_set(topic(robot, STATUS), status_bytes("lost"), qos=0, retain=True)
+        self._client.will_set(topic(robot, Kind.STATUS), status_bytes("lost"), qos=0, retain=True)
         self._waiting: dict[str, Message] = {}
         self._lock = Lock()
         self._packets = PacketLimit(f"{address.host}:{address.port}")
@@ -169,7 +152,7 @@ class MqttSink(MqttLink):
 
     def _hear(self, message: Message, *, kept: bool) -> None:
         """Pass on messages of others. Retained ones are no current requests and are ignored, except a stop."""
-        if not kept or message.topic.endswith(f"/{STOP}"):
+        if not kept or message.kind == Kind.STOP:
             self.hub.received(message, "MQTT")
 
     def _greet(self, *told: Any) -> None:
@@ -219,20 +202,11 @@ def lets_anybody_in(address: BrokerAddress, timeout_s: float = 3.0) -> bool | No
     """Return whether a broker accepts a client without a name and password; None if it does not answer in time [s]."""
     if address.user is None:
         return True
-    answered, accepted = Event(), []
-    client = make_client(replace(address, user=None, password=None))
-
-    def answer(_client: Any, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        accepted.append(not reason.is_failure)
-        answered.set()
-
-    client.on_connect = answer
-    client.connect_async(address.host, address.port)
-    client.loop_start()
-    answered.wait(timeout_s)
-    client.disconnect()
-    client.loop_stop()
-    return accepted[0] if accepted else None
+    stranger = MqttSource(replace(address, user=None, password=None), lambda _: None)
+    answered = stranger.answered.wait(timeout_s)
+    accepted = stranger.was_connected
+    stranger.close()
+    return accepted if answered else None
 
 
 def make_client(address: BrokerAddress) -> Client:
@@ -278,18 +252,14 @@ class EmbeddedBroker(ServerThread):
         self._access, self._hub = access or Access(), hub
         self._access.tls()  # raises early if the certificate is invalid
         self._broker: Any = None
-        self._deliveries: set[asyncio.Task[None]] = set()
         self._arrived: set[str] = set()
-        failed = self._start()
-        if failed is not None:
-            raise InputError(
-                "the broker cannot be served", where=f"port {port}", found=failed, hint="--mqtt HOST, if one runs there"
-            ) from None
+        hint = "--mqtt HOST, if one runs there"
+        self._start("the broker cannot be served", where=f"port {port}", hint=hint)
         hub.attach(self)
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to clients; returns at once."""
-        self._call(self._take, messages)
+        self._call(self._broker.hand_out, messages)
 
     @property
     def clients(self) -> int:
@@ -316,20 +286,8 @@ class EmbeddedBroker(ServerThread):
         await self._broker.shutdown()
 
     def _hear(self, message: Message, who: str) -> None:
-        known = split_topic(message.topic)
-        if known is not None and known[1] in RECEIVED:
+        if message.kind in RECEIVED:
             self._hub.received(message, who)
-
-    def _take(self, messages: tuple[Message, ...]) -> None:
-        delivery = self._loop.create_task(self._deliver(messages))
-        self._deliveries.add(delivery)
-        delivery.add_done_callback(self._deliveries.discard)
-
-    async def _deliver(self, messages: tuple[Message, ...]) -> None:
-        for message in messages:
-            if message.retained:
-                await self._broker.retain_message(None, message.topic, message.payload, 0)
-            await self._broker.internal_message_broadcast(message.topic, message.payload, 0)
 
 
 def _free_port() -> int:

@@ -15,33 +15,43 @@ import json
 import re
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, freeze
-from femsense.core.errors import InputError
+from femsense.core.arrays import FloatArray
 from femsense.xr.landmarks import Landmarks
 
 PREFIX = "femsense"
-MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, FIELD, STATUS = (
-    "model",
-    "glb",
-    "pose",
-    "pose_json",
-    "force",
-    "inputs",
-    "cloud",
-    "field",
-    "status",
-)
-DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
-LEASE, STOP = "lease", "stop"
-RECEIVED = (DRAG, MEASURED, STOP)
-"""Topics that clients may send: requests, measured markers of the robot, and the stop of all motion."""
-RETAINED = (MODEL, GLB, STATUS)
+
+
+class Kind(StrEnum):
+    """The kinds of messages, the last part of a topic."""
+
+    MODEL = "model"
+    GLB = "glb"
+    POSE = "pose"
+    POSE_JSON = "pose_json"
+    FORCE = "force"
+    INPUTS = "inputs"
+    CLOUD = "cloud"
+    FIELD = "field"
+    STATUS = "status"
+    DRAG = "drag"
+    GHOST = "ghost"
+    REACH = "reach"
+    COMMAND = "command"
+    MEASURED = "measured"
+    LEASE = "lease"
+    STOP = "stop"
+
+
+RECEIVED = (Kind.DRAG, Kind.MEASURED, Kind.STOP)
+"""What clients may send: requests, measured markers of the robot, and the stop of all motion."""
+RETAINED = (Kind.MODEL, Kind.GLB, Kind.STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"
 FRAMES = {"robot": "robot: right-handed, Z up", "markers": "markers: as they were measured, not the robot's"}
@@ -49,17 +59,7 @@ FRAMES = {"robot": "robot: right-handed, Z up", "markers": "markers: as they wer
 POSE_HEAD = struct.Struct("<4sIdHH")
 CLOUD_HEAD = struct.Struct("<4sIdI")
 POSE_MAGIC, CLOUD_MAGIC, FIELD_MAGIC = b"FSP1", b"FSC1", b"FSV1"
-MOST_BONES, MOST_POINTS = 255, 20_000
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Pose:
-    """The bones of a robot at one time."""
-
-    seq: int
-    time_s: float
-    bones: npt.NDArray[np.float32]
-    """x y z [m] and the quaternion x y z w of each bone, robot frame, shape (B, 7)."""
+MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,7 +146,7 @@ class TwinFrame:
 
     time_s: float
     bones: npt.NDArray[np.float32]
-    """As in `Pose`, shape (B, 7)."""
+    """x y z [m] and the quaternion x y z w of each bone, shape (B, 7)."""
     contacts: tuple[Contact, ...] | None = ()
     """None: no estimator runs."""
     inputs: tuple[float, ...] = ()
@@ -197,20 +197,6 @@ def pose_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes
     return head + np.ascontiguousarray(bones, dtype="<f4").tobytes()
 
 
-def read_pose(payload: bytes) -> Pose:
-    """Return the pose in a message. Raises InputError."""
-    if len(payload) < POSE_HEAD.size:
-        raise InputError("not a pose", where="payload", found=f"{len(payload)} bytes", expected="a header of 20 bytes")
-    magic, seq, time_s, count, _ = POSE_HEAD.unpack_from(payload)
-    size = POSE_HEAD.size + 28 * count
-    if magic != POSE_MAGIC or len(payload) != size or count > MOST_BONES:
-        raise InputError(
-            "not a pose", where="payload", found=f"{magic!r}, {count} bones, {len(payload)} bytes", expected=f"FSP1, {size} bytes"
-        )
-    bones = np.frombuffer(payload, "<f4", 7 * count, POSE_HEAD.size).reshape(count, 7)
-    return Pose(seq, time_s, freeze(bones, np.float32))
-
-
 def cloud_bytes(seq: int, time_s: float, points: npt.ArrayLike) -> bytes:
     """Return a message of measured points and residuals [m], shape (n, 4)."""
     rows = np.ascontiguousarray(points, dtype="<f4").reshape(-1, 4)[:MOST_POINTS]
@@ -232,65 +218,63 @@ def header(seq: int, time_s: float, frame_id: str) -> dict[str, Any]:
     return {"seq": seq, "stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": frame_id}
 
 
+def document_bytes(seq: int, time_s: float, frame_id: str = "robot", **told: Any) -> bytes:
+    """Return a numbered JSON message of a moment [s]: its header, and what is told. Numbers that are not finite are left out."""
+    return _json({"header": header(seq, time_s, frame_id), **told})
+
+
 def model_bytes(twin: Twin, glb_url: str) -> bytes:
     """Return the retained description of a twin."""
     import hashlib
 
-    bones = [{"name": name, **_pose_table(row)} for name, row in zip(twin.bone_names, bone_rows(twin.T_robot_bone))]
     known = twin.landmarks
-    return _json(
-        _known(
-            {
-                "schema": SCHEMA,
-                "name": twin.name,
-                "glb": glb_url,
-                "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
-                "frame": FRAMES[twin.frame],
-                "length_unit": "m",
-                "force_unit": "N",
-                "pose": "FSP1",
-                "bones": bones,
-                "inputs": [
-                    _known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high, "range": i.range}) for i in twin.inputs
-                ],
-                "handles": [{"name": h.name, "position_m": _vector(h.position_m)} for h in twin.handles],
-                "commands": twin.commands,
-                "markers": [{"name": m.name, "position_m": _vector(m.position_m)} for m in known.markers],
-                "cameras": [{"name": c.name, "position_m": _vector(c.position_m)} for c in known.cameras],
-                "duration_s": twin.duration_s,
-                "error_m": twin.error_m,
-                **({"field": {"name": twin.field.name, "unit": twin.field.unit}} if twin.field else {}),
-            }
-        )
-    )
+    document = {
+        "schema": SCHEMA,
+        "name": twin.name,
+        "glb": glb_url,
+        "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
+        "frame": FRAMES[twin.frame],
+        "length_unit": "m",
+        "force_unit": "N",
+        "pose": "FSP1",
+        "bones": [{"name": name, **_pose_table(row)} for name, row in zip(twin.bone_names, bone_rows(twin.T_robot_bone))],
+        "inputs": twin.inputs,
+        "handles": twin.handles,
+        "commands": twin.commands,
+        "markers": known.markers,
+        "cameras": known.cameras,
+        "duration_s": twin.duration_s,
+        "error_m": twin.error_m,
+        "field": None if twin.field is None else {"name": twin.field.name, "unit": twin.field.unit},
+    }
+    return _json(document)
 
 
 def force_bytes(seq: int, frame: TwinFrame, frame_id: str = "robot") -> bytes:
     """Return contacts and forces of a moment, in the frame of reference `frame_id`, with standard deviations, and intervals of markers."""
-    document: dict[str, Any] = {
-        "header": header(seq, frame.time_s, frame_id),
-        "frame": frame.frame,
-        "status": frame.status,
-        "residual_m": frame.residual_m,
-        "run_s": frame.run_s,
-    }
-    if frame.contacts is not None:
-        document["contacts"] = [_contact_table(contact) for contact in frame.contacts]
-    if frame.interval_m:
-        document["markers"] = [{"name": name, "interval_m": radius} for name, radius in frame.interval_m.items()]
-    return _json(_known(document))
+    return document_bytes(
+        seq,
+        frame.time_s,
+        frame_id,
+        frame=frame.frame,
+        status=frame.status,
+        residual_m=frame.residual_m,
+        run_s=frame.run_s,
+        contacts=None if frame.contacts is None else [_contact_table(one) for one in frame.contacts],
+        markers=[{"name": name, "interval_m": radius} for name, radius in frame.interval_m.items()] or None,
+    )
 
 
 def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Sequence[float], frame_id: str = "robot") -> bytes:
     """Return the inputs of the robot at a moment."""
-    rows = [_known({"name": i.name, "unit": i.unit, "value": float(v)}) for i, v in zip(inputs, values)]
-    return _json({"header": header(seq, time_s, frame_id), "inputs": rows})
+    rows = [{"name": i.name, "unit": i.unit, "value": float(v)} for i, v in zip(inputs, values)]
+    return document_bytes(seq, time_s, frame_id, inputs=rows)
 
 
 def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike], detail: str = "") -> bytes:
     """Return where markers of a robot were measured, name → place [m], robot frame, shape (3,); `detail`: why they were not."""
-    rows = [{"name": name, "position_m": _vector(place)} for name, place in markers.items()]
-    return _json({"header": header(seq, time_s, "robot"), "markers": rows, **({"detail": detail} if detail else {})})
+    rows = [{"name": name, "position_m": np.asarray(place)} for name, place in markers.items()]
+    return document_bytes(seq, time_s, markers=rows, detail=detail or None)
 
 
 def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:
@@ -300,7 +284,7 @@ def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> 
     These are local poses of the bones under the node `robot_frame` of the GLB file,
     or under any transform that is turned by −90° about x.
     """
-    return _json({"header": header(seq, time_s, "unity"), "poses": [_pose_table(row) for row in in_unity(bones)]})
+    return document_bytes(seq, time_s, "unity", poses=[_pose_table(row) for row in in_unity(bones)])
 
 
 def in_unity(bones: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -313,7 +297,7 @@ def status_bytes(state: str, detail: str = "", since_s: float = float("nan")) ->
 
     `since_s`: time of the data of the last pose [s since 1970]; left out if there was none.
     """
-    return _json(_known({"state": state, "detail": detail, "since_s": since_s}))
+    return _json({"state": state, "detail": detail, "since_s": since_s})
 
 
 def read_document(payload: bytes, *, most: int = 1 << 20) -> dict[str, Any] | None:
@@ -327,36 +311,27 @@ def read_document(payload: bytes, *, most: int = 1 << 20) -> dict[str, Any] | No
     return value if isinstance(value, dict) else None
 
 
-def _contact_table(contact: Contact) -> dict[str, Any]:
-    c = contact
-    known = _known({"std_n": c.std_n, "radius_m": c.radius_m})
-    vectors = {"force_std_n": c.force_std_n, "point_std_m": c.point_std_m}
-    known |= {name: _vector(value) for name, value in vectors.items() if np.isfinite(value).all()}
-    return {
-        "contact": c.contact,
-        "track": c.track,
-        "source": c.source,
-        "point_m": _vector(c.point_m),
-        "force_n": _vector(c.force_n),
-        "size_n": float(np.linalg.norm(c.force_n)),
-        **known,
-    }
-
-
 def _pose_table(row: npt.NDArray[np.float32]) -> dict[str, Any]:
     x, y, z, qx, qy, qz, qw = (round(float(v), 9) for v in row)
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
 
 
-def _vector(values: npt.ArrayLike) -> dict[str, float]:
-    x, y, z = (float(v) for v in np.asarray(values))
-    return {"x": x, "y": y, "z": z}
+def _contact_table(contact: Contact) -> dict[str, Any]:
+    return {**_plain(contact), "size_n": float(np.linalg.norm(contact.force_n))}
 
 
-def _known(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out numbers that are not finite, which JSON lacks."""
-    return {key: value for key, value in table.items() if not (isinstance(value, float) and not np.isfinite(value))}
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: fields of dataclasses, and x, y, z of vectors, without any that is None or not finite."""
+    if is_dataclass(value):
+        value = {one.name: getattr(value, one.name) for one in fields(value)}
+    if isinstance(value, np.ndarray):
+        return dict(zip("xyz", value.tolist())) if np.isfinite(value).all() else None
+    if isinstance(value, Mapping):
+        return {key: plain for key, own in value.items() if (plain := _plain(own)) is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(own) for own in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _json(value: Mapping[str, Any]) -> bytes:
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+    return json.dumps(_plain(value), allow_nan=False, separators=(",", ":")).encode()

@@ -10,15 +10,7 @@ from threading import Event, Lock
 
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import (
-    CLOUD,
-    FIELD,
-    FORCE,
-    GLB,
-    INPUTS,
-    MODEL,
-    POSE,
-    POSE_JSON,
-    STATUS,
+    Kind,
     Twin,
     TwinFrame,
     cloud_bytes,
@@ -49,8 +41,6 @@ class PublishOptions:
     """Of clouds and fields: they are large."""
     json_mirror: bool = False
     """Also `pose_json`, for clients that read only text."""
-    glb_url: str = ""
-    """Address of the mesh; by default next to the page."""
     waits_for: str = FIRST_POSE
     """What the stream waits for before the first pose, in words."""
 
@@ -97,9 +87,8 @@ class Publisher:
     def announce(self, twin: Twin) -> None:
         """Send the description; also later, when it has changed."""
         self.twin = twin
-        glb = topic(twin.name, GLB)
-        url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
-        model = Message(topic(twin.name, MODEL), model_bytes(twin, url))
+        glb = topic(twin.name, Kind.GLB)
+        model = Message(topic(twin.name, Kind.MODEL), model_bytes(twin, f"robots/{glb.split('/')[1]}.glb"))
         with self._lock:
             self.hub.publish([Message(glb, twin.glb), model, self._status(*self._said)])
 
@@ -156,25 +145,27 @@ class Publisher:
     def _status(self, state: str, detail: str = "") -> Message:
         self._said = (state, detail)
         since = self._since if state == "stale" else float("nan")
-        return Message(topic(self.twin.name, STATUS), status_bytes(state, detail, since))
+        return Message(topic(self.twin.name, Kind.STATUS), status_bytes(state, detail, since))
 
     def _messages(self, frame: TwinFrame, moment: float, *, is_new: bool) -> list[Message]:
         """Return the messages of a frame at a time of our clock [s]; its pose only if it is new."""
         seq, name, t = self._seq, self.twin.name, frame.time_s
-        messages = [Message(topic(name, POSE), pose_bytes(seq, t, frame.bones))] if is_new else []
-        messages.append(Message(topic(name, FORCE), force_bytes(seq, frame, self.twin.frame)))
+        messages = [Message(topic(name, Kind.POSE), pose_bytes(seq, t, frame.bones))] if is_new else []
+        messages.append(Message(topic(name, Kind.FORCE), force_bytes(seq, frame, self.twin.frame)))
         if frame.inputs:
-            messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs, self.twin.frame)))
+            messages.append(
+                Message(topic(name, Kind.INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs, self.twin.frame))
+            )
         if self.options.json_mirror and is_new:
-            messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
+            messages.append(Message(topic(name, Kind.POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
         if self._has_cloud and frame.cloud is None:
-            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, [])))  # clears the previous cloud
+            messages.append(Message(topic(name, Kind.CLOUD), cloud_bytes(seq, t, [])))  # clears the previous cloud
             self._has_cloud = False
         elif frame.cloud is not None and self._cloud_limit.allows(moment):
-            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, frame.cloud)))
+            messages.append(Message(topic(name, Kind.CLOUD), cloud_bytes(seq, t, frame.cloud)))
             self._has_cloud = True
         if self.twin.field is not None and frame.field is not None and self._field_limit.allows(moment):
-            messages.append(Message(topic(name, FIELD), field_bytes(seq, t, self.twin.field.largest, frame.field)))
+            messages.append(Message(topic(name, Kind.FIELD), field_bytes(seq, t, self.twin.field.largest, frame.field)))
         return messages
 
 

@@ -8,7 +8,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -40,14 +39,6 @@ Reading = tuple[float, FloatArray]
 """Time [s], and one value per channel; nan if missing."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Made:
-    """A reading, and when it was made [s, monotonic clock]."""
-
-    reading: Reading
-    made_at: float
-
-
 class Readings(Iterator[Reading]):
     """Yields the newest reading of a source; replaced ones are only counted."""
 
@@ -69,7 +60,7 @@ class Readings(Iterator[Reading]):
         """
         self._read, self._stop, self._away, self._age_s = read, stop, away, age_s
         self._begun = time.monotonic()
-        self._clock, self._slot = SenderClock(), Latest[_Made]()
+        self._clock, self._slot = SenderClock(), Latest[tuple[Reading, float]]()  # a reading, and when it was made
         self._first: Any = None
         self._pair: tuple[bytes, FloatArray] | None = None
         self._newest_at = self._late_s = float("nan")
@@ -93,16 +84,15 @@ class Readings(Iterator[Reading]):
         if late is None:
             self.overtaken += 1
             return
-        age = max(late, self._age_s())
-        self._newest_at, self._late_s = arrived - age, late
+        self._newest_at, self._late_s = arrived - max(late, self._age_s()), late
         when = found[0] if np.isfinite(found[0]) else arrived - self._begun
-        self._slot.put(_Made((when, found[1]), arrived - age))
+        self._slot.put(((when, found[1]), self._newest_at))
 
     def __next__(self) -> Reading:
         while not self._stop.is_set():
             if (made := self._slot.take(WAIT_S)) is not None:
-                self.came = made.made_at
-                return made.reading
+                reading, self.came = made
+                return reading
         raise StopIteration
 
     def _pass_over(self, item: Any) -> None:

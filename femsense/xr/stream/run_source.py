@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
@@ -38,12 +38,10 @@ class RunStream:
 
     twin: Twin
     skin: AnimatedSkin
-    frames: tuple[Mapping[str, Any], ...]
-    """As `contacts_of_run` has them, one for each pose."""
+    frames: tuple[TwinFrame, ...]
+    """One for each pose, without its cloud."""
     clouds: MeasuredClouds
     """Measured points and residuals of each pose, if the recording still exists."""
-    field: npt.NDArray[np.uint8]
-    """Share of the largest stress at each vertex of each pose, 0 … 255, shape (F, v)."""
 
     @property
     def duration_s(self) -> float:
@@ -78,9 +76,8 @@ def open_run(folder: str | Path, *, clouds: bool = True) -> RunStream:
         duration_s=float(skin.time_s[-1]),
         field=FieldKind(**told["field"], largest=stress.largest),
     )
-    frames = tuple(told["frames"])
-    measured = MeasuredClouds(len(frames), _cloud_reader(run, frames) if clouds else None)
-    return RunStream(twin, skin, frames, measured, stress.shares)
+    frames = tuple(_frame(*pose) for pose in zip(told["frames"], skin.bones, stress.shares))
+    return RunStream(twin, skin, frames, MeasuredClouds(_clouds_of(run, frames) if clouds else ()))
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:
@@ -97,12 +94,12 @@ def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) ->
     while True:
         for k in range(count):
             t = min(k / rate_hz, stream.duration_s)
-            yield _frame(stream, t, offset + t, int(np.abs(times - t).argmin()))
+            yield _at(stream, t, offset + t, int(np.abs(times - t).argmin()))
         if not loop:
             return
         waiting = int(PAUSE_S * rate_hz)
         for k in range(waiting):
-            yield _frame(stream, stream.duration_s, offset + stream.duration_s + (k + 1) / rate_hz, len(times) - 1)
+            yield _at(stream, stream.duration_s, offset + stream.duration_s + (k + 1) / rate_hz, len(times) - 1)
         offset += stream.duration_s + (waiting + 1) / rate_hz
 
 
@@ -117,32 +114,35 @@ def between(times: FloatArray, bones: npt.NDArray[np.float32], t: float) -> npt.
     return np.asarray(rows)
 
 
-def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFrame:
-    told = stream.frames[nearest]
-    inputs = told["inputs"] or ()
+def _at(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFrame:
+    """Return the frame of a time in the run [s], sent at a time of the stream [s]."""
+    bones = between(stream.skin.time_s, stream.skin.bones, t)
+    return replace(stream.frames[nearest], time_s=sent_at, run_s=t, bones=bones, cloud=stream.clouds.at(nearest))
+
+
+def _frame(told: Mapping[str, Any], bones: npt.NDArray[np.float32], field: npt.NDArray[np.uint8]) -> TwinFrame:
+    """Return a frame of `contacts_of_run` with the bones and the field of its pose."""
     return TwinFrame(
-        time_s=sent_at,
-        bones=between(stream.skin.time_s, stream.skin.bones, t),
+        time_s=told["time_s"],
+        bones=bones,
         contacts=tuple(_contact(c) for c in told["contacts"] if c["point_m"] and c["force_vector_n"]),
-        inputs=tuple(_or_nan(value) for value in inputs),
+        inputs=tuple(_or_nan(value) for value in told["inputs"] or ()),
         residual_m=_or_nan(told["rms_after_m"]),
         status=told["status"] or "",
         frame=-1 if told["frame"] is None else told["frame"],
-        run_s=t,
-        cloud=stream.clouds.at(nearest),
-        field=stream.field[nearest],
+        field=field,
     )
 
 
 def _contact(told: Mapping[str, Any]) -> Contact:
-    unknown = np.full(3, np.nan)
+    unknown = (np.nan, np.nan, np.nan)
     return Contact(
         contact=told["contact"],
         point_m=np.array(told["point_m"]),
         force_n=np.array(told["force_vector_n"]),
         std_n=_or_nan(told["std_n"]),
-        force_std_n=unknown if told["force_std_n"] is None else np.array(told["force_std_n"]),
-        point_std_m=unknown if told["point_std_m"] is None else np.array(told["point_std_m"]),
+        force_std_n=np.array(told["force_std_n"] or unknown),
+        point_std_m=np.array(told["point_std_m"] or unknown),
         radius_m=_or_nan(told["radius_m"]),
         source=told["source"],
         track=told["track"],
@@ -160,71 +160,51 @@ class MeasuredClouds:
     """Measured points of each pose with their residuals, read in the background in the order of the poses, so that the stream does not
     wait for them (importing the distance library alone takes seconds)."""
 
-    def __init__(self, count: int, read: Callable[[], Callable[[int], Cloud | None] | None] | None) -> None:
-        """Begin to read.
-
-        Arguments:
-            count: number of poses.
-            read: returns a function that reads the cloud of a pose, or None if there are no clouds; called in the background. None: no clouds.
-        """
-        self._found: dict[int, Cloud | None] = {}
+    def __init__(self, clouds: Iterable[Cloud | None]) -> None:
+        """clouds: of each pose, read while they are iterated; None where a pose has none."""
+        self._found: list[Cloud | None] = []
         self._stop = Event()
-        self._thread: Thread | None = None
-        if read is not None:
-            self._thread = Thread(target=self._read_all, args=(count, read), daemon=True, name="femsense-clouds")
-            self._thread.start()
+        self._thread = Thread(target=self._read_all, args=(clouds,), daemon=True, name="femsense-clouds")
+        self._thread.start()
 
     def at(self, k: int) -> Cloud | None:
         """Return points and residuals [m] of a pose, shape (n, 4); None if there are none, or not yet."""
-        return self._found.get(k)
+        return self._found[k] if k < len(self._found) else None
 
     def wait(self) -> None:
         """Return when all are read."""
-        if self._thread is not None:
-            self._thread.join()
+        self._thread.join()
 
     def close(self) -> None:
         """Read no more."""
         self._stop.set()
         self.wait()
 
-    def _read_all(self, count: int, read: Callable[[], Callable[[int], Cloud | None] | None]) -> None:
-        cloud_of = read()
-        if cloud_of is None:
-            return
-        for k in range(count):
+    def _read_all(self, clouds: Iterable[Cloud | None]) -> None:
+        for cloud in clouds:
+            self._found.append(cloud)
             if self._stop.is_set():
                 return
-            self._found[k] = cloud_of(k)
 
 
-def _cloud_reader(run: Path, frames: tuple[Mapping[str, Any], ...]) -> Callable[[], Callable[[int], Cloud | None] | None]:
-    """Return a function that opens the recording of a run and reads a pose's cloud; nothing is opened if it no longer exists."""
+def _clouds_of(run: Path, frames: Iterable[TwinFrame]) -> Iterator[Cloud | None]:
+    """Yield the cloud of each pose of a run; nothing if its recording no longer exists."""
+    from femsense.calib.files import read_calibration
+    from femsense.io.recording_folder import load_recording
+    from femsense.sensing.run_files import read_states
 
-    def opened() -> Callable[[int], Cloud | None] | None:
-        from femsense.calib.files import read_calibration
-        from femsense.io.recording_folder import load_recording
-        from femsense.sensing.run_files import read_states
-
-        try:
-            document = json.loads((run / "run.json").read_text(encoding="utf-8"))
-            recording = load_recording(document["inputs"]["recording"]["path"])
-            poses = read_calibration(run / "calibration.json").poses
-            states = read_states(run / "states.npz")
-        except (OSError, ValueError, KeyError, TypeError, FemsenseError):
-            return None
-        numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
-        if not recording.has_clouds:
-            return None
-
-        def cloud(k: int) -> Cloud | None:
-            number = numbers.get(frames[k]["frame"], -1)
-            points = _points(recording, number, poses) if number >= 0 and k < len(states.nodes_m) else None
-            return None if points is None else with_residuals(points, states.nodes_m[k], states.tets)
-
-        return cloud
-
-    return opened
+    try:
+        document = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        recording = load_recording(document["inputs"]["recording"]["path"])
+        poses = read_calibration(run / "calibration.json").poses
+        states = read_states(run / "states.npz")
+    except (OSError, ValueError, KeyError, TypeError, FemsenseError):
+        return
+    numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
+    for frame, nodes in zip(frames if recording.has_clouds else (), states.nodes_m):
+        number = numbers.get(frame.frame)
+        points = None if number is None else _points(recording, number, poses)
+        yield None if points is None else with_residuals(points, nodes, states.tets)
 
 
 def _points(recording: Recording, number: int, poses: Sequence[FloatArray]) -> FloatArray | None:

@@ -37,32 +37,22 @@ def sensor_twin(model: ProprioceptiveModel, name: str, worn: UserSkin | None = N
         InputError: the model has no chain, or the surface is not at its bones.
     """
     rest = model.rest_bones
-    if worn is None:
-        skin, triangles = tube_around(rest.positions, rest.T_robot_bone[:, :3, :2])
-    else:
-        skin, triangles = bound_to_chain(worn.rest, rest.positions), worn.triangles
-    still = np.tile(skin.skeleton.T_robot_bone, (1, 1, 1, 1))
-    color, texture = (None, None) if worn is None else (worn.colors, worn.texture)
-    glb = glb_bytes(skin.rest, triangles, skin, still, [0.0], color_rgb=color, texture=texture, name=name)
+    surface = worn or UserSkin(*tube_around(rest.positions, rest.T_robot_bone[:, :3, :2]))
+    skin = bound_to_chain(surface.rest, rest.positions)
+    still = skin.skeleton.T_robot_bone[None]
+    colors, texture = surface.colors, surface.texture
+    glb = glb_bytes(skin.rest, surface.triangles, skin, still, [0.0], color_rgb=colors, texture=texture, name=name)
     inputs = tuple(
         Input(channel, "", float(low), float(high), "learnt")
         for channel, low, high in zip(model.channels, model.domain.low, model.domain.high)
     )
     places = () if model.chain is None else model.chain.rest_points
     marks = tuple(Landmark(label, place) for label, place in zip(model.marker_names, places))
-    known = model.report.get("error_mm")
-    error = 1e-3 * known if isinstance(known, float) else float("nan")
-    landmarks = Landmarks(marks, ())
-    return Twin(
-        name,
-        glb,
-        skin.skeleton.names,
-        skin.skeleton.T_robot_bone,
-        inputs=inputs,
-        frame=model.frame,
-        landmarks=landmarks,
-        error_m=error,
-    )
+    stated = model.report.get("error_mm")
+    error = 1e-3 * stated if isinstance(stated, float) else float("nan")
+    bones = skin.skeleton
+    known = Landmarks(marks, ())
+    return Twin(name, glb, bones.names, bones.T_robot_bone, inputs, landmarks=known, error_m=error, frame=model.frame)
 
 
 def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
@@ -76,15 +66,12 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
         InputError: half of the vertices are farther from the chain than half of its length.
     """
     length = float(np.linalg.norm(np.diff(bones, axis=0), axis=1).sum()) or 1e-3
-    if len(bones) == 1:
-        owner, share, away = np.zeros(len(vertices), np.int64), np.zeros(len(vertices)), np.linalg.norm(vertices - bones, axis=1)
-    else:
-        along = np.diff(bones, axis=0)
-        off = vertices[:, None] - bones[:-1]
-        t = np.clip(np.einsum("vbi,bi->vb", off, along) / np.maximum((along**2).sum(axis=1), 1e-18), 0.0, 1.0)
-        apart = np.linalg.norm(off - t[..., None] * along, axis=2)
-        owner = apart.argmin(axis=1)
-        share, away = (part[np.arange(len(vertices)), owner] for part in (t, apart))
+    along = np.diff(bones, axis=0, append=bones[-1:])  # of no length beyond the last bone, for a chain of one
+    off = vertices[:, None] - bones
+    t = np.clip(np.einsum("vbi,bi->vb", off, along) / np.maximum((along**2).sum(axis=1), 1e-18), 0.0, 1.0)
+    apart = np.linalg.norm(off - t[..., None] * along, axis=2)
+    owner = apart.argmin(axis=1)
+    share, away = (part[np.arange(len(vertices)), owner] for part in (t, apart))
     if np.median(away) > 0.5 * length:
         raise InputError(
             "the skin is not at the model's bones",
@@ -93,11 +80,6 @@ def bound_to_chain(vertices: FloatArray, bones: FloatArray) -> Skin:
             expected=f"at most half of the chain's length, {500.0 * length:.3g} mm",
             hint="--skin-unit, or a surface in the frame in which the markers were measured",
         )
-    return _between_bones(vertices, bones, owner, share)
-
-
-def _between_bones(vertices: FloatArray, bones: FloatArray, owner: IntArray, share: FloatArray) -> Skin:
-    """Return a skin whose vertices follow a bone, shape (v,), and the next one by a share, shape (v,)."""
     weights, joints = np.zeros((len(vertices), INFLUENCES)), np.zeros((len(vertices), INFLUENCES), dtype=np.int64)
     weights[:, 0], weights[:, 1] = 1.0 - share, share
     joints[:, 0], joints[:, 1] = owner, np.minimum(owner + 1, len(bones) - 1)
@@ -139,41 +121,21 @@ def markers_of_sensors(readings: Readings, model: ProprioceptiveModel) -> Iterat
             yield time_s, {} if why else dict(zip(model.marker_names, pose.markers)), why
 
 
-def tube_around(places: FloatArray, across: FloatArray) -> tuple[Skin, IntArray]:
-    """Return a closed tube around a chain of bones, and its triangles, shape (t, 3).
+def tube_around(places: FloatArray, across: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices of a closed tube around a chain of bones [m], shape (v, 3), and outward triangles, shape (t, 3).
 
     Arguments:
         places: positions of the bones at rest, in their order along the body [m], shape (b, 3).
         across: two unit vectors across the body at each bone, shape (b, 3, 2).
-
-    Returns:
-        the skin, its bones with the robot's axes at rest, and triangles that look outward.
     """
+    from trimesh.creation import revolve
+
     b = len(places)
-    length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) or 1e-3
-    half = 0.5 * length / max(b - 1, 1)
-    at = np.linspace(-half, length + half, BETWEEN * b + 1) / (2 * half)  # in bones, from the first
-    k = np.clip(np.floor(at).astype(int), 0, max(b - 2, 0))
-    share = (at - k)[:, None] if b > 1 else np.zeros((len(at), 1))
-    nearest = np.clip(np.rint(at).astype(int), 0, b - 1)
-    middle = (1 - share) * places[k] + share * places[np.minimum(k + 1, b - 1)]
-    angle = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    ring = middle[:, None] + THICKNESS * length * np.einsum("rij,ja->rai", across[nearest], circle)
-    points = np.vstack([ring.reshape(-1, 3), middle[:1], middle[-1:]])
-    blend = np.clip(share[:, 0], 0.0, 1.0)
-    of = np.concatenate([np.repeat(np.arange(len(at)), AROUND), [0, len(at) - 1]])  # the ring of each vertex
-    return _between_bones(points, places, k[of], blend[of]), _tube_triangles(len(at))
-
-
-def _tube_triangles(rings: int) -> IntArray:
-    i = np.arange(AROUND)
-    n = (i + 1) % AROUND
-    found = []
-    for r in range(rings - 1):
-        a, b = r * AROUND, (r + 1) * AROUND
-        found += [np.stack([a + i, a + n, b + i], 1), np.stack([a + n, b + n, b + i], 1)]
-    low, high = rings * AROUND, rings * AROUND + 1
-    last = (rings - 1) * AROUND
-    found += [np.stack([np.full(AROUND, low), n, i], 1), np.stack([np.full(AROUND, high), last + i, last + n], 1)]
-    return np.vstack(found)
+    radius = THICKNESS * (float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) or 1e-3)
+    at = np.linspace(-0.5, b - 0.5, BETWEEN * b + 1)  # in bones, half of one beyond the first and the last
+    straight = revolve([(0.0, at[0]), *((radius, z) for z in at), (0.0, at[-1])], sections=AROUND)
+    xy, z = straight.vertices[:, :2], straight.vertices[:, 2]
+    k = np.clip(np.floor(z).astype(int), 0, max(b - 2, 0))
+    middle = places[k] + (z - k)[:, None] * (places[np.minimum(k + 1, b - 1)] - places[k])
+    nearest = np.clip(np.rint(z).astype(int), 0, b - 1)
+    return middle + np.einsum("vij,vj->vi", across[nearest], xy), np.asarray(straight.faces, dtype=np.int64)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from femsense.core.errors import InputError
 from femsense.xr.stream.connecting import NO_ANSWER, why_not
-from femsense.xr.stream.quiet import stream_log
+from femsense.xr.stream.server_thread import stream_log
 from femsense.xr.stream.websocket import require_websockets
 
 if TYPE_CHECKING:

@@ -19,16 +19,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING
 
 from femsense.core.errors import InputError
 from femsense.core.packages import needed
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import GLB, RECEIVED, split_topic, topic
-from femsense.xr.stream.quiet import stream_log
-from femsense.xr.stream.server_thread import ServerThread
+from femsense.xr.stream.payloads import RECEIVED, Kind, topic
+from femsense.xr.stream.server_thread import ServerThread, stream_log
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -97,11 +95,10 @@ class _Viewer:
     def __init__(self) -> None:
         self.waiting: dict[str, Message] = {}
         self.wake = asyncio.Event()
-        self.gone = False
         self.sent = self.confirmed = self._answered = 0
 
-    def offer(self, messages: Mapping[str, Message]) -> None:
-        self.waiting.update(messages)
+    def offer(self, messages: Iterable[Message]) -> None:
+        self.waiting.update((message.topic, message) for message in messages if message.kind != Kind.GLB)
         self.wake.set()
 
     def confirm(self) -> bool:
@@ -115,10 +112,6 @@ class _Viewer:
     def answer(self, pong: asyncio.Future[float]) -> None:
         """Take note of the answer to a ping; one that never came, since the viewer left, is no error."""
         self._answered += not pong.cancelled() and pong.exception() is None
-        self.wake.set()
-
-    def leave(self) -> None:
-        self.gone = True
         self.wake.set()
 
     def take(self) -> list[Message]:
@@ -158,17 +151,9 @@ class WebSocketServer(ServerThread):
         self.visits = 0
         """Number of viewers so far."""
         self._viewers: set[_Viewer] = set()
-        self._fresh: dict[str, Message] = {}
-        self._lock = Lock()
         self._tls = self.access.tls()
-        failed = self._start()
-        if failed is not None:
-            raise InputError(
-                "the stream cannot be served",
-                where=f"{self.access.host}, port {self.options.port}",
-                found=failed,
-                hint="port 0 takes a free one",
-            ) from None
+        where = f"{self.access.host}, port {self.options.port}"
+        self._start("the stream cannot be served", where=where, hint="port 0 takes a free one")
         hub.attach(self)
 
     @property
@@ -184,12 +169,7 @@ class WebSocketServer(ServerThread):
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to all viewers; returns at once."""
-        with self._lock:
-            first = not self._fresh
-            self._fresh.update((message.topic, message) for message in messages if not message.topic.endswith(f"/{GLB}"))
-            first = first and bool(self._fresh)
-        if first:
-            self._call(self._hand_out)
+        self._call(self._hand_out, messages)
 
     # ---- in the thread of the server
 
@@ -218,39 +198,26 @@ class WebSocketServer(ServerThread):
         self._server.close()
         await self._server.wait_closed()
 
-    def _hand_out(self) -> None:
-        with self._lock:
-            fresh, self._fresh = self._fresh, {}
+    def _hand_out(self, messages: tuple[Message, ...]) -> None:
         for viewer in self._viewers:
-            viewer.offer(fresh)
+            viewer.offer(messages)
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """Send to one viewer until it disconnects; its messages are read concurrently."""
-        from websockets.exceptions import ConnectionClosed
-
+        """Read from one viewer until it disconnects; messages are sent to it concurrently."""
         endpoint = connection.transport.get_extra_info("socket")
         if endpoint is not None:
             endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALLEST_BUFFER)
         viewer = _Viewer()
-        viewer.offer({name: message for name, message in self.hub.newest().items() if not name.endswith(f"/{GLB}")})
+        viewer.offer(self.hub.newest().values())
         self._viewers.add(viewer)
         self.visits += 1
-        listening = asyncio.create_task(self._listen(connection, viewer))
-        listening.add_done_callback(lambda _: viewer.leave())
+        feeding = asyncio.create_task(_feed(connection, viewer))
         try:
-            while not viewer.gone:
-                await viewer.wake.wait()
-                if waiting := viewer.take():
-                    viewer.sent += 1
-                    await connection.send(pack(waiting))
-                    if not viewer.confirmed:
-                        asyncio.ensure_future(await connection.ping()).add_done_callback(viewer.answer)
-        except ConnectionClosed:
-            pass
+            await self._listen(connection, viewer)
         finally:
             self._viewers.discard(viewer)
-            listening.cancel()
+            feeding.cancel()
 
     async def _listen(self, connection: ServerConnection, viewer: _Viewer) -> None:
         """Pass on the requests of a viewer; invalid data and floods end the connection."""
@@ -297,7 +264,7 @@ class WebSocketServer(ServerThread):
     def _content(self, name: str) -> bytes | None:
         """Return a file of the page, or the mesh of a robot; no other file is read."""
         if name.startswith("robots/") and name.endswith(".glb"):
-            message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], GLB))
+            message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], Kind.GLB))
             return None if message is None else message.payload
         if name == "stream.json":
             return json.dumps({"format": "femsense-stream-1", "trouble": self.trouble()}).encode()
@@ -308,6 +275,19 @@ class WebSocketServer(ServerThread):
             return None
 
 
+async def _feed(connection: ServerConnection, viewer: _Viewer) -> None:
+    """Send to a viewer what waits for it, until it disconnects."""
+    from websockets.exceptions import ConnectionClosed
+
+    with contextlib.suppress(ConnectionClosed):
+        while await viewer.wake.wait():
+            if waiting := viewer.take():
+                viewer.sent += 1
+                await connection.send(pack(waiting))
+                if not viewer.confirmed:
+                    asyncio.ensure_future(await connection.ping()).add_done_callback(viewer.answer)
+
+
 def _wanted(frame: str | bytes) -> Message | None:
     """Return the message of a viewer if viewers may send it."""
     if isinstance(frame, str):
@@ -316,8 +296,7 @@ def _wanted(frame: str | bytes) -> Message | None:
         messages = list(unpack(frame))
     except InputError:
         return None
-    known = split_topic(messages[0].topic) if len(messages) == 1 else None
-    return messages[0] if known is not None and known[1] in RECEIVED else None
+    return messages[0] if len(messages) == 1 and messages[0].kind in RECEIVED else None
 
 
 def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = None) -> Response:

@@ -64,11 +64,11 @@ def test_the_papers_network_finds_a_curved_map_and_is_not_misled_by_noise() -> N
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, size=(300, 3))
     clean = lambda x: np.stack([np.sin(x[:, 0]), x[:, 0] * x[:, 1]], axis=1)  # noqa: E731
-    network = train_bayesian(x, clean(x) + 0.1 * rng.normal(size=(300, 2)), rng=rng)
+    network = train_bayesian(x, clean(x) + 0.1 * rng.normal(size=(300, 2)), seed=1)
     fresh = rng.uniform(-2, 2, size=(500, 3))
     assert np.sqrt(((network(fresh) - clean(fresh)) ** 2).mean()) < 0.06
     # of pure noise almost nothing is learnt, where least squares with 62 weights would follow it
-    noise = train_bayesian(x, rng.normal(size=(300, 1)), rng=rng)
+    noise = train_bayesian(x, rng.normal(size=(300, 1)), seed=1)
     assert noise(fresh).std() < 0.25
 
 
@@ -78,7 +78,7 @@ def test_training_does_not_care_for_units() -> None:
     y = np.stack([np.tanh(x[:, 0]), x[:, 1]], axis=1)
     scale, shift = np.array([1e3, 1e-3]), np.array([7.0, -2.0])
     for train in (
-        lambda x, y: train_bayesian(x, y, rng=np.random.default_rng(5), steps=30),
+        lambda x, y: train_bayesian(x, y, seed=5, steps=30),
         lambda x, y: train_ridge(x, y, penalty=1e-3),
         lambda x, y: train_radial(x, y, penalty=1e-3, length=1.0, noise=1e-2),
     ):
@@ -392,5 +392,5 @@ def test_two_frames_beyond_the_others_do_not_select_the_stiffest_map() -> None:
     bent = np.column_stack([np.where(np.abs(x[:, 0]) > 1, 0.2 * np.sign(x[:, 0]), x[:, 0]), x[:, 1]])
     y = bent @ np.array([[0.03, 0.0, 0.01], [0.01, 0.02, 0.0]]) + 2e-4 * rng.normal(size=(40, 3))
     other_day = train_ridge(rng.uniform(-1, 1, (50, 2)), 0.05 * rng.normal(size=(50, 3)), penalty=1.0)
-    chosen, left = explain(Frames(other_day, x, y, np.full(2, 2.0)))
-    assert chosen == "afresh 0.0001" and min(LINEAR, key=lambda name: left[name]) == "base, line 1.0"
+    chosen, errors = explain(Frames(other_day, x, y, np.full(2, 2.0)))
+    assert chosen == "afresh 0.0001" and min(LINEAR, key=lambda name: marker_rms(errors[name])) == "base, line 1.0"

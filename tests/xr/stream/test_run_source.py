@@ -94,14 +94,14 @@ def test_clouds_are_read_beside_the_stream_until_it_is_closed() -> None:
         assert go.wait(10.0)
         return None if k == 1 else np.full((1, 4), k, dtype=np.float32)
 
-    clouds = MeasuredClouds(3, lambda: read)
+    clouds = MeasuredClouds(read(k) for k in range(3))
     assert begun.wait(10.0) and clouds.at(0) is None  # not yet, and nobody waits for it
     go.set()
     clouds.wait()
     assert clouds.at(1) is None and [clouds.at(k)[0, 0] for k in (0, 2)] == [0.0, 2.0]
-    closed = MeasuredClouds(10_000, lambda: lambda k: time.sleep(0.01))
+    closed = MeasuredClouds(time.sleep(0.01) for _ in range(10_000))
     closed.close()  # does not wait for all of them
-    assert MeasuredClouds(3, lambda: None).at(0) is None and MeasuredClouds(3, None).at(0) is None
+    assert MeasuredClouds(()).at(0) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"glTF", b"x" * 40, b"glTF\x02\0\0\0\x1c\0\0\0\x08\0\0\0JSON{}      "])
