@@ -233,8 +233,9 @@ def _place_offset(contact: Touch) -> FloatArray:
 
 
 def _prior(model: Model, here: Point) -> float:
-    """Return |f̃|² + |s̃|²."""
-    return float((whitened(model, here, trust=False)[1] ** 2).sum())
+    """Return |f̃|² + |s̃|², without the normal forces of `_unpulled`."""
+    at = whitened(model, here, trust=False)[1]
+    return float((at**2).sum() - (at[_unpulled(here)] ** 2).sum())
 
 
 def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArray, FloatArray]:
@@ -251,28 +252,10 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
     return np.concatenate(scales), np.concatenate(at)
 
 
-def outward(at: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return the whitened gradient, halved, of λ log |f|² with λ = |f̃|², shape (3,): subtracted from f̃, it leaves no pull along the force.
-
-    Arguments:
-        at: f̃, shape (3,); scale: the prior scales of its components [N], shape (3,).
-    """
-    force = scale * at
-    return np.asarray((at @ at) * scale * force / (force @ force))
-
-
-def _freed(here: Point) -> list[int]:
-    """Return the contacts whose prior does not pull along the force: the visible ones whose τ the evidence chooses."""
-    return [i for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined and here.forces[i].any()]
-
-
-def _gained_along(here: Point, there: Point, at: FloatArray) -> float:
-    """Return Σ λ log(|f|²/|f₀|²) from one point to another, λ = |f̃₀|²; at: whitened parameters at the first one, shape (5m,)."""
-    return sum(
-        float(at[5 * i : 5 * i + 3] @ at[5 * i : 5 * i + 3])
-        * float(np.log(max(there.forces[i] @ there.forces[i], 1e-12) / (here.forces[i] @ here.forces[i])))
-        for i in _freed(here)
-    )
+def _unpulled(here: Point) -> list[int]:
+    """Return the indices, among the parameters, of the normal forces of visible contacts whose τ the evidence chooses. Their prior is uniform in the
+    logarithm, in which the minimum is taken."""
+    return [5 * i for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined]
 
 
 def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
@@ -299,8 +282,6 @@ class Step:
     """Decrease of Φ in the linear problem."""
     phi: float
     """Φ at the start of the step, with these prior scales."""
-    at: FloatArray
-    """Whitened forces and contact points there, shape (5m,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -330,9 +311,7 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
         A = np.eye(len(scales)) + scales[:, None] * gram * scales
         covariance = np.linalg.inv(A)
         pull = np.zeros(len(scales))
-        for i in _freed(here):
-            own = slice(5 * i, 5 * i + 3)
-            pull[own] = outward(at[own], scale[own])
+        pull[_unpulled(here)] = at[_unpulled(here)]
         minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))) + pull)  # of the whitened parameters
         used = tau.copy()
         for i, contact in enumerate(here.contacts):
@@ -346,7 +325,7 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
     decrease = float(change @ A @ change)
     # The step belongs to the scales it was computed with; the next one is computed with those that follow from it.
     phi += _prior(model, replace(here, tau=used))
-    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi, at)
+    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi)
 
 
 def _descended(
@@ -364,7 +343,7 @@ def _descended(
         if there is None:
             continue
         eta, phi, _ = fit_nuisance(there.rows, there.residual, there.N, step.eta, kappa=kappa.of(there.rows.pixel))
-        phi += _prior(model, there) - _gained_along(here, there, step.at)
+        phi += _prior(model, there)
         if phi < step.phi:
             return Lower(there, eta, phi), False
         refused = True
@@ -398,11 +377,9 @@ def _finished(
     X = np.hstack([D * scale, here.N])
     A = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X
     precision = A.copy()
-    for i in _freed(here):
-        own = slice(5 * i, 5 * i + 3)
-        precision[own, own] -= np.outer(at[own], at[own]) / float(at[own] @ at[own])
+    precision[_unpulled(here), _unpulled(here)] -= 1.0
     P = np.linalg.inv(precision)
-    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(A)[1])
+    evidence = phi + float((at**2).sum()) + float(np.linalg.slogdet(A)[1])
     q = model.nuisance.root.shape[1]
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):

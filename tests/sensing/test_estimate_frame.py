@@ -18,7 +18,7 @@ from femsense.model.recording_parts import Tool
 from femsense.sensing.cone import within_cones
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import estimate_frame, sense
-from femsense.sensing.fit import fit, outward
+from femsense.sensing.fit import fit
 from femsense.sensing.model import Candidates, Model
 from femsense.sensing.no_penetration import gap_rows, in_touch
 from femsense.sensing.odds import VISIBLE, odds_of
@@ -195,14 +195,6 @@ def test_a_refuted_proposal_is_not_fitted_again_for_some_frames(tmp_path: Path):
     for error, age, found in ((1e9, 1, 0), (1e9, 11, 1), (0.0, 1, 1)):
         refuted = tuple(Refuted(3 - age, (), one.contacts, error) for one in proposals(model, alone, []))
         assert len(sense(model, 3, replace(free, refuted=refuted)).touches) == found
-
-
-def test_without_the_part_along_the_force_the_prior_only_turns_it():
-    rng = np.random.default_rng(1)
-    for at, scale in zip(rng.normal(size=(5, 3)), rng.uniform(0.1, 2.0, (5, 3))):
-        assert at @ (at - outward(at, scale)) == pytest.approx(0.0, abs=1e-12)
-    along = np.array([2.0, 0.0, 0.0])
-    np.testing.assert_allclose(outward(along, np.array([0.3, 0.15, 0.15])), along)
 
 
 def test_a_gap_moves_with_the_cameras_that_show_its_object(tmp_path: Path):
