@@ -86,7 +86,7 @@ def tie_spacing_text(spacing: TieSpacing, count: int) -> str:
     pulled = "its max_tension_n" if spacing.declared else "what bends the body by 57°"
     return (
         f"cable {spacing.cable!r}: its points are too far apart. The body is free between points {spacing.after} and "
-        f"{spacing.after + 1} of its path ({1e3 * spacing.gap:.3g} mm) and buckles there at {spacing.buckles_at:.3g} N, but the "
-        f"cable may pull {spacing.tension:.3g} N ({pulled}). Where it runs in a channel, give it about "
-        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (femsense docs bodies)"
+        f"{spacing.after + 1} of its path ({1e3 * spacing.gap:.3g} mm) and buckles there at {spacing.buckles_at:.3g} N. The "
+        f"cable may pull {spacing.tension:.3g} N ({pulled}), more than {HELD:.0%} of that: the body leaves the cable. "
+        f"Where it runs in a channel, give it about {int(np.ceil(count * spacing.points_wanted))} points instead of {count} (femsense docs bodies)"
     )

@@ -81,6 +81,15 @@ class Shape:
         """Standard deviation of the fitted radius [m]; inf without one."""
         return np.inf if self.covariance is None else float(np.sqrt(self.covariance[3, 3]))
 
+    def tilt_std(self, offsets: FloatArray) -> FloatArray:
+        """Return the standard deviation of the surface's height at offsets relative to that at their origin [m], shape (k, 3) → (k,).
+
+        The slope of a line through points with the standard deviation σ of their mean, evenly spread over ± h, is known to √3 σ / h.
+        """
+        ways = {"plate": 2, "cylinder": 1}.get(self.kind, 0)
+        share = offsets @ self.axes[:ways].T / np.maximum(self.half[:ways], 1e-9)
+        return np.asarray(np.sqrt(3.0) * self.std_m * np.linalg.norm(share, axis=1))
+
     def moved(self, T: FloatArray) -> Shape:
         """Return the shape moved by a rigid motion, shape (4, 4)."""
         R, t = T[:3, :3], T[:3, 3]

@@ -75,7 +75,7 @@ def run_document(run: Run) -> dict[str, Any]:
     good = [frame for frame in run.frames if frame.status == "ok"]
     strongest, felt = strongest_contact(run.contacts, run.frames), sensed(run.contacts)
     feels = {contact.frame for contact in felt}
-    touched = [frame for frame in good if frame.frame in feels] or good
+    touched = [frame for frame in good if frame.frame in feels] or [frame for frame in run.frames if frame.frame in feels] or good
     return {
         "robot": run.robot.name,
         "frames": len(run.frames),
@@ -141,7 +141,7 @@ def _contact_rows(run: Run, facts: dict[str, Any]) -> list[list[str]]:
         found.append(f"a contact whose size is not determined in {count} frame{'s' if count > 1 else ''}")
     text = "; ".join(found) or "none"
     doubted = len({c.frame for c in sensed(run.contacts)} - {frame.frame for frame in run.frames if frame.status == "ok"})
-    rows = [["contacts", f"{text}, {doubted} of them not ok" if doubted else text]]
+    rows = [["contacts", f"{text}; {doubted} of the frames with a force are not ok" if doubted else text]]
     rows += [[f"frame {c.frame}", undetermined_text(c.force_n, c.std_n)] for c in weak[:LISTED]]
     return rows + ([["", f"{len(weak) - LISTED} more: see frames.csv"]] if len(weak) > LISTED else [])
 

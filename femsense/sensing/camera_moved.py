@@ -32,6 +32,8 @@ LEAST_MM, LEAST_DEG = 0.05, 0.05
 """Smallest motion that is reported: poses are not known better."""
 CLEAR = 2.0
 """A moved camera is fitted only if its J to first order is higher by at most this multiple of EQUAL."""
+FAILED = (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP, Status.SQUEEZED)
+"""Statuses of frames that a moved camera may explain."""
 STEPS, FIRST, STILL = 8, 1, 1e-3
 """Maximum number of pose steps, number of steps before the search may be abandoned, and the share of FAR below which a step is the last."""
 
@@ -56,7 +58,7 @@ def camera_verdict(model: Model, best: Fit, found: Verdict) -> Verdict:
     if best.frame.pixels is None or len(model.sensor.places):
         return found
     inferred = [i for i, contact in enumerate(best.contacts) if contact.source == "shape"]
-    failed = found.status in (Status.NOT_EXPLAINED, Status.LARGE_ERROR_FIELD, Status.BEHIND_BODY, Status.OVERLAP)
+    failed = found.status in FAILED
     if not failed and _stands(model, best, inferred):
         return found
     try:

@@ -233,8 +233,9 @@ def _place_offset(contact: Touch) -> FloatArray:
 
 
 def _prior(model: Model, here: Point) -> float:
-    """Return |f̃|² + |s̃|²."""
-    return float((whitened(model, here, trust=False)[1] ** 2).sum())
+    """Return |f̃|² + |s̃|², without the normal forces of `_unpulled`."""
+    at = whitened(model, here, trust=False)[1]
+    return float((at**2).sum() - (at[_unpulled(here)] ** 2).sum())
 
 
 def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArray, FloatArray]:
@@ -249,6 +250,12 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
         scales += [own, _place_scale(contact, force, limit)]
         at += [(axes @ force) / own, _place_offset(contact)]
     return np.concatenate(scales), np.concatenate(at)
+
+
+def _unpulled(here: Point) -> list[int]:
+    """Return the indices, among the parameters, of the normal forces of visible contacts whose τ the evidence chooses. Their prior is uniform in the
+    logarithm, in which the minimum is taken."""
+    return [5 * i for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined]
 
 
 def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
@@ -303,7 +310,9 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
         scales = np.append(scale, np.ones(here.N.shape[1]))
         A = np.eye(len(scales)) + scales[:, None] * gram * scales
         covariance = np.linalg.inv(A)
-        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))))  # of the whitened parameters
+        pull = np.zeros(len(scales))
+        pull[_unpulled(here)] = at[_unpulled(here)]
+        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))) + pull)  # of the whitened parameters
         used = tau.copy()
         for i, contact in enumerate(here.contacts):
             own = slice(5 * i, 5 * i + 3)
@@ -315,7 +324,8 @@ def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Widt
     change = minimum - np.append(at, eta)
     decrease = float(change @ A @ change)
     # The step belongs to the scales it was computed with; the next one is computed with those that follow from it.
-    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi + _prior(model, replace(here, tau=used)))
+    phi += _prior(model, replace(here, tau=used))
+    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi)
 
 
 def _descended(
@@ -366,8 +376,10 @@ def _finished(
     scale, at = whitened(model, here, trust=False)
     X = np.hstack([D * scale, here.N])
     A = np.eye(X.shape[1]) + (X * weight[:, None]).T @ X
-    P = np.linalg.inv(A)
-    evidence = phi + _prior(model, here) + float(np.linalg.slogdet(A)[1])
+    precision = A.copy()
+    precision[_unpulled(here), _unpulled(here)] -= 1.0
+    P = np.linalg.inv(precision)
+    evidence = phi + float((at**2).sum()) + float(np.linalg.slogdet(A)[1])
     q = model.nuisance.root.shape[1]
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):

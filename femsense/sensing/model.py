@@ -23,7 +23,7 @@ from femsense.pointcloud.primitives import Shape
 from femsense.sensing.marker_rows import marker_rows
 from femsense.sensing.prepare import scan_of
 from femsense.sensing.states import loaded_state
-from femsense.sensing.types import Case, Sensor, Touch
+from femsense.sensing.types import Case, Refuted, Sensor, Touch
 
 STRAY, UNTOLD = 0.01, 1.0
 """Prior ω of a pixel: that it mixes both sides of a depth edge; and that it shows an object in front, without colour that separates it."""
@@ -201,6 +201,8 @@ class Frame:
     """Nodes of the state in which these objects were separated from depth bleeding at the silhouette [m], shape (n, 3)."""
     seen_before: tuple[Shape, ...] = ()
     """Objects of the previous frame."""
+    refuted: tuple[Refuted, ...] = ()
+    """Proposals that did not lower J, here or in the frames before."""
     latent: tuple[Touch, ...] = ()
     """Touching objects that are not contacts of the best hypothesis. Each can carry a small normal force; neglecting it would bias the
     forces of its neighbours and make their intervals too narrow. Empty while hypotheses are compared."""

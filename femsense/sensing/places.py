@@ -25,8 +25,8 @@ NEAR = 0.08
 """Maximum distance of the visible points of a touching object from the body, relative to the body's diagonal."""
 SLACK = 2.0
 """A completed object touches if its gap is less than this many standard deviations."""
-TILT = 1.5e-4
-"""Gaps that differ by less than this are equal: a rod along a face touches along its whole length [m]."""
+FACETS = 1.5e-4
+"""Standard deviation of gaps: the surface of the model is flat between nodes [m]."""
 ZONE = 0.15
 """Maximum extent of a contact about its nearest point, relative to the body's diagonal."""
 HERTZ = float(np.sqrt(5.0 / 2.0))
@@ -239,10 +239,10 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     normals = np.cross(*(state.positions[closest[:, i]] - state.positions[closest[:, 0]] for i in (1, 2)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     apart = np.linalg.norm(places - places[best], axis=1)
-    zone = np.inf if shape.kind == "cylinder" else ZONE * sensor.size
+    zone = np.inf if shape.kind in ("cylinder", "plate") else ZONE * sensor.size
     own = _face_towards(shape, places[best], normals, np.unique(np.flatnonzero(apart < 1e-9) // len(weights)))
     alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (apart < zone)
-    weight = alike * np.exp(-(distance - distance[best]) / _alike_within(sensor, shape, state, places[best], apart))
+    weight = alike * np.exp(-(distance - distance[best]) / _alike_within(sensor, shape, state, places[best], places))
     weight /= weight.sum()
     middle = weight @ rest
     _, spread, axes = np.linalg.svd(np.sqrt(weight)[:, None] * (rest - middle), full_matrices=False)
@@ -268,18 +268,15 @@ def _face_towards(shape: Shape, place: FloatArray, normals: FloatArray, faces: I
     return int(faces[np.argmax(normals[faces] @ towards)])
 
 
-def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatArray, apart: FloatArray) -> FloatArray:
-    """Return the difference below which gaps are equal [m], shape (k,), as a function of their distance from the smallest gap [m].
-
-    Correlated errors of model and camera move neighbouring points together, and points farther apart than the correlation length
-    independently. The tolerance of a rod along the body therefore grows with the distance.
-    """
+def _alike_within(sensor: Sensor, shape: Shape, state: Equilibrium, best: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the standard deviation of the differences of the gaps at places (k, 3) from that at the smallest one [m], shape (k,)."""
     known = sensor.knowledge
+    apart = np.linalg.norm(places - best, axis=1)
     node = int(np.argmin(((state.positions - best) ** 2).sum(axis=1)))
     way = float(np.linalg.norm(state.positions[node] - sensor.robot.body.mesh.nodes[node]))
-    shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way)
-    least = max(0.5 * min(shape.std_m, FLOOR_STD), TILT)
-    return np.asarray(np.maximum(least, shared * np.minimum(1.0, apart / sensor.error_field.length)))
+    shared = np.sqrt(2.0) * np.hypot(known.bias_m, known.model_share * way) * np.minimum(1.0, apart / sensor.error_field.length)
+    tilt = np.sqrt(known.together) * shape.tilt_std(places - best)
+    return np.asarray(np.sqrt(max(0.5 * min(shape.std_m, FLOOR_STD), FACETS) ** 2 + shared**2 + tilt**2))
 
 
 def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:

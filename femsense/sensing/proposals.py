@@ -56,6 +56,13 @@ def proposals(model: Model, best: Fit, seen: Sequence[Touch]) -> list[Proposal]:
     return sorted(found, key=lambda one: -one.gain)
 
 
+def is_alike(model: Model, first: Sequence[Touch], second: Sequence[Touch]) -> bool:
+    """Return whether two hypotheses have the same contacts: at the same places, and hanging weights where the other has them."""
+    return len(first) == len(second) and all(
+        a.pulls == b.pulls and float(np.linalg.norm(a.place - b.place)) < SAME * model.sensor.size for a, b in zip(first, second)
+    )
+
+
 def inferred_gain(model: Model, best: Fit) -> float:
     """Return the decrease of J by an additional inferred contact, marginalised over the candidates."""
     near = vicinity(model, best)

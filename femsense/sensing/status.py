@@ -38,10 +38,10 @@ class Status(Enum):
     PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
     NOT_CONVERGED = "not converged: the forces still changed after the last step"
     SQUEEZED = "squeezed to {percent:.0f} % under a contact, beyond what the law and the mesh hold: its force may be far off"
-    NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.2f} times what contact-free frames let expect"
+    NOT_EXPLAINED = "not explained: {rms_mm:.2f} mm remain, {times:.2f} times the limit that contact-free frames set"
     NOT_EXPLAINED_MARKERS = "not explained: the markers are off by {times:.1f} standard deviations"
     LARGE_ERROR_FIELD = (
-        "not explained: a smooth error takes up the residual, {times:.2f} times what contact-free frames let expect"
+        "not explained: a smooth error takes up the residual, {times:.2f} times the limit that contact-free frames set"
     )
     BEHIND_BODY = "{percent:.0f} % of the points lie behind the body: parts of it may have been taken for something else; set appearance.color_rgb"
     MARKER_MISMATCH = "the markers lie {off_mm:.1f} mm off the body that was found in the cloud"

@@ -194,6 +194,20 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Refuted:
+    """A proposal that was fitted and did not lower J, and the error of its linear prediction."""
+
+    frame: int
+    """Index of the frame in which it was fitted."""
+    before: tuple[Touch, ...]
+    """Contacts of the hypothesis from which it was proposed."""
+    contacts: tuple[Touch, ...]
+    """Its own contacts, as proposed."""
+    error: float
+    """Expected minus actual decrease of J."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class SensedFrame:
     """The result of one frame, from which the next one starts."""
 
@@ -212,6 +226,8 @@ class SensedFrame:
     """Whether the next frame may start from this one."""
     objects: tuple[Shape, ...] = ()
     """Observed objects near the body, so that a ball keeps its radius."""
+    refuted: tuple[Refuted, ...] = ()
+    """Proposals that did not lower J, in this frame or a few before."""
 
 
 @dataclass(eq=False, slots=True)

@@ -27,7 +27,7 @@ from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.proposals import proposals
 from femsense.sensing.status import Status, checked, verdict
-from femsense.sensing.types import Run
+from femsense.sensing.types import Refuted, Run
 
 PUSH = np.array([0.0, 0.0, -0.15])
 
@@ -179,6 +179,22 @@ def test_the_expected_gain_of_a_contact_is_about_that_of_its_fit(tmp_path: Path)
     assert found is not None
     gained = start.criterion - found.criterion
     assert gained > 0.0 and best.gain == pytest.approx(gained, rel=0.5, abs=6.0)
+
+
+def test_a_refuted_proposal_is_not_fitted_again_for_some_frames(tmp_path: Path):
+    model = model_of(touched(tmp_path, PUSH, ball=False))
+    alone = fit(
+        model,
+        estimate_frame(model, 3, None).best.frame,
+        (),
+        np.zeros((0, 3)),
+        estimate_frame(model, 3, None).best.frame.predicted,
+    )
+    assert alone is not None
+    free = sense(model, 2, None)
+    for error, age, found in ((1e9, 1, 0), (1e9, 11, 1), (0.0, 1, 1)):
+        refuted = tuple(Refuted(3 - age, (), one.contacts, error) for one in proposals(model, alone, []))
+        assert len(sense(model, 3, replace(free, refuted=refuted)).touches) == found
 
 
 def test_a_gap_moves_with_the_cameras_that_show_its_object(tmp_path: Path):

@@ -45,3 +45,23 @@ def test_a_rod_is_placed_well_across_it_and_anywhere_along_it(sensor):
         assert stds[1] < 0.003
         assert abs(touch.place[1] - 0.001) < 0.001
         assert abs(touch.place[0] - 0.05) < 2.0 * stds[0]
+
+
+def test_a_plate_on_a_bent_arm_is_placed_as_well_as_its_tilt_is_known(sensor):
+    nodes = sensor.robot.body.mesh.nodes
+    bent = nodes - np.outer(
+        2.0 * (nodes[:, 0] - 0.05) ** 2, [0.0, 0.0, 1.0]
+    )  # curvature 4 / m: 1 mrad moves the place by 0.25 mm
+    state = replace(free_state(sensor, 0, None, None), positions=bent)
+    known = replace(sensor, knowledge=replace(sensor.knowledge, bias_m=0.0))
+    spread = []
+    for std in (1e-5, 1e-4):
+        plate = Shape(
+            "plate", np.array([0.05, 0.0, 0.01]), np.eye(3), np.array([0.02, 0.008, 0.0]), np.inf, std, np.zeros((0, 3))
+        )
+        (touch,) = object_touches(known, [plate], state)
+        spread.append(touch.std_m)
+    assert spread[1] > 1.1 * spread[0]
+    assert plate.tilt_std(np.array([[0.02, 0.0, 0.0], [0.0, 0.004, 0.0]])) == pytest.approx(
+        np.sqrt(3.0) * 1e-4 * np.array([1.0, 0.5])
+    )
