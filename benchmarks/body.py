@@ -2,7 +2,7 @@
 Prints the tables of docs/results/speed.md.
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py
-    [cold|parts|orders|crowded|frames|terms|kept|growth|iterative …] [--data FOLDER]
+    [cold|parts|orders|frames|terms|kept|growth|iterative …] [--data FOLDER]
 
 CPU time of one thread, the least of several runs (what others do on the machine only adds); SOFA's figures are those of
 `reference/cases.json`, measured on a like machine.
@@ -19,7 +19,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -28,9 +27,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from threadpoolctl import ThreadpoolController
 
-import femsense.fem.linalg.cholesky as factoring
 from femsense import BodyModel, Tracker, compliance, embed_points, load_robot, make_body, solve_equilibrium, tie_cable
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.cables import pull_rows
@@ -329,36 +326,6 @@ def kept(data: Path) -> None:
                 print(f"{'tet10' if quadratic else 'tet4 '} {lag} frames old, {name:8}", *(f"{100 * v:10.2g} %" for v in left))
 
 
-def crowded(data: Path) -> None:
-    """The factor of the solid bar of `data/beam` with one and two threads of BLAS,
-    on a machine as it is and with another program on one core."""
-    body = load_robot(data / "beam" / "robot").body
-    state = solve_equilibrium(body)
-    blocks = internal(body, state.positions).blocks
-    assert blocks is not None
-    pattern, values = body.free_map.pattern, reduced_values(body, blocks)
-    analysis = pattern.analysis()
-    assert analysis is not None
-    threads, one_blas_thread = ThreadpoolController(), factoring.one_blas_thread
-    factoring.one_blas_thread = nullcontext
-    for others in (0, 1):
-        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(others)]
-        for count in (1, 2):
-            times = []
-            for _ in range(15):
-                with threads.limit(limits=count, user_api="blas"):
-                    began = time.perf_counter()
-                    factoring.cholesky(analysis, values)
-                    times.append(1e3 * (time.perf_counter() - began))
-            print(
-                f"{others} other programs, {count} threads of BLAS: {np.median(times):6.0f} ms (least {min(times):.0f})",
-                flush=True,
-            )
-        for process in busy:
-            process.kill()
-    factoring.one_blas_thread = one_blas_thread
-
-
 def growth(data: Path, levels: int) -> None:
     """Uniform refinement: each mesh in a process of its own."""
     rows = []
@@ -476,9 +443,7 @@ def one_side(data: Path, level: int, element: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument(
-        "what", nargs="*", default=["cold", "parts", "orders", "crowded", "frames", "terms", "kept", "growth", "iterative"]
-    )
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "orders", "frames", "terms", "kept", "growth", "iterative"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--level", type=int, default=0)
     parser.add_argument("--levels", type=int, default=3)
@@ -498,7 +463,6 @@ if __name__ == "__main__":
             "parts": lambda: parts(given.data),
             "orders": lambda: orders(given.data),
             "frames": lambda: frames(given.data),
-            "crowded": lambda: crowded(given.data),
             "terms": lambda: terms(given.data),
             "kept": lambda: kept(given.data),
             "growth": lambda: growth(given.data, given.levels),

@@ -84,7 +84,7 @@ def one_blas_thread() -> Iterator[None]:
 
     The threads of a call wait for each other. On matrices as large as ours two of them gain a fifth on an idle machine;
     where other threads are busy, ours or another program's,
-    they take twice as long and more (`python benchmarks/body.py crowded`).
+    they take twice as long and more (docs/appendix/mechanics-trials.md).
     """
     with _blas().limit(limits=1, user_api="blas"):
         yield

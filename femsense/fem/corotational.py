@@ -23,8 +23,6 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.simd_code import fetch_ahead
-from femsense.fem.linalg.simd_tiles import add_run, subtract_product
 from femsense.fem.rotation import FAST, closest_rotation, closest_rotation_anyhow, determinant, turning_compliance
 
 LOCAL = 0.75
@@ -125,27 +123,19 @@ def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignor
 @njit(inline="always")
 def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
     """Add T's product to the blocks of the pairs a ≤ b; K is room for it."""
-    width = T.itemsize
-    for pair in range(55):  # work memory of the product
-        fetch_ahead(blocks.ctypes.data + 9 * width * slots[pair], 9 * width)
-    K[:] = 0.0
-    for first, count in ((0, 6), (6, 4)):
-        subtract_product(
-            T,
-            T.ctypes.data,
-            T.ctypes.data + width * (96 + first),
-            STEP,
-            K.ctypes.data + width * first * STEP,
-            STEP,
-            9 * (first + count),
-            count,
-            15,
-        )
-    pair, row = 0, blocks.ctypes.data
+    for b in range(10):
+        for row in range(8 * ((9 * b + 16) // 8)):  # a whole number of registers
+            total = T[0, row] * T[0, 96 + b]
+            for k in range(1, 15):
+                total += T[k, row] * T[k, 96 + b]
+            K[b, row] = total
+    pair = 0
     for a in range(10):
         for b in range(a, 10):
-            add_run(blocks, row + 9 * width * slots[pair], K.ctypes.data + width * (b * STEP + 9 * a), 9)
+            block = blocks[slots[pair]]
             pair += 1
+            for i in range(9):
+                block[i] -= K[b, 9 * a + i]
 
 
 @njit(cache=True, fastmath=FAST)

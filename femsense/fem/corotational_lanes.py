@@ -10,7 +10,6 @@ import numpy as np
 
 from femsense.core.kernels import njit
 from femsense.fem.corotational import LOCAL
-from femsense.fem.linalg.simd_code import fetch_ahead
 from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
@@ -109,8 +108,6 @@ def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type:
     local, rest, theta, whole = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
     first, energy = gradients.ctypes.data, 0.0
     for e in range(len(nodes)):
-        if e + 1 < len(nodes):  # work memory of this group
-            fetch_ahead(first + 8 * (e + 1) * points * wide, 8 * points * wide)
         for a in range(count):
             for q in range(LANES):
                 n, to = nodes[e, a, q], 3 * a * LANES + q

@@ -63,6 +63,17 @@ def _call(typing_context: Any, address: Any, arguments: Any) -> Any:
     return types.void(address, arguments), build
 
 
+@intrinsic
+def numbers_at(typing_context: Any, like: Any, address: Any) -> Any:
+    """Return a pointer to numbers of the kind of the array `like`. It has neither length nor reference count, so that loops stay short."""
+    del typing_context
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.inttoptr(values[1], context.get_value_type(signature.return_type))
+
+    return types.CPointer(like.dtype)(like, address), build
+
+
 @njit(cache=True)
 def gemm(
     blas: Blas,

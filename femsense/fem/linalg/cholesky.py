@@ -16,15 +16,13 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from femsense.core.arrays import FloatArray
-from femsense.core.parallel import one_blas_thread
 from femsense.fem.linalg.blas import blas_of
 from femsense.fem.linalg.multifrontal import factorize
-from femsense.fem.linalg.simd_columns import SIDES
-from femsense.fem.linalg.substitution import add_gram, reach, solve_many, solve_one, solve_sides
+from femsense.fem.linalg.substitution import SIDES, add_gram, reach, solve_few, solve_many
 from femsense.fem.linalg.symbolic import Analysis
 
-MOST_IN_GROUPS = 40
-"""Largest number of right-hand sides that are solved in groups of SIDES."""
+FEW = 24
+"""Largest number of right-hand sides that `solve_few` takes."""
 
 
 class Cholesky:
@@ -44,8 +42,7 @@ class Cholesky:
 
         | right-hand sides | kernel | why |
         |---|---|---|
-        | 1 | `solve_one` | column by column: reading L is most of the time |
-        | 2 to 40, matrix of 3 × 3 blocks | `solve_sides` | L is read once for all; 10 to 16 took half the time of BLAS |
+        | 1 to 24, matrix of 3 × 3 blocks | `solve_few` | plain loops: BLAS copies the panels of L first, which takes most of the time |
         | others | `solve_many` | BLAS is faster for many, and works for any pattern |
         """
         if right.size == 0:
@@ -53,28 +50,17 @@ class Cholesky:
         a = self._analysis
         columns = np.asarray(right).reshape(a.size, -1)
         count = columns.shape[1]
-        if count == 1:
-            ordered = self._solve_one(columns)
-        elif count <= MOST_IN_GROUPS and a.tree.unit == 3:
-            ordered = self._solve_groups(columns)
-        else:
-            ordered = self._solve_many(columns)
+        few = count <= FEW and a.tree.unit == 3
+        ordered = self._solve_few(columns) if few else self._solve_many(columns)
         return ordered[a.rank].astype(np.float64, copy=False).reshape(right.shape)
 
-    def _solve_one(self, column: FloatArray) -> npt.NDArray[Any]:
-        a, kind = self._analysis, self._L.dtype
-        x = column.ravel()[a.order].astype(kind, copy=False)
-        solve_one(a.tree, self._L, x, np.empty(a.size, kind))
-        return x
-
-    def _solve_groups(self, columns: FloatArray) -> npt.NDArray[Any]:
+    def _solve_few(self, columns: FloatArray) -> npt.NDArray[Any]:
         a, kind, count = self._analysis, self._L.dtype, columns.shape[1]
-        groups = -(-count // SIDES)
-        x, work = np.zeros((groups, a.size, SIDES), kind), np.empty((groups, SIDES * a.tallest()), kind)
-        for group, part in zip(x, np.split(columns, range(SIDES, count, SIDES), axis=1)):
-            group[:, : part.shape[1]] = part[a.order]
-        solve_sides(a.tree, self._L, x.reshape(groups, -1), work)
-        return np.concatenate(list(x), axis=1)[:, :count]
+        sides = 1 if count == 1 else -(-count // SIDES) * SIDES
+        x = np.zeros((sides, a.size), kind)
+        x[:count] = columns.T[:, a.order]
+        solve_few(a.tree, self._L, x, np.empty((sides, a.tallest()), kind))
+        return x[:count].T
 
     def _solve_many(self, columns: FloatArray) -> npt.NDArray[Any]:
         a, kind = self._analysis, self._L.dtype
@@ -108,8 +94,7 @@ def cholesky(
     """
     tree, pool, kind = analysis.tree, analysis.pool, "f" if single else "d"
     L, stack = pool.take(kind, analysis.factor_entries), pool.take(kind, tree.stack)
-    with one_blas_thread():
-        definite = factorize(tree, values, tree.source if source is None else source, blas_of(kind), L, stack)
+    definite = factorize(tree, values, tree.source if source is None else source, L, stack)
     pool.give_back(stack)
     if definite:
         return Cholesky(analysis, L)

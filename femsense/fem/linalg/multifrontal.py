@@ -7,128 +7,138 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.blas import Blas, gemm, syrk
-from femsense.fem.linalg.simd_tiles import WIDE, add_run, subtract_and_solve, subtract_product, write_product
+from femsense.fem.linalg.blas import numbers_at
 from femsense.fem.linalg.symbolic import Tree
 
-LARGE = 144
-"""Columns that register tiles factorise at a time; wider fronts also call BLAS. Two solid bars were slower by up to 2 % with 120 columns,
-and with 180 by up to 5 % in double precision (1–2 % faster in single)."""
+
+@njit(cache=True, fastmath={"contract"})
+def _subtract_product(
+    unit: int, like: FloatArray, a: int, step: int, c: int, step_c: int, rows: int, columns: int, depth: int, fresh: bool
+) -> None:
+    """C −= A Bᵀ on and below the diagonal of C (rows, columns), where B is the first rows of A (rows, depth); if `fresh`, C ← −A Bᵀ.
+
+    Matrices stand by columns, A from the address `a` on, `step` bytes from column to column, and C likewise. Their numbers are of the kind
+    of `like`. Three columns of A go into three of C at a time: nine products for six numbers read, as vector instructions.
+    """
+    for j in range(0, columns, unit):
+        n, down = rows - j, like.itemsize * j
+        here = c + j * step_c + down
+        c0, c1, c2 = numbers_at(like, here), numbers_at(like, here + step_c), numbers_at(like, here + 2 * step_c)
+        for m in range(unit if fresh else 0):
+            column = numbers_at(like, here + m * step_c)
+            for i in range(n):
+                column[i] = 0.0
+        for m in range(0, depth, unit):
+            k = a + down + m * step
+            a0, a1, a2 = numbers_at(like, k), numbers_at(like, k + step), numbers_at(like, k + 2 * step)
+            if unit == 3:
+                x0, x1, x2, y0, y1, y2, z0, z1, z2 = a0[0], a0[1], a0[2], a1[0], a1[1], a1[2], a2[0], a2[1], a2[2]
+                for i in range(n):
+                    x, y, z = a0[i], a1[i], a2[i]
+                    c0[i] -= x * x0 + y * y0 + z * z0
+                    c1[i] -= x * x1 + y * y1 + z * z1
+                    c2[i] -= x * x2 + y * y2 + z * z2
+            else:
+                x0 = a0[0]
+                for i in range(n):
+                    c0[i] -= a0[i] * x0
 
 
-@njit(cache=True)
-def _factor_corner(L: FloatArray, at: int, height: int, columns: int, corner: FloatArray) -> bool:
-    """Factorise the first columns ≤ 6 and rows of a panel that begins at `at`; write them to `corner` too,
-    with reciprocal diagonal."""
-    for j in range(columns):
-        pivot = L[at + j * height + j]
-        if not pivot > 0.0:
-            return False
-        inverse = 1.0 / np.sqrt(pivot)
-        corner[j * WIDE + j] = inverse
-        L[at + j * height + j] = pivot * inverse
-        for i in range(j + 1, columns):
-            value = L[at + j * height + i] * inverse
-            L[at + j * height + i] = value
-            corner[i * WIDE + j] = value
-        for k in range(j + 1, columns):
-            scale = corner[k * WIDE + j]
-            for i in range(k, columns):
-                L[at + k * height + i] -= scale * corner[i * WIDE + j]
-    return True
-
-
-@njit(cache=True)
-def _factor_panel(L: FloatArray, start: int, height: int, first: int, last: int, corner: FloatArray) -> bool:
-    """Factorise columns first … last of a panel whose earlier columns are factorised; return False if a pivot is not positive."""
-    width = L.itemsize
-    for j in range(first, last, WIDE):
-        columns, depth = min(WIDE, last - j), j - first
-        at = start + j * height + j
-        left, here = L.ctypes.data + width * (start + first * height + j), L.ctypes.data + width * at
-        subtract_product(L, left, left, height, here, height, columns, columns, depth)
-        if not _factor_corner(L, at, height, columns, corner):
-            return False
-        step, rows = width * columns, height - j - columns
-        subtract_and_solve(L, left + step, left, height, here + step, height, rows, columns, depth, corner.ctypes.data)
+@njit(cache=True, fastmath={"contract"})
+def _factor_node(unit: int, like: FloatArray, at: int, step: int, rows: int) -> bool:
+    """Factorise the columns of a node from its diagonal on, with the products of earlier columns subtracted; return False if a pivot is not positive."""
+    a, b, c = numbers_at(like, at), numbers_at(like, at + step), numbers_at(like, at + 2 * step)
+    if not a[0] > 0.0:
+        return False
+    a[0] = np.sqrt(a[0])
+    p = 1.0 / a[0]
+    if unit == 1:
+        for i in range(1, rows):
+            a[i] *= p
+        return True
+    s, t = a[1] * p, a[2] * p
+    second = b[1] - s * s
+    if not second > 0.0:
+        return False
+    b[1] = np.sqrt(second)
+    q = 1.0 / b[1]
+    u = (b[2] - s * t) * q
+    third = c[2] - t * t - u * u
+    if not third > 0.0:
+        return False
+    c[2] = np.sqrt(third)
+    r = 1.0 / c[2]
+    a[1], a[2], b[2] = s, t, u
+    for i in range(3, rows):
+        x = a[i] * p
+        y = (b[i] - x * s) * q
+        a[i], b[i], c[i] = x, y, (c[i] - x * t - y * u) * r
     return True
 
 
 @njit(cache=True)
 def _add_children(
-    tree: Tree, low: int, high: int, front: int, height: int, child: int, follow: IntArray, pile: int, L: FloatArray
+    tree: Tree, low: int, high: int, like: FloatArray, front: int, step: int, child: int, follow: IntArray, pile: int
 ) -> None:
     """Add the update matrices of a child and its followers to nodes low … high of the columns of a front.
 
     Arguments:
-        front, height: address of the front and rows in it.
+        like, front, step: an array of the kind of the numbers, the address of the diagonal of node `low`, and bytes from column to column.
         child, follow: the first child, and the next child after each (−1: none).
         pile: address of the update matrices.
-        L: the factor, for its kind of numbers.
-
-    The update matrix is added one pair of runs at a time: columns with the same few rows follow each other, which the processor foresees.
     """
-    unit, begin, place, heads, runs, room = tree.unit, tree.begin, tree.place, tree.heads, tree.runs, tree.room
-    node, step = L.itemsize * unit, L.itemsize * height
+    unit, begin, place, room, width = tree.unit, tree.begin, tree.place, tree.room, like.itemsize
     while child != -1:
-        rows, end = place[begin[child] : begin[child + 1]], heads[child + 1]
-        update, size = pile + L.itemsize * room[child], node * len(rows)
-        for c in range(heads[child], end):
-            last = runs[c + 1] if c + 1 < end else len(rows)
-            shift = rows[runs[c]] - runs[c]
-            left, right = max(runs[c], low - shift), min(last, high - shift)
-            for j in range(left, right):
-                to, line = front + (unit * step + node) * (j + shift), update + (unit * size + node) * j
-                for b in range(unit):
-                    add_run(L, to + step * b, line + size * b, unit * (last - j))
-            for r in range(c + 1, end if left < right else c):
-                i, after = runs[r], runs[r + 1] if r + 1 < end else len(rows)
-                to, line = front + unit * step * (left + shift) + node * rows[i], update + unit * size * left + node * i
-                for b in range(unit * (right - left)):
-                    add_run(L, to + step * b, line + size * b, unit * (after - i))
+        rows = place[begin[child] : begin[child + 1]]
+        for j in range(len(rows)):
+            if not low <= rows[j] < high:
+                continue
+            for b in range(unit):
+                column = numbers_at(like, front + step * (unit * (rows[j] - low) + b) - width * unit * low)
+                part = numbers_at(like, pile + width * (room[child] + (unit * j + b) * unit * len(rows)))
+                for i in range(j, len(rows)):
+                    if unit == 3:
+                        r, k = 3 * rows[i], 3 * i
+                        column[r] += part[k]
+                        column[r + 1] += part[k + 1]
+                        column[r + 2] += part[k + 2]
+                    else:
+                        column[rows[i]] += part[i]
         child = follow[child]
 
 
 @njit(cache=True, nogil=True)
-def factorize(tree: Tree, values: FloatArray, source: IntArray, blas: Blas, L: FloatArray, stack: FloatArray) -> bool:
+def factorize(tree: Tree, values: FloatArray, source: IntArray, L: FloatArray, stack: FloatArray) -> bool:
     """Write the factor of a matrix to L; return False where the matrix is not positive definite.
 
     Arguments:
         values: entries of the matrix.
         source: where the entries named by `tree.source` stand in `values`.
-        blas: the routines for the numbers of L.
-        stack: memory for the update matrices, of the same kind, tree.stack entries.
+        stack: memory for the update matrices, of the kind of L, tree.stack entries.
     """
-    width, corner, count = L.itemsize, np.empty(WIDE * WIDE, L.dtype), len(tree.parent)
-    base, pile = L.ctypes.data, stack.ctypes.data
+    unit, width, count, pile = tree.unit, L.itemsize, len(tree.parent), stack.ctypes.data
     head, follow = np.full(count, -1, np.int64), np.empty(count, np.int64)  # children of each supernode as a linked list
     for s in range(count):
         own = tree.firsts[s + 1] - tree.firsts[s]
-        columns, rest = tree.unit * own, tree.unit * (tree.begin[s + 1] - tree.begin[s])
-        height, start, update = columns + rest, tree.offset[s], pile + width * tree.room[s]
+        columns, rest = unit * own, unit * (tree.begin[s + 1] - tree.begin[s])
+        height, start = columns + rest, tree.offset[s]
+        panel, update, step = L.ctypes.data + width * start, pile + width * tree.room[s], width * height
         # assemble the panel
         L[start : tree.offset[s + 1]] = 0.0
         for k in range(tree.entries[s], tree.entries[s + 1]):
             L[start + tree.target[k]] = values[source[k]]
-        _add_children(tree, 0, own, base + width * start, height, head[s], follow, pile, L)
+        _add_children(tree, 0, own, L, panel, step, head[s], follow, pile)
         # factorise it
-        for j in range(0, columns, LARGE):
-            last = min(j + LARGE, columns)
-            if not _factor_panel(L, start, height, j, last, corner):
+        for j in range(0, columns, unit):
+            here = panel + j * (step + width)
+            if j > 0:
+                _subtract_product(unit, L, panel + width * j, step, here, step, height - j, unit, j, False)
+            if not _factor_node(unit, L, here, step, height - j):
                 return False
-            if last < columns:  # A[last:, last:columns] −= X[last:, j:last] X[last:columns, j:last]ᵀ
-                x, y = base + width * (start + j * height + last), base + width * (start + last * height + last)
-                gemm(blas, False, True, height - last, columns - last, last - j, -1.0, x, height, x, height, 1.0, y, height)
         # update matrix: −X Xᵀ with the rows X below, then the parts of the children's update matrices that concern these rows
-        x = base + width * (start + columns)
-        if columns > LARGE and rest > 0:
-            syrk(blas, rest, columns, -1.0, x, height, update, rest)
-        else:
-            for j in range(0, rest, WIDE):
-                here = x + width * j
-                to = update + width * (j * rest + j)
-                write_product(L, here, here, height, to, rest, rest - j, min(WIDE, rest - j), columns)
-        _add_children(tree, own, height, update - width * columns * (rest + 1), rest, head[s], follow, pile, L)
+        if rest > 0:
+            _subtract_product(unit, L, panel + width * columns, step, update, width * rest, rest, rest, columns, True)
+        _add_children(tree, own, height, L, update, width * rest, head[s], follow, pile)
         if tree.parent[s] != -1:
             follow[s] = head[tree.parent[s]]
             head[tree.parent[s]] = s

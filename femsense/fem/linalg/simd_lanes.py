@@ -1,5 +1,9 @@
 # mypy: allow-untyped-decorators, allow-untyped-calls
-"""Sums over the nodes of eight elements at once, as LLVM code."""
+"""Sums over the nodes of eight elements at once, as LLVM code.
+
+LLVM makes no vector instructions of such loops by itself: it would have to compare too many addresses to see that nothing overlaps.
+They would take five times as long, and all forces of a body 2.5 times (docs/appendix/mechanics-trials.md).
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,8 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
-
-from femsense.fem.linalg.simd_code import INTEGER, declared, function_named, kind_of, number, pointer_at
 
 LANES = 8
 """Number of elements on which `add_gradient` and `add_divergence` work at once."""
@@ -22,7 +25,15 @@ def add_gradient(context: Any, like: Any, to: Any, x: Any, slopes: Any, count: A
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.call(_lane_function(builder.module, "gradient", like), values[1:])
+        _, to, x, slopes, count = values
+        sums = [cgutils.alloca_once_value(builder, builder.load(at, align=8)) for at in _rows(builder, to, 64, 9)]
+        with cgutils.for_range(builder, count) as loop:
+            g = _slopes(builder, like, slopes, loop.index)
+            places = [builder.load(at, align=8) for at in _rows(builder, x, 64, 3, loop.index)]
+            for k, total in enumerate(sums):
+                builder.store(_with_product(builder, builder.load(total), places[k // 3], g[k % 3]), total)
+        for total, at in zip(sums, _rows(builder, to, 64, 9)):
+            builder.store(builder.load(total), at, align=8)
         return target.get_dummy_value()
 
     return types.void(like, *[types.int64] * 4), build
@@ -34,55 +45,34 @@ def add_divergence(context: Any, like: Any, to: Any, stress: Any, slopes: Any, c
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.call(_lane_function(builder.module, "divergence", like), values[1:])
+        _, to, stress, slopes, count = values
+        p = [builder.load(at, align=8) for at in _rows(builder, stress, 64, 9)]
+        with cgutils.for_range(builder, count) as loop:
+            g = _slopes(builder, like, slopes, loop.index)
+            for i, at in enumerate(_rows(builder, to, 64, 3, loop.index)):
+                value = builder.load(at, align=8)
+                for j in range(3):
+                    value = _with_product(builder, value, p[3 * i + j], g[j])
+                builder.store(value, at, align=8)
         return target.get_dummy_value()
 
     return types.void(like, *[types.int64] * 4), build
 
 
-def _lane_function(module: Any, name: str, like: Any) -> Any:
-    """Return the function of a loop over nodes: nine products each, eight elements at once."""
-    letter, kind, _ = kind_of(like)
-    function, known = function_named(module, f"femsense_{name}_{letter}", 4)
-    if known:
-        return function
-    wide, given, size = ir.VectorType(ir.DoubleType(), 8), ir.VectorType(kind, 8), 8 if letter == "d" else 4
-    multiply_add = declared(module, "llvm.fmuladd.v8f64", wide, [wide] * 3)
-    builder = ir.IRBuilder(function.append_basic_block("entry"))
-    to, other, slopes, count = function.args
-    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
-    fixed = to if name == "gradient" else other
-    nine = [builder.load(pointer_at(builder, fixed, number(64 * k), wide), align=8) for k in range(9)]
-    builder.branch(loop)
-    builder.position_at_end(loop)
-    node = builder.phi(INTEGER)
-    node.add_incoming(number(0), entry)
-    sums = []
-    if name == "gradient":
-        for value in nine:
-            sums.append(builder.phi(wide))
-            sums[-1].add_incoming(value, entry)
-    place, slope = builder.mul(node, number(192)), builder.add(slopes, builder.mul(node, number(24 * size)))
-    g = [builder.load(pointer_at(builder, slope, number(8 * size * j), given), align=size) for j in range(3)]
-    g = g if letter == "d" else [builder.fpext(value, wide) for value in g]
-    row = builder.add(other if name == "gradient" else to, place)
-    results = []
-    for i in range(3):
-        pointer = pointer_at(builder, row, number(64 * i), wide)
-        value = builder.load(pointer, align=8)
-        if name == "gradient":
-            results += [builder.call(multiply_add, [value, g[j], sums[3 * i + j]]) for j in range(3)]
-            continue
-        for j in range(3):
-            value = builder.call(multiply_add, [nine[3 * i + j], g[j], value])
-        builder.store(value, pointer, align=8)
-    following = builder.add(node, number(1))
-    node.add_incoming(following, loop)
-    for phi, value in zip(sums, results):
-        phi.add_incoming(value, loop)
-    builder.cbranch(builder.icmp_signed("<", following, count), loop, end)
-    builder.position_at_end(end)
-    for k, value in enumerate(results):
-        builder.store(value, pointer_at(builder, to, number(64 * k), wide), align=8)
-    builder.ret_void()
-    return function
+def _rows(builder: Any, address: Any, bits: int, count: int, group: Any = None) -> list[Any]:
+    """Return pointers to the rows of eight numbers from an address on, or to a later group of as many rows."""
+    kind = ir.VectorType(ir.DoubleType() if bits == 64 else ir.FloatType(), LANES).as_pointer()
+    if group is not None:
+        address = builder.add(address, builder.mul(group, group.type(count * LANES * bits // 8)))
+    return [builder.inttoptr(builder.add(address, address.type(row * LANES * bits // 8)), kind) for row in range(count)]
+
+
+def _slopes(builder: Any, like: Any, address: Any, node: Any) -> list[Any]:
+    """Return the three rows of a node's slopes in double precision."""
+    bits = like.dtype.bitwidth
+    rows = [builder.load(at, align=bits // 8) for at in _rows(builder, address, bits, 3, node)]
+    return rows if bits == 64 else [builder.fpext(row, ir.VectorType(ir.DoubleType(), LANES)) for row in rows]
+
+
+def _with_product(builder: Any, total: Any, a: Any, b: Any) -> Any:
+    return builder.fadd(total, builder.fmul(a, b, flags=("contract",)), flags=("contract",))

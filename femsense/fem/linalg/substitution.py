@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Solves with a multifrontal factor: for one right-hand side, a few side by side, many by BLAS, and for sparse ones; compiled."""
+"""Solves with a multifrontal factor: for a few right-hand sides, for many by BLAS, and for sparse ones; compiled."""
 
 from __future__ import annotations
 
@@ -7,135 +7,116 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.blas import Blas, gemm, syrk, trsm
-from femsense.fem.linalg.simd_columns import (
-    SIDES,
-    down_one,
-    down_six,
-    down_six_sides,
-    down_three,
-    down_three_sides,
-    up_one,
-    up_six,
-    up_six_sides,
-    up_three,
-    up_three_sides,
-)
-from femsense.fem.linalg.simd_tiles import add_run
+from femsense.fem.linalg.blas import Blas, gemm, numbers_at, syrk, trsm
 from femsense.fem.linalg.symbolic import Tree
+from femsense.fem.rotation import FAST
+
+SIDES = 3
+"""Number of right-hand sides that `solve_few` takes through the columns of a node at once, if there are several: nine products for six
+numbers read."""
+
+
+@njit(cache=True, fastmath={"contract"})
+def _forward(sides: int, like: FloatArray, at: int, step: int, y: int, line: int, rows: int) -> None:
+    """Eliminate a node, whose three columns begin with the diagonal at the address `at`, from right-hand sides at y, `line` bytes apart."""
+    a, b, c = numbers_at(like, at), numbers_at(like, at + step), numbers_at(like, at + 2 * step)
+    for k in range(sides):
+        u = numbers_at(like, y + k * line)
+        u[0] /= a[0]
+        u[1] = (u[1] - a[1] * u[0]) / b[1]
+        u[2] = (u[2] - a[2] * u[0] - b[2] * u[1]) / c[2]
+    u, v, w = numbers_at(like, y), numbers_at(like, y + line), numbers_at(like, y + 2 * line)
+    u0, u1, u2 = u[0], u[1], u[2]
+    if sides == 1:
+        for i in range(3, rows):
+            u[i] -= a[i] * u0 + b[i] * u1 + c[i] * u2
+        return
+    v0, v1, v2, w0, w1, w2 = v[0], v[1], v[2], w[0], w[1], w[2]
+    for i in range(3, rows):
+        p, q, r = a[i], b[i], c[i]
+        u[i] -= p * u0 + q * u1 + r * u2
+        v[i] -= p * v0 + q * v1 + r * v2
+        w[i] -= p * w0 + q * w1 + r * w2
+
+
+@njit(inline="always")
+def _finish(a, b, c, u, u0, u1, u2):  # type: ignore[no-untyped-def]
+    """Solve with the transposed triangle of a node, given the products with what is below."""
+    u[2] = (u[2] - u2) / c[2]
+    u[1] = (u[1] - u1 - b[2] * u[2]) / b[1]
+    u[0] = (u[0] - u0 - a[1] * u[1] - a[2] * u[2]) / a[0]
+
+
+@njit(cache=True, fastmath=FAST)
+def _backward(sides: int, like: FloatArray, at: int, step: int, y: int, line: int, rows: int) -> None:
+    """Solve for the node, where what is below it is known; the arguments are those of `_forward`."""
+    a, b, c = numbers_at(like, at), numbers_at(like, at + step), numbers_at(like, at + 2 * step)
+    u, v, w = numbers_at(like, y), numbers_at(like, y + line), numbers_at(like, y + 2 * line)
+    u0 = u1 = u2 = v0 = v1 = v2 = w0 = w1 = w2 = like.dtype.type(0.0)
+    if sides == 1:
+        for i in range(3, rows):
+            u0 += a[i] * u[i]
+            u1 += b[i] * u[i]
+            u2 += c[i] * u[i]
+    else:
+        for i in range(3, rows):
+            p, q, r = a[i], b[i], c[i]
+            u0 += p * u[i]
+            u1 += q * u[i]
+            u2 += r * u[i]
+            v0 += p * v[i]
+            v1 += q * v[i]
+            v2 += r * v[i]
+            w0 += p * w[i]
+            w1 += q * w[i]
+            w2 += r * w[i]
+        _finish(a, b, c, v, v0, v1, v2)
+        _finish(a, b, c, w, w0, w1, w2)
+    _finish(a, b, c, u, u0, u1, u2)
 
 
 @njit(cache=True, nogil=True)
-def solve_one(tree: Tree, L: FloatArray, x: FloatArray, half: FloatArray) -> None:
-    """Solve in place for one right-hand side x (f,) in the order of elimination; `half` (f,) is work memory."""
-    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
-    width, base, y = L.itemsize, L.ctypes.data, half.ctypes.data
-    for s in range(len(firsts) - 1):
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        height = columns + unit * (begin[s + 1] - begin[s])
-        for i in range(columns):
-            half[i] = x[c0 + i]
-        for i in range(columns, height):
-            half[i] = 0.0
-        j = 0
-        while j < columns:
-            size = 6 if columns - j >= 6 else 3 if columns - j >= 3 else 1
-            at, to = base + width * (offset[s] + j * height + j), y + width * j
-            left, ahead = height - j - size, width * size * (height + 1)
-            if size == 6:
-                down_six(L, at, height, to, left, ahead)
-            elif size == 3:
-                down_three(L, at, height, to, left, ahead)
-            else:
-                down_one(L, at, height, to, left, ahead)
-            j += size
-        for i in range(columns):
-            x[c0 + i] = half[i]
-        for q in range(begin[s + 1] - begin[s]):
-            line = unit * below[begin[s] + q]
-            for a in range(unit):
-                x[line + a] += half[columns + unit * q + a]
-    for s in range(len(firsts) - 2, -1, -1):
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        height = columns + unit * (begin[s + 1] - begin[s])
-        for i in range(columns):
-            half[i] = x[c0 + i]
-        for q in range(begin[s + 1] - begin[s]):
-            line = unit * below[begin[s] + q]
-            for a in range(unit):
-                half[columns + unit * q + a] = x[line + a]
-        j = columns
-        while j > 0:
-            size = 6 if j >= 6 else 3 if j >= 3 else 1
-            j -= size
-            at, to = base + width * (offset[s] + j * height + j), y + width * j
-            left, ahead = height - j - size, -width * size * (height + 1)
-            if size == 6:
-                up_six(L, at, height, to, left, ahead)
-            elif size == 3:
-                up_three(L, at, height, to, left, ahead)
-            else:
-                up_one(L, at, height, to, left, ahead)
-        for i in range(columns):
-            x[c0 + i] = half[i]
+def solve_few(tree: Tree, L: FloatArray, x: FloatArray, fronts: FloatArray) -> None:
+    """Solve in place for right-hand sides x (k, f), k = 1 or a multiple of SIDES, in the order of elimination, where a node has 3 unknowns.
 
-
-@njit(cache=True, nogil=True)
-def solve_sides(tree: Tree, L: FloatArray, x: FloatArray, half: FloatArray) -> None:
-    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination, where a node has 3 unknowns.
-
-    `half` (g, …) is work memory for the tallest front. All groups go through a panel while it is in the cache.
+    All of them go through a panel while it is in the cache. `fronts` (k, …) is work memory for the tallest front.
     """
-    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
-    width, base, groups = L.itemsize, L.ctypes.data, len(x)
-    line, block = width * SIDES, SIDES * unit
+    firsts, begin, below, width, work = tree.firsts, tree.begin, tree.below, L.itemsize, fronts.ctypes.data
+    sides, line = min(SIDES, len(x)), width * fronts.shape[1]
     for s in range(len(firsts) - 1):
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        height = columns + unit * (begin[s + 1] - begin[s])
-        for g in range(groups):
-            for i in range(SIDES * columns):
-                half[g, i] = x[g, SIDES * c0 + i]
-            for i in range(SIDES * columns, SIDES * height):
-                half[g, i] = 0.0
-        j = 0
-        while j < columns:
-            size = 6 if columns - j >= 6 else 3
-            at, left, ahead = base + width * (offset[s] + j * height + j), height - j - size, width * size * (height + 1)
-            for g in range(groups):
-                if size == 6:
-                    down_six_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
-                else:
-                    down_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
-            j += size
-        for g in range(groups):
-            for i in range(SIDES * columns):
-                x[g, SIDES * c0 + i] = half[g, i]
-            to, y = x[g].ctypes.data, half[g].ctypes.data
-            for q in range(begin[s + 1] - begin[s]):
-                add_run(L, to + width * block * below[begin[s] + q], y + line * (columns + unit * q), block)
+        c0, columns, nodes = 3 * firsts[s], 3 * (firsts[s + 1] - firsts[s]), below[begin[s] : begin[s + 1]]
+        height, panel = columns + 3 * len(nodes), L.ctypes.data + width * tree.offset[s]
+        for r in range(len(x)):
+            for i in range(columns):
+                fronts[r, i] = x[r, c0 + i]
+            for i in range(columns, height):
+                fronts[r, i] = 0.0
+        for r in range(0, len(x), sides):
+            for j in range(0, columns, 3):
+                at, y = panel + width * j * (height + 1), work + line * r + width * j
+                _forward(sides, L, at, width * height, y, line, height - j)
+        for r in range(len(x)):
+            for i in range(columns):
+                x[r, c0 + i] = fronts[r, i]
+            for q in range(len(nodes)):
+                for i in range(3):
+                    x[r, 3 * nodes[q] + i] += fronts[r, columns + 3 * q + i]
     for s in range(len(firsts) - 2, -1, -1):
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        height = columns + unit * (begin[s + 1] - begin[s])
-        for g in range(groups):
-            for i in range(SIDES * columns):
-                half[g, i] = x[g, SIDES * c0 + i]
-            for q in range(begin[s + 1] - begin[s]):
-                source, to = block * below[begin[s] + q], SIDES * (columns + unit * q)
-                for i in range(block):
-                    half[g, to + i] = x[g, source + i]
-        j = columns
-        while j > 0:
-            size = 6 if j >= 6 else 3
-            j -= size
-            at, left, ahead = base + width * (offset[s] + j * height + j), height - j - size, -width * size * (height + 1)
-            for g in range(groups):
-                if size == 6:
-                    up_six_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
-                else:
-                    up_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
-        for g in range(groups):
-            for i in range(SIDES * columns):
-                x[g, SIDES * c0 + i] = half[g, i]
+        c0, columns, nodes = 3 * firsts[s], 3 * (firsts[s + 1] - firsts[s]), below[begin[s] : begin[s + 1]]
+        height, panel = columns + 3 * len(nodes), L.ctypes.data + width * tree.offset[s]
+        for r in range(len(x)):
+            for i in range(columns):
+                fronts[r, i] = x[r, c0 + i]
+            for q in range(len(nodes)):
+                for i in range(3):
+                    fronts[r, columns + 3 * q + i] = x[r, 3 * nodes[q] + i]
+        for r in range(0, len(x), sides):
+            for j in range(columns - 3, -1, -3):
+                at, y = panel + width * j * (height + 1), work + line * r + width * j
+                _backward(sides, L, at, width * height, y, line, height - j)
+        for r in range(len(x)):
+            for i in range(columns):
+                x[r, c0 + i] = fronts[r, i]
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from femsense.core.arrays import IntArray
 from femsense.core.kernels import njit
 from femsense.fem.linalg.ordering import _elimination_tree, _structures
-from femsense.fem.linalg.simd_tiles import PADDING
 
 
 class Tree(NamedTuple):
@@ -43,10 +42,6 @@ class Tree(NamedTuple):
     """Places of these entries in the matrix."""
     target: npt.NDArray[np.int32]
     """Places of these entries in the panel."""
-    heads: IntArray
-    """Where the runs of each supernode begin in `runs`, shape (s + 1,)."""
-    runs: IntArray
-    """First row of each run: rows below that follow each other in the front of the parent as well."""
     room: IntArray
     """Where the update matrix of each supernode stands in work memory until its parent has taken it, shape (s,)."""
     stack: int
@@ -205,22 +200,6 @@ def _targets(
 
 
 @njit(cache=True)
-def _runs(begin: IntArray, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the begin of each supernode's runs of rows that follow each other in the parent's front too,
-    and where each run begins."""
-    heads = np.zeros(len(begin), np.int64)
-    runs = np.empty(len(place), np.int64)
-    k = 0
-    for s in range(len(begin) - 1):
-        for q in range(begin[s], begin[s + 1]):
-            if q == begin[s] or place[q] != place[q - 1] + 1:
-                runs[k] = q - begin[s]
-                k += 1
-        heads[s + 1] = k
-    return heads, runs[:k].copy()
-
-
-@njit(cache=True)
 def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]:
     """Return where the update matrix of each supernode lives until its parent has taken it, and how much room all of them need.
 
@@ -278,8 +257,7 @@ def _layout(
         offset[s + 1] = offset[s] + own * (own + unit * (begin[s + 1] - begin[s]))
     starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below, unit)
     room, stack = _rooms(above, begin, unit)
-    run_heads, runs = _runs(begin, place)
-    return Tree(unit, firsts, above, begin, below, place, offset, starts, source, target, run_heads, runs, room, stack)
+    return Tree(unit, firsts, above, begin, below, place, offset, starts, source, target, room, stack)
 
 
 class Pool:
@@ -295,12 +273,11 @@ class Pool:
         self._zeros: dict[tuple[str, int, int], npt.NDArray[Any]] = {}
 
     def take(self, kind: str, entries: int) -> npt.NDArray[Any]:
-        """Return an array of any content with some entries and PADDING more, up to which the kernels may read."""
-        size = entries + PADDING
+        """Return an array of any content with so many entries."""
         try:
-            return self.idle.setdefault((kind, size), []).pop()
+            return self.idle.setdefault((kind, entries), []).pop()
         except IndexError:
-            return np.empty(size, kind)
+            return np.empty(entries, kind)
 
     def give_back(self, array: npt.NDArray[Any]) -> None:
         """Take over an array that its owner needs no more."""

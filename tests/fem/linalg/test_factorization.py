@@ -103,9 +103,9 @@ def test_a_random_pattern_is_factorised_as_the_dense_matrix(seed: int) -> None:
 
 
 @pytest.mark.parametrize("single", [False, True])
-@pytest.mark.parametrize("count", [1, 2, 8, 9, 17, 40, 41])
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 24, 25])
 def test_any_number_of_right_hand_sides_is_solved_as_by_the_dense_matrix(count: int, single: bool) -> None:
-    """One, groups side by side whose last one is full or not, and as many as BLAS takes."""
+    """One, groups whose last one is full or not, and as many as BLAS takes."""
     body = bar_body(block_mesh((5, 3, 2)), quadratic=True, cables=False)
     pattern, values = body.free_map.pattern, stiffness(body)
     factor = cholesky(pattern.analysis(), values, single=single)
