@@ -1,7 +1,10 @@
 """Newton's method with the exact tangent at one load, with a factor that is kept as long as it converges fast enough.
 
-`newton` solves for a fixed set of taut cables. `settle` repeats it until cables that would push are slack, cables that are too long are
-taut, and friction holds the tensions along the cables.
+`newton` solves for a fixed set of taut cables. `settle` repeats it until every cable that would push is slack, every slack cable has the
+length that its motor leaves it, and friction holds the tensions along the cables.
+
+`State.borrowed` says that the factor was made at another state. It is set by whoever passes such a factor on (a solve that starts from a
+solved state, and `settle` after a change of friction), and reset when `FactorKeeper` makes a new one.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ def settle(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             if state.iterations > state.options.most_steps:
                 return SolveStatus.ITERATIONS
             if not update_slack(body, loads, state):
-                if update_friction(body, loads, state):
+                if not update_friction(body, loads, state):
                     return SolveStatus.CONVERGED
                 state.borrowed = True  # the tensions change little, so the current factor is tried again
                 continue
@@ -51,6 +54,10 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
 
     A step changes the node positions by du [m] and the efforts T of held drives by dT (`NewtonEquations`). Tensions along cables with
     friction follow the bends in the first FOLLOW_FRICTION steps if no drive is held; otherwise they are fixed.
+
+    Returns CONVERGED; SINGULAR without a factor; CABLES if the equations of held cables contradict each other; STALLED if no step lowers
+    the potential or a number is not finite; ITERATIONS after `max_iterations` steps, or for a trial state whose stiffness is indefinite too
+    often.
     """
     keeper, length = FactorKeeper(body, loads, state), np.inf
     here = state.here = internal(body, state.x, tangent=not state.borrowed)

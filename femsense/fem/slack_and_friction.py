@@ -41,8 +41,8 @@ def update_slack(body: BodyModel, loads: Loads, state: State) -> bool:
 
 
 def update_friction(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Update the tensions along cables by capstan friction; return whether they were in equilibrium with the bends already."""
-    still = True
+    """Update the tensions along cables by capstan friction; return whether anything changed."""
+    changed = False
     for i, cable in enumerate(body.cables):
         if cable.friction == 0:
             continue
@@ -50,6 +50,6 @@ def update_friction(body: BodyModel, loads: Loads, state: State) -> bool:
         tensions = capstan_tensions(cable, bend_angles(cable, state.x), loads.before[i], T)
         share = tensions / T if T > 0 else np.zeros_like(tensions)
         if np.abs(share - state.shares[i]).max() * T > 1e-8 * max(1.0, T):
-            still = False
+            changed = True
         state.shares[i] = share
-    return still
+    return changed

@@ -14,32 +14,28 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.inference.mixture import misfit
 from femsense.inference.rows import Rows
 from femsense.model.drive import has_history
-from femsense.pointcloud.primitives import Shape
 from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
 from femsense.sensing.law import BETWEEN, moved_by_law
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
-from femsense.sensing.no_penetration import COMPLETED, gap_std, in_touch, is_rigid, is_with
-from femsense.sensing.places import away_from_scenery, case_of, given_touches, object_touches, objects_near
+from femsense.sensing.no_penetration import is_with
+from femsense.sensing.objects_of_frame import touching_objects, with_expected_objects, with_segmented_objects
+from femsense.sensing.places import away_from_scenery, case_of, given_touches, object_touches
 from femsense.sensing.proposals import SAME, Proposal, elsewhere, is_alike, proposals
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
-from femsense.sensing.status import SQUEEZED, UNDETERMINED, checked, std_along, stretch_under_contacts
+from femsense.sensing.status import SQUEEZED, checked, stretch_under_contacts
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import Case, FrameReport, Refuted, SensedFrame, Touch
+from femsense.sensing.undetermined import with_undetermined
 
 ROUNDS, FITTED = 8, 4
 """Maximum number of rounds of proposals, and of proposals fitted in each."""
 REMEMBERED = 10
 """Number of frames in which the error of a refuted proposal is used."""
-UNDETERMINED_TAU = 2.0
-"""Prior scale of the force at an object in touch whose force the data do not determine [N]; hands and grippers press with so much."""
-MANY = 30
-"""Minimum number of pixels of an object without a known shape that can carry a latent force."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,17 +59,17 @@ def sense(model: Model, k: int, previous: SensedFrame | None) -> SensedFrame:
     contacts = contacts_of(sensor, k, best.contacts, best.forces, covariances, places, best.state, previous)
     stages = {**found.stages_ms, "check": 1e3 * (time.perf_counter() - began)}
     report = FrameReport(
-        int(sensor.recording.frame_numbers[k]),
-        float(sensor.recording.time_s[k]),
-        str(status),
-        len(sensed(contacts)),
-        measurements(best.rows),
-        found.rms_before_m,
-        rms_of(best.rows, inliers(best)),
-        sum(stages.values()),
-        dict(best.state.tension),
-        dict(best.state.pressure),
-        stages,
+        frame=int(sensor.recording.frame_numbers[k]),
+        time_s=float(sensor.recording.time_s[k]),
+        status=str(status),
+        contacts=len(sensed(contacts)),
+        matched=measurements(best.rows),
+        rms_before_m=found.rms_before_m,
+        rms_after_m=rms_of(best.rows, best.of_robot),
+        ms=sum(stages.values()),
+        tension_n=dict(best.state.tension),
+        pressure_pa=dict(best.state.pressure),
+        stages_ms=stages,
     )
     state = replace(best.state, factor=None)
     return SensedFrame(
@@ -113,9 +109,9 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
         start = _carried_over(model, frame, previous)
         best = _without_contacts(model, frame) if start is None else start
         clock.lap("fit")
-        best = _with_objects_in_touch(model, *_searched(model, best))
+        best = with_undetermined(model, *_searched(model, best))
     clock.lap("search")
-    before = rms_of(_without_forces(best), inliers(best))
+    before = rms_of(_without_forces(best), best.of_robot)
     clock.lap("rms")
     return Estimate(best, before, clock.stages)
 
@@ -129,11 +125,6 @@ def covariances_of(model: Model, best: Fit) -> list[FloatArray]:
         model_error = model.compliance_std**2 * np.outer(force, force) + np.outer(by_law[own], by_law[own])
         result.append(best.covariance[own, own] + model_error)
     return result
-
-
-def inliers(best: Fit) -> BoolArray:
-    """Return which measured rows belong to the robot with probability above one half, shape (r,)."""
-    return np.asarray((best.responsibility > 0.5) & (best.rows.pixel if best.rows.pixel.any() else True))
 
 
 def rms_of(rows: Rows, robot: BoolArray) -> float:
@@ -160,13 +151,13 @@ def _searched(model: Model, best: Fit) -> tuple[Fit, list[Touch]]:
     """Return the fit at which no proposal lowers J any more, after ROUNDS at most, and where visible objects touch there. The first proposal that lowers J
     is taken."""
     for _ in range(ROUNDS):
-        best = _with_objects(model, best)
-        touching = _touching(model, best)
+        best = with_segmented_objects(model, best)
+        touching = touching_objects(model, best)
         lower, refuted = _lower(model, best, touching)
         if lower is None:
             return replace(best, frame=replace(best.frame, refuted=refuted)), touching
         best = lower
-    return best, _touching(model, best)
+    return best, touching_objects(model, best)
 
 
 def _lower(model: Model, best: Fit, touching: Sequence[Touch]) -> tuple[Fit | None, tuple[Refuted, ...]]:
@@ -203,108 +194,6 @@ def _promising(model: Model, best: Fit, touching: Sequence[Touch], refuted: Sequ
     return promising
 
 
-def _touching(model: Model, best: Fit) -> list[Touch]:
-    """Return where visible objects touch the state of a fit."""
-    return away_from_scenery(model.sensor, object_touches(model.sensor, best.frame.objects, best.state))
-
-
-def _with_objects(model: Model, best: Fit) -> Fit:
-    """Return a fit with the objects near its state.
-
-    With colour they are segmented again once the state is an edge away from where they were; without, they are the pixels in front that the fit does not
-    take for the robot.
-    """
-    frame = best.frame
-    if frame.scan is None or (frame.coloured and _moved_by(frame.objects_at, best.state) <= model.sensor.surface.edge):
-        return best
-    if frame.coloured:
-        objects = tuple(objects_near(model.sensor, frame.scan, best.state, frame.seen_before))
-        frame = replace(frame, objects_at=best.state.positions)
-        best = replace(best, frame=frame)
-    else:
-        objects = _in_front(model, frame, best.rows, inliers(best), best.state)
-    if len(objects) == len(frame.objects) and all(_is_alike(model, a, b) for a, b in zip(objects, frame.objects)):
-        return best
-    with_objects = replace(frame, objects=objects)
-    again = fit(
-        model, with_objects, best.contacts, best.forces, best.state, eta=best.eta, tau=best.tau, linearised=best.linearised
-    )
-    return best if again is None else again
-
-
-def _moved_by(positions: FloatArray | None, state: Equilibrium) -> float:
-    """Return how far the nodes of a state are from positions at most [m], shape (n, 3); 0 without positions, which a frame without pixels has."""
-    return 0.0 if positions is None else float(np.linalg.norm(state.positions - positions, axis=1).max())
-
-
-def _in_front(model: Model, frame: Frame, rows: Rows, robot: BoolArray, state: Equilibrium) -> tuple[Shape, ...]:
-    """Return the objects formed by the pixels in front of a state that do not belong to the robot; robot: responsibilities, shape (r,)."""
-    assert frame.scan is not None
-    pixels = rows.pixel
-    other = ~robot[pixels] & (rows.residual[pixels] > 0.0)
-    scan = replace(frame.scan, others=frame.scan.camera_points[other], others_view=frame.scan.view[other])
-    return tuple(objects_near(model.sensor, scan, state, frame.seen_before))
-
-
-def _is_alike(model: Model, first: Shape, second: Shape) -> bool:
-    """Return whether two shapes agree within the standard deviation of their surfaces; extents of plates, and of rods along their axis, do not count."""
-    ways = {"plate": first.axes[2:], "cylinder": first.axes[1:]}.get(first.kind, first.axes)
-    apart = float(np.linalg.norm(ways @ (first.center - second.center)))
-    return first.kind == second.kind and apart < max(gap_std(model, first), gap_std(model, second))
-
-
-# --- objects in touch whose force the data do not determine -----------------------------------------------------------------
-
-
-def _with_objects_in_touch(model: Model, best: Fit, touching: Sequence[Touch]) -> Fit:
-    """Return a hypothesis fitted again with the objects in touch that are no contacts of it, whatever J says.
-
-    These objects have no significant force. Left out, they would bias the forces of their neighbours and make the neighbours' intervals too narrow. An object
-    whose surface lies at the body's becomes a contact with a wide prior, another object a latent force. Visible contacts without a significant force get the
-    wide prior, too: of two tips that squeeze a body the pixels determine the difference only, and the τ of highest evidence would make both forces zero.
-    """
-    others = [t for t in touching if _is_object(t) and not any(is_with(c, t.shape) for c in best.contacts)]
-    at_surface = [replace(t, undetermined=True) for t in others if in_touch(model, t, best.state.positions)]
-    latent = [t for t in others if not any(is_with(c, t.shape) for c in at_surface)]
-    if at_surface or latent:
-        best = _under_wide_prior(model, replace(best, frame=replace(best.frame, latent=tuple(latent))), at_surface)
-    return _under_wide_prior(model, best, ()) if any(_insignificant(model, best)) else best
-
-
-def _insignificant(model: Model, best: Fit) -> list[bool]:
-    """Return for each contact whether it is visible and its force is not significant, under a prior that was sized by this force."""
-    return [
-        is_rigid(model, contact) and not contact.undetermined and float(np.linalg.norm(force)) < UNDETERMINED * std_along(best, i)
-        for i, (contact, force) in enumerate(zip(best.contacts, best.forces))
-    ]
-
-
-def _under_wide_prior(model: Model, best: Fit, more: Sequence[Touch]) -> Fit:
-    """Return a hypothesis with more contacts, fitted again with the prior scale UNDETERMINED_TAU for these and for contacts without a significant force.
-
-    The other visible contacts begin with this scale: their τ was sized while the forces opposite to them were zero.
-    """
-    wide = [contact.undetermined or small for contact, small in zip(best.contacts, _insignificant(model, best))]
-    tau = [UNDETERMINED_TAU if is_rigid(model, contact) else own for contact, own in zip(best.contacts, best.tau)]
-    again = fit(
-        model,
-        best.frame,
-        [*(replace(contact, undetermined=own) for contact, own in zip(best.contacts, wide)), *more],
-        np.vstack([best.forces, np.zeros((len(more), 3))]),
-        best.state,
-        eta=best.eta,
-        tau=np.append(tau, np.full(len(more), UNDETERMINED_TAU)),
-        linearised=best.linearised,
-    )
-    return best if again is None else again
-
-
-def _is_object(contact: Touch) -> bool:
-    """Return whether a contact is with an object of known shape, or of at least MANY pixels: fewer may be a part of the scene."""
-    shape = contact.shape
-    return shape is not None and (shape.kind in COMPLETED or len(shape.points) >= MANY)
-
-
 # --- predict ------------------------------------------------------------------------------------------------------------
 
 
@@ -330,22 +219,9 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
     refuted = tuple(one for one in refuted if k - one.frame <= REMEMBERED)
     frame = Frame(k, case, pixels, scan, predicted, tensions, seen_before=seen, refuted=refuted)
     if case is Case.UNKNOWN_CONTACTS:
-        frame = _with_objects_expected(model, frame, expected)
+        frame = with_expected_objects(model, frame, expected)
     clock.lap("objects")
     return frame
-
-
-def _with_objects_expected(model: Model, frame: Frame, expected: Equilibrium) -> Frame:
-    """Return a frame with the objects near the expected state. Without colour there are none before a state has been fitted."""
-    assert frame.scan is not None
-    if frame.coloured:
-        objects = tuple(objects_near(model.sensor, frame.scan, expected, frame.seen_before))
-        return replace(frame, objects=objects, objects_at=expected.positions)
-    if expected is frame.predicted:
-        return frame
-    rows = model.rows(frame, expected)
-    robot = misfit(rows.residual / rows.std, rows.log_other, rows.share)[1] > 0.5
-    return replace(frame, objects=_in_front(model, frame, rows, robot, expected))
 
 
 def _expected(predicted: Equilibrium, previous: SensedFrame | None) -> Equilibrium:

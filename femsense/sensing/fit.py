@@ -7,6 +7,9 @@
     f̃: force over its prior scale;  s̃: shift of the contact point over its standard deviation;  η̃: whitened nuisance with prior mean μ and root R
     X = [D · scales, N]: derivatives of the modelled rows with (f̃, s̃) and η̃, N = C R;  W: weights of the rows, responsibility/(σ² T)
 
+    The normal force f_n of a visible contact has a prior uniform in log f_n, since E chooses its scale τ. The minimum is taken in log f_n, where this prior is
+    flat: f̃_n² is left out while Φ is minimised, and A has 1 less in its diagonal where the covariance is computed from it. E contains both.
+
 Gauss–Newton steps over all of (f̃, s̃, η̃) with iteratively reweighted rows; each state is a new equilibrium. The tangent of one state is kept for those near
 it (chord method). E, which is −2 log evidence up to a constant, is the lower the better.
 """
@@ -15,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 
 import numpy as np
 
@@ -51,6 +55,10 @@ LENGTHS = (1.0, 0.3, 0.1, 0.03)
 """Lengths of a step that are tried."""
 JUMP = 5.0
 """Pixels at the silhouette make Φ jump by so much. A step that failed is shortened only if the shorter one promises a larger decrease."""
+WIDEST = 30.0
+"""κ with which the nuisance is fitted once before the residual gives κ: so many σ away, pixels still pull."""
+FIXED = 1e-5
+"""A contact point that a step moves by less stays [m]."""
 TOLERANCE = 0.1
 """A fit ends where a step lowers Φ by less, and a search where no proposal lowers J by more."""
 LATENT = 0.2
@@ -116,16 +124,16 @@ def fit(
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
         return _finished(model, frame, here, _contact_columns(model, here, linear), linear, eta, True)
-    wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=30.0, steps=1)[0]
+    wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=WIDEST, steps=1)[0]
     kappa = _width(here, wide, frame, catch)
     D, converged = _contact_columns(model, here, linear), False
     for _ in range(STEPS):
         step = _step(model, here, D, eta, kappa)
         here = replace(here, tau=step.tau)
-        lower, settled = _descended(model, frame, here, linear, step, kappa)
-        if lower is None:
+        lower = _descended(model, frame, here, linear, step, kappa)
+        if isinstance(lower, End):
             if kappa.narrow:
-                converged = settled
+                converged = lower is End.MINIMUM
                 break
             kappa = kappa.narrowed()
             continue
@@ -253,9 +261,8 @@ def whitened(model: Model, here: Point | Fit, *, trust: bool) -> tuple[FloatArra
 
 
 def _unpulled(here: Point) -> list[int]:
-    """Return the indices, among the parameters, of the normal forces of visible contacts whose τ the evidence chooses. Their prior is uniform in the
-    logarithm, in which the minimum is taken."""
-    return [5 * i for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined]
+    """Return the indices of f_n of visible contacts among the parameters: those whose prior does not pull (see above)."""
+    return [force_of(i).start for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined]
 
 
 def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
@@ -293,48 +300,77 @@ class Lower:
     phi: float
 
 
-def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Width) -> Step:
-    """Return the Gauss–Newton step from a point, and the prior scales τ of the forces for which it is computed.
+class End(Enum):
+    """Why a step leads to no point of lower Φ."""
 
-    τ of each force maximises the evidence of the linear problem (type-II maximum likelihood): τ² is the mean square of the force's whitened components,
-    expected under the posterior (MacKay 1992). τ stays for contacts whose force is known not to be determined, and at given places where the data leave more
-    than TOLD of the prior variance of the normal force: two opposed fingers determine the difference of their forces only, and τ would shrink both to zero.
-    """
+    MINIMUM = auto()
+    """The linear problem promises less than TOLERANCE, or Φ is not lower at any length of the step."""
+    NO_EQUILIBRIUM = auto()
+    """No length of the step has an equilibrium."""
+
+
+def force_of(i: int) -> slice:
+    """Return the place of the force of contact i among the parameters (force along its axes, contact point) of all contacts."""
+    return slice(5 * i, 5 * i + 3)
+
+
+def place_of(i: int) -> slice:
+    """Return the place of the contact point of contact i among these parameters."""
+    return slice(5 * i + 3, 5 * i + 5)
+
+
+def _step(model: Model, here: Point, D: FloatArray, eta: FloatArray, kappa: Width) -> Step:
+    """Return the Gauss–Newton step from a point, with the prior scales τ of the forces for which its linear problem has the highest evidence."""
     m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=kappa.of(here.rows.pixel))
     DN = np.hstack([D, here.N])
-    weighted = DN * weight[:, None]
-    gram, tau = DN.T @ weighted, here.tau.copy()
+    weighted, tau = DN * weight[:, None], here.tau
+    gram = DN.T @ weighted
     for _ in range(SIZINGS):
-        scale, at = whitened(model, replace(here, tau=tau), trust=True)
+        sized = replace(here, tau=tau)
+        scale, at = whitened(model, sized, trust=True)
         scales = np.append(scale, np.ones(here.N.shape[1]))
         A = np.eye(len(scales)) + scales[:, None] * gram * scales
         covariance = np.linalg.inv(A)
-        pull = np.zeros(len(scales))
-        pull[_unpulled(here)] = at[_unpulled(here)]
-        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))) + pull)  # of the whitened parameters
-        used = tau.copy()
-        for i, contact in enumerate(here.contacts):
-            own = slice(5 * i, 5 * i + 3)
-            variance = np.diag(covariance)[own]
-            if not contact.undetermined and (contact.source != "given" or variance[0] < TOLD):
-                tau[i] = np.clip(tau[i] * np.sqrt((minimum[own] ** 2 + variance).mean()), *TAU)
-        if np.abs(np.log(tau / used)).max(initial=0.0) < SETTLED:
+        prior_mean = np.zeros(len(scales))
+        prior_mean[_unpulled(here)] = at[_unpulled(here)]
+        minimum = covariance @ (scales * (weighted.T @ (here.residual + D @ (at * scale))) + prior_mean)
+        tau = _of_highest_evidence(sized, minimum, np.diag(covariance))
+        if np.abs(np.log(tau / sized.tau)).max(initial=0.0) < SETTLED:
             break
     change = minimum - np.append(at, eta)
-    decrease = float(change @ A @ change)
     # The step belongs to the scales it was computed with; the next one is computed with those that follow from it.
-    phi += _prior(model, replace(here, tau=used))
-    return Step((minimum[: 5 * m] - at) * scale, minimum[5 * m :], used, decrease, phi)
+    return Step(
+        change=(minimum[: 5 * m] - at) * scale,
+        eta=minimum[5 * m :],
+        tau=sized.tau,
+        decrease=float(change @ A @ change),
+        phi=phi + _prior(model, sized),
+    )
 
 
-def _descended(
-    model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width
-) -> tuple[Lower | None, bool]:
-    """Return a point of lower Φ along a step, or None; and, without one, whether the step ends at a minimum of Φ (True) or because no point along it has
-    an equilibrium (False)."""
+def _of_highest_evidence(here: Point, mean: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return the next iterate of the prior scales τ that maximise the evidence of a linear problem (type-II maximum likelihood) [N], shape (m,).
+
+    τ² is the mean square of the whitened components of the force, expected under the posterior (MacKay 1992). τ stays for contacts whose force is known not
+    to be determined, and at given places where the data leave more than TOLD of the prior variance of the normal force: two opposed fingers determine the
+    difference of their forces only, and τ would shrink both to zero.
+
+    Arguments:
+        mean, variance: of the whitened parameters under the posterior with the present τ, shape (p,).
+    """
+    tau = here.tau.copy()
+    for i, contact in enumerate(here.contacts):
+        own = force_of(i)
+        if not contact.undetermined and (contact.source != "given" or variance[own][0] < TOLD):
+            tau[i] = np.clip(tau[i] * np.sqrt((mean[own] ** 2 + variance[own]).mean()), *TAU)
+    return tau
+
+
+def _descended(model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width) -> Lower | End:
+    """Return a point of lower Φ along a step, or why there is none."""
     if step.decrease < TOLERANCE:
-        return None, True
+        return End.MINIMUM
     refused = False
     for length in LENGTHS:
         if refused and length * step.decrease < JUMP:
@@ -345,20 +381,19 @@ def _descended(
         eta, phi, _ = fit_nuisance(there.rows, there.residual, there.N, step.eta, kappa=kappa.of(there.rows.pixel))
         phi += _prior(model, there)
         if phi < step.phi:
-            return Lower(there, eta, phi), False
+            return Lower(there, eta, phi)
         refused = True
-    return None, refused
+    return End.MINIMUM if refused else End.NO_EQUILIBRIUM
 
 
 def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: FloatArray) -> Point | None:
     edge = model.sensor.surface.edge
     contacts, forces = [], here.forces.copy()
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
-        own = step[5 * i : 5 * i + 5]
-        forces[i] += axes.T @ own[:3]
-        way = own[3:] @ ways_of(contact)[0]
+        forces[i] += axes.T @ step[force_of(i)]
+        way = step[place_of(i)] @ ways_of(contact)[0]
         far = float(np.linalg.norm(way))
-        there = moved_to(model.sensor, contact, contact.place + way * min(1.0, edge / far)) if far > 1e-5 else contact
+        there = moved_to(model.sensor, contact, contact.place + way * min(1.0, edge / far)) if far > FIXED else contact
         contacts.append(pressed(model.sensor, there, forces[i]))
     state = model.solve(frame, tuple(contacts), forces, here.state)
     return None if state is None else _point(model, frame, tuple(contacts), forces, here.tau, state, linear)
@@ -383,7 +418,7 @@ def _finished(
     q = model.nuisance.root.shape[1]
     force_map, places, gain = np.zeros((3 * m, 5 * m)), np.zeros((m, 3, 3)), np.zeros(m)
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
-        f, s = slice(5 * i, 5 * i + 3), slice(5 * i + 3, 5 * i + 5)
+        f, s = force_of(i), place_of(i)
         force_map[3 * i : 3 * i + 3, f] = axes.T * scale[f]
         ways, stds = ways_of(contact)
         way = ways.T * (scale[s] if here.forces[i].any() else stds)  # without a force, the contact point is the observed one

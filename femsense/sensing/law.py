@@ -16,7 +16,7 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_near
-from femsense.sensing.fit import whitened
+from femsense.sensing.fit import force_of, whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.types import Sensor
 
@@ -63,7 +63,7 @@ def moved_by_law(model: Model, fit: Fit) -> FloatArray:
     X = np.hstack([fit.D * scale, fit.N])
     WX = X * fit.weight[:, None]
     change = scale * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ moved)[: 5 * m]
-    return np.concatenate([axes.T @ change[5 * i : 5 * i + 3] for i, axes in enumerate(fit.axes)])
+    return np.concatenate([axes.T @ change[force_of(i)] for i, axes in enumerate(fit.axes)])
 
 
 def _unbalanced(body: BodyModel, other: BodyModel, positions: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.calib.condensed_scan import block_side, in_blocks
 from femsense.calib.scan import Scan, pixel_angles, read_scan
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
@@ -29,6 +29,8 @@ STRAY, UNTOLD = 0.01, 1.0
 """Prior ω of a pixel: that it mixes both sides of a depth edge; and that it shows an object in front, without colour that separates it."""
 STALE = 0.03
 """The compliance at the candidates is reused until a node has moved by more than this share of the diagonal. It only ranks candidates."""
+LIKELY = 0.5
+"""A pixel counts as the robot's if it is with a larger probability."""
 PIXELS = 6000
 """Neighbouring pixels are averaged so that about this many pixels of the robot remain in the first frame."""
 
@@ -261,6 +263,11 @@ class Fit:
     def responsibility(self) -> FloatArray:
         """Probability that each row is the robot's, shape (r,)."""
         return np.asarray(self.weight * self.rows.std**2 / self.rows.share)
+
+    @property
+    def of_robot(self) -> BoolArray:
+        """Which pixels, or markers where there are no pixels, show the robot with a probability above LIKELY, shape (r,)."""
+        return np.asarray((self.responsibility > LIKELY) & (self.rows.pixel if self.rows.pixel.any() else True))
 
     def left(self, nuisance: Nuisance) -> FloatArray:
         """Return the whitened residual at the fitted η, shape (r,)."""

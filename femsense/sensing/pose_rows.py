@@ -11,7 +11,7 @@ from femsense.inference.mixture import misfit
 from femsense.inference.nuisance import fit_nuisance
 from femsense.inference.rows import Rows, stacked
 from femsense.sensing.background import off_background
-from femsense.sensing.fit import whitened
+from femsense.sensing.fit import force_of, whitened
 from femsense.sensing.model import Fit, Frame, Model
 
 FAR = 0.1
@@ -83,7 +83,7 @@ def cost_of_moving(model: Model, best: Fit, removed: Sequence[int]) -> float:
     residual = best.left(model.nuisance) * best.rows.std + best.N @ best.eta
     for i in removed:
         kept[5 * i : 5 * i + 5] = False
-        own = slice(5 * i, 5 * i + 3)
+        own = force_of(i)
         residual = residual + D[:, own] @ (at[own] * scale[own])
     D, at = D[:, kept] * scale[kept], at[kept]
     residual = residual + D @ at

@@ -17,7 +17,7 @@ from femsense.fem.mesh import vertex_normals
 from femsense.inference.mixture import first_width, misfit
 from femsense.inference.rows import Rows
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, fit, force_scale, whitened
+from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, fit, force_of, force_scale, whitened
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.no_penetration import is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
@@ -414,7 +414,7 @@ def _on_other_side(model: Model, best: Fit, i: int) -> Fit | None:
 def _gain_at_own_place(near: Vicinity, i: int) -> float:
     """Return the decrease of −2 log evidence by contact i at its own position."""
     own, contact = near.own(i), near.fit.contacts[i]
-    scale = near.scale[5 * i : 5 * i + 3]
+    scale = near.scale[force_of(i)]
     XWX = near.K - np.eye(len(near.K))
     sites = Sites(
         (near.X[:, own].T @ (near.weight * near.left)) / scale,

@@ -90,7 +90,7 @@ def cholesky(
         analysis: from `analyse`.
         values: entries in CSC order, shape (nnz,).
         single: work in single precision (errors of 1e-7 times the condition of the matrix: a preconditioner).
-        source: for values in another order, the places in `values` of the entries that `analysis.tree.source` names.
+        source: where `values` are in another order: entry j in CSC order is values[source[j]] for each j that `analysis.tree.source` lists, in its order.
     """
     tree, pool, kind = analysis.tree, analysis.pool, "f" if single else "d"
     L, stack = pool.take(kind, analysis.factor_entries), pool.take(kind, tree.stack)
