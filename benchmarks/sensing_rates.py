@@ -34,19 +34,16 @@ def print_rates(points: int, folder: Path) -> None:
     """Print a table: seconds before the first frame, then the median processor time of each stage over touched frames, of untouched ones, and frames a second.
 
     Linear elements meet a body of the same linear elements, made by the rig. Quadratic ones meet a body of quadratic elements on another mesh, of
-    another law, made by another program (`independent`). Recordings and rows that are in the folder are taken from there.
+    another law, made by another program (`independent`). Recordings that are in the folder are taken from there.
     """
     print(f"data/diamond, {points} points a frame, one touch; processor time [ms], medians of touched frames")
     print("beside: the paper 143 (7 Hz, all of it), SOFA 16-19 (its quadratic programme alone)")
     print(
-        "| | ready [s] | on the robot | equilibrium | read | objects | fit | search | state | check | together | rate | first contact | untouched | not ok |"
+        "| | ready [s] | on the robot | equilibrium | read | objects | fit | search | rms | check | together | rate | first contact | untouched | not ok |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
     for label in ("tet4", "tet4, no colour", "tet10"):
-        row = folder / f"{label.replace(', ', '-').replace(' ', '-')}-{points}.txt"
-        if not row.exists():
-            row.write_text(_row(label, *_made(label, points, folder)) + "\n", encoding="utf-8")
-        print(row.read_text(encoding="utf-8"), end="", flush=True)
+        print(_row(label, *_made(label, points, folder)), flush=True)
 
 
 def _made(label: str, points: int, folder: Path) -> tuple[Robot, Recording, int]:

@@ -19,7 +19,7 @@ from femsense.inference.rows import Rows
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.fit import CATCH, SWAYING, axes_at, axes_of, fit, force_of, force_scale, whitened
 from femsense.sensing.model import Fit, Model
-from femsense.sensing.no_penetration import is_with
+from femsense.sensing.no_penetration import COMPLETED, is_with
 from femsense.sensing.odds import HANGING, IN_SIGHT, in_sight, odds_of
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Sensor, Touch
@@ -214,7 +214,7 @@ def _dropped(best: Fit) -> list[Proposal]:
 
 
 def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
-    """Return additional contacts at observed objects, and observed objects in place of inferred contacts."""
+    """Return additional contacts at observed objects, and observed objects in place of contacts whose place is known less well."""
     model, best = near.model, near.fit
     new = [one for one in seen if not _is_there(model, best, one)]
     if not new:
@@ -226,7 +226,7 @@ def _at_objects(near: Vicinity, seen: Sequence[Touch]) -> list[Proposal]:
     gains = added.gains - odds
     found = [_added(best, new[c], added, int(c), gains[c]) for c in np.flatnonzero(gains > -SHORT)]
     for i, contact in enumerate(best.contacts):
-        if contact.source == "shape":
+        if _is_placed_worse(contact):
             instead = evidence_at(near, sites, axes, push, without=i)
             gains = instead.gains - odds + best.odds[i] - best.drop_gain[i]
             found += [_replaced(best, i, new[c], instead, int(c), gains[c]) for c in np.flatnonzero(gains > -SHORT)]
@@ -240,11 +240,18 @@ def _at_touches(near: Vicinity, touches: Sequence[Touch]) -> Sites:
     return near.sites(np.moveaxis(best.linearised.tangent.respond(loads), 0, 2))
 
 
+def _is_placed_worse(contact: Touch) -> bool:
+    """Return whether the place of a contact is inferred, or that of an object of unknown shape: an object of known shape may be what touches there."""
+    return contact.source == "shape" or (contact.shape is not None and contact.shape.kind not in COMPLETED)
+
+
 def _is_there(model: Model, best: Fit, seen: Touch) -> bool:
-    """Return whether a hypothesis has a contact at an observed object."""
-    reach = max(SAME * model.sensor.size, 2.0 * seen.std_m)
+    """Return whether a hypothesis has a contact at an observed object, or with one of no better known shape next to it."""
+    reach, known = max(SAME * model.sensor.size, 2.0 * seen.std_m), not _is_placed_worse(seen)
     near = [c for c in best.contacts if c.source == "cloud" and float(np.linalg.norm(c.place - seen.place)) < reach]
-    return bool(near) or any(is_with(contact, seen.shape) for contact in best.contacts)
+    return any(not (known and _is_placed_worse(c)) for c in near) or any(
+        is_with(contact, seen.shape) for contact in best.contacts
+    )
 
 
 def _at_candidates(near: Vicinity) -> list[Proposal]:

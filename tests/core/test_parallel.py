@@ -10,16 +10,12 @@ import numpy as np
 import pytest
 import threadpoolctl
 from driven import recording, robot
-from helpers import block_mesh
 
 from femsense.core import parallel
 from femsense.core.errors import DataError, InputError
 from femsense.core.parallel import beside, each, set_workers, workers
 from femsense.core.work import Work, counting
 from femsense.core.work import count as counted
-from femsense.fem.assembly import internal, reduced_values
-from femsense.fem.body import make_body
-from femsense.fem.linalg.factorization import factorize
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import solve_path
 
@@ -79,29 +75,6 @@ def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards(c
     with beside(lambda: list(each(blas_threads, range(20)))):
         list(each(blas_threads, range(20)))
     assert blas_threads() == 2
-
-
-@pytest.mark.usefixtures("_two_blas_threads")
-def test_a_factor_is_made_with_one_thread_of_blas():
-    """Two of them wait for each other: twice as long where another program keeps a core busy."""
-    body = make_body(block_mesh((16, 8, 8)), young_modulus=1e5, poisson_ratio=0.4, clamped=np.arange(17 * 9 * 9) < 81)
-    values, seen, done = reduced_values(body, internal(body, body.mesh.nodes).blocks), set[int](), threading.Event()
-
-    def watch():
-        while not done.is_set():
-            seen.add(blas_threads())
-
-    watching = threading.Thread(target=watch)
-    watching.start()
-    try:
-        for _ in range(200):  # a dozen milliseconds each: the first ones are seen
-            assert factorize(body.free_map.pattern, values) is not None
-            if 1 in seen:
-                break
-    finally:
-        done.set()
-        watching.join()
-    assert 1 in seen and blas_threads() == 2
 
 
 def test_the_first_error_arrives_and_the_rest_is_left():

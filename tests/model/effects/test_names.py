@@ -16,7 +16,6 @@ ROOT = Path(femsense.__file__).parent
 OTHER_MEANINGS = {
     ("fem", "gravity"),  # an argument of a body
     ("fem", "density"),
-    ("xr/stream", "payload"),  # the bytes of a message
     ("fem", "hyperelastic"),  # a kind of element
     ("io/robot_toml.py", "gravity"),  # a table of robot.toml
     ("io/importers/images/folders.py", "depth_scale"),  # a key of Open3D's lenses
@@ -28,7 +27,6 @@ OTHER_MEANINGS = {
     ("rig", "gravity"),
     ("app", "gravity"),  # what the declared model has
     ("io/meshing/robot_from_line.py", "gravity"),
-    ("xr/stream", "payload"),  # of a message
     ("app/demo/truth.py", "hyperelastic"),  # what the demo's truth is made with
 }
 """(where, word): plain words that say something else there."""
