@@ -26,7 +26,7 @@ from independent.grade import Row, grade, summed
 from independent.make import make
 
 from femsense import SensingOptions, calibrate, estimate, load_recording, load_robot
-from femsense.sensing import contact_free, estimate_frame, model, pipeline, touches
+from femsense.sensing import contact_free, model, objects_of_frame, pipeline, touches
 from femsense.sensing.model import Model
 from femsense.sensing.run_files import write_run
 from femsense.sensing.types import Sensor
@@ -71,7 +71,7 @@ WAYS = (
         "all, but nothing learnt from free frames",
         patches=((pipeline, "learn", _untaught),),
     ),
-    Way("all, but no objects: contacts by the shape alone", patches=((estimate_frame, "objects_near", _nothing_seen),)),
+    Way("all, but no objects: contacts by the shape alone", patches=((objects_of_frame, "objects_near", _nothing_seen),)),
     Way("all, but no forces along the surface", SensingOptions(friction=0.0)),
     Way("all, but no patch by the object", patches=((touches, "contact_radius", _no_radius),)),
     Way("all, but no deviation of the compliance", patches=((model.Model, "compliance_std", 0.0),)),
