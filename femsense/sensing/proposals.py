@@ -241,7 +241,7 @@ def _at_touches(near: Vicinity, touches: Sequence[Touch]) -> Sites:
 
 
 def _is_placed_worse(contact: Touch) -> bool:
-    """Return whether the place of a contact is inferred, or that of an object of unknown shape: an object of known shape may be what touches there."""
+    """Return whether the place of a contact is inferred, or given by points of an object whose shape is unknown."""
     return contact.source == "shape" or (contact.shape is not None and contact.shape.kind not in COMPLETED)
 
 

@@ -18,7 +18,7 @@ from femsense.model.recording_parts import Tool
 from femsense.sensing.cone import within_cones
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import estimate_frame, sense
-from femsense.sensing.fit import fit
+from femsense.sensing.fit import fit, whitened
 from femsense.sensing.model import Candidates, Model
 from femsense.sensing.no_penetration import gap_rows, in_touch
 from femsense.sensing.odds import VISIBLE, odds_of
@@ -195,6 +195,17 @@ def test_a_refuted_proposal_is_not_fitted_again_for_some_frames(tmp_path: Path):
     for error, age, found in ((1e9, 1, 0), (1e9, 11, 1), (0.0, 1, 1)):
         refuted = tuple(Refuted(3 - age, (), one.contacts, error) for one in proposals(model, alone, []))
         assert len(sense(model, 3, replace(free, refuted=refuted)).touches) == found
+
+
+@pytest.mark.parametrize("ball", [True, False])
+def test_the_normal_force_of_a_visible_contact_has_no_prior_in_its_covariance(tmp_path: Path, ball: bool):
+    best = estimate_frame(model_of(touched(tmp_path, PUSH, ball=ball)), 3, None).best
+    scale = whitened(model_of(touched(tmp_path, PUSH, ball=ball)), best, trust=False)[0]
+    X = np.hstack([best.D * scale, best.N])
+    precision = np.eye(X.shape[1]) + (X * best.weight[:, None]).T @ X
+    precision[0, 0] -= 1.0 if ball else 0.0
+    covariance = np.linalg.inv(precision)[:3, :3] * np.outer(scale[:3], scale[:3])
+    np.testing.assert_allclose(best.axes[0] @ best.covariance @ best.axes[0].T, covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_a_gap_moves_with_the_cameras_that_show_its_object(tmp_path: Path):

@@ -51,7 +51,7 @@ def test_the_change_under_the_other_law_makes_up_for_how_far_it_moves_the_body(p
     root = np.sqrt(best.weight)
     rows, right = np.vstack([root[:, None] * X, np.eye(X.shape[1])]), np.append(root * moved, np.zeros(X.shape[1]))
     change = best.axes[0].T @ (scale * np.linalg.lstsq(rows, right)[0][:5])[:3]
-    assert np.linalg.norm(change) > 0.01
+    assert np.linalg.norm(change) > 0.02
     assert np.linalg.norm(change - moved_by_law(model, best)) < 0.5 * np.linalg.norm(change)  # first order in the strain
 
 

@@ -49,7 +49,7 @@ def _finish(a, b, c, u, u0, u1, u2):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST)
 def _backward(sides: int, like: FloatArray, at: int, step: int, y: int, line: int, rows: int) -> None:
-    """Solve for the node, where what is below it is known; the arguments are those of `_forward`."""
+    """Solve for the unknowns of a node by backward substitution: the unknowns below it are known. Arguments as of `_forward`."""
     a, b, c = numbers_at(like, at), numbers_at(like, at + step), numbers_at(like, at + 2 * step)
     u, v, w = numbers_at(like, y), numbers_at(like, y + line), numbers_at(like, y + 2 * line)
     u0 = u1 = u2 = v0 = v1 = v2 = w0 = w1 = w2 = like.dtype.type(0.0)

@@ -219,7 +219,7 @@ def header(seq: int, time_s: float, frame_id: str) -> dict[str, Any]:
 
 
 def document_bytes(seq: int, time_s: float, frame_id: str = "robot", **told: Any) -> bytes:
-    """Return a numbered JSON message of a moment [s]: its header, and what is told. Numbers that are not finite are left out."""
+    """Return a JSON message with its header (sequence number, time [s]) and its values. Numbers that are not finite are left out."""
     return _json({"header": header(seq, time_s, frame_id), **told})
 
 
