@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event, RLock
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
@@ -130,7 +130,10 @@ class MqttSink(MqttLink):
         self.hub = hub
         self._client.will_set(topic(robot, Kind.STATUS), status_bytes("lost"), qos=0, retain=True)
         self._waiting: dict[str, Message] = {}
-        self._lock = Lock()
+        self._sending: int | None = None
+        """paho's number of the last message that it has and has not written yet."""
+        self._lock = RLock()
+        self._client.on_publish = self._written
         self._packets = PacketLimit(f"{address.host}:{address.port}")
         self._begin()
         hub.attach(self)
@@ -144,11 +147,20 @@ class MqttSink(MqttLink):
             return
         with self._lock:
             self._waiting.update((message.topic, message) for message in messages)
-            if self._client.want_write() and not any(message.retained for message in messages):
-                return
-            taken, self._waiting = list(self._waiting.values()), {}
-        for message in taken:
-            self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
+            if self._sending is None or any(message.retained for message in messages):
+                self._send_waiting()
+
+    def _send_waiting(self) -> None:
+        """Hand what waits to paho, with the lock held."""
+        for message in self._waiting.values():
+            self._sending = self._client.publish(message.topic, message.payload, qos=0, retain=message.retained).mid
+        self._waiting = {}
+
+    def _written(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
+        with self._lock:
+            if number == self._sending:
+                self._sending = None
+                self._send_waiting()
 
     def _hear(self, message: Message, *, kept: bool) -> None:
         """Pass on messages of others. Retained ones are no current requests and are ignored, except a stop."""
@@ -156,9 +168,11 @@ class MqttSink(MqttLink):
             self.hub.received(message, "MQTT")
 
     def _greet(self, *told: Any) -> None:
-        super()._greet(*told)
-        if self.connected.is_set():
-            self.send(self._packets.fitting(tuple(message for message in self.hub.newest().values() if message.retained)))
+        with self._lock:  # what others send meanwhile comes after the model
+            self._waiting, self._sending = {}, None
+            super()._greet(*told)
+            if self.connected.is_set():
+                self.send(self._packets.fitting(tuple(message for message in self.hub.newest().values() if message.retained)))
 
     def _leave(self, *told: object) -> None:
         self._packets.ended()
