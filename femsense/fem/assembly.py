@@ -15,6 +15,7 @@ from femsense.fem.clamp import add_followers, clamp_energy_and_forces, followers
 from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10
 from femsense.fem.corotational_lanes import corotational_forces
 from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
+from femsense.fem.hyperelastic_lanes import hyperelastic_forces
 from femsense.fem.stencil import block_row_numbers, lanes_of
 
 KERNELS = {
@@ -23,6 +24,8 @@ KERNELS = {
     ("hyperelastic", 4): hyperelastic_tet4,
     ("hyperelastic", 10): hyperelastic_tet10,
 }
+FORCES = {"corotational": corotational_forces, "hyperelastic": hyperelastic_forces}
+"""Kernels for forces without stiffness."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -57,15 +60,15 @@ def internal(
     forces = np.zeros_like(body.mesh.nodes)
     blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9)) if room is None else room
     blocks[:] = 0.0
-    kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
+    law = "corotational" if material.law == "corotational" else "hyperelastic"
     limit = material.stretch_limit if material.law == "gent" else np.inf
     x = read_only(positions)
     mesh = x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam
-    if stretch is None and not tangent and material.law == "corotational":
+    if stretch is None and not tangent:
         lanes = lanes_of(stencil)
-        energy = corotational_forces(x, lanes.nodes, lanes.gradients, stencil.volumes, mu, lam, forces)
+        energy = FORCES[law](x, lanes.nodes, lanes.gradients, stencil.volumes, mu, lam, limit, forces)
     elif stretch is None:
-        energy = kernel(*mesh, limit, tangent, stencil.slots, forces, blocks)
+        energy = KERNELS[law, body.mesh.tets.shape[1]](*mesh, limit, tangent, stencil.slots, forces, blocks)
     else:
         energy = stretched_tet10(*mesh, tangent, stencil.slots, forces, blocks, stretch)
     ties = ties_of(body)

@@ -19,6 +19,26 @@ that rows do not overlap."""
 ROWS = 23
 
 
+@njit(cache=True, inline="always")
+def gathered(x, nodes, X):  # type: ignore[no-untyped-def]
+    """Copy the positions (n, 3) of the nodes of LANES elements, (a, LANES), to rows of LANES numbers, three a node."""
+    for a in range(len(nodes)):
+        for q in range(LANES):
+            n, to = nodes[a, q], 3 * a * LANES + q
+            X[to], X[to + LANES], X[to + 2 * LANES] = x[n, 0], x[n, 1], x[n, 2]
+
+
+@njit(cache=True, inline="always")
+def scattered(X, nodes, forces):  # type: ignore[no-untyped-def]
+    """Add such rows to the forces (n, 3) of the nodes."""
+    for a in range(len(nodes)):
+        for q in range(LANES):
+            n, to = nodes[a, q], 3 * a * LANES + q
+            forces[n, 0] += X[to]
+            forces[n, 1] += X[to + LANES]
+            forces[n, 2] += X[to + 2 * LANES]
+
+
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _begin_rotations(v):  # type: ignore[no-untyped-def]
     """Write the deformations of a point, shape (ROWS LANES,), to where rotations go,
@@ -98,20 +118,17 @@ def _stress(v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type: ignore[no-untyped-def]
+def corotational_forces(x, nodes, gradients, volumes, mu, lam, limit, forces):  # type: ignore[no-untyped-def]
     """Add internal forces [N] to those of the body, LANES elements at a time; return the energy [J].
 
-    Arrays are those of `Lanes` and `Stencil`.
+    Arrays are those of `Lanes` and `Stencil`; `limit` is not used.
     """
     points, count, wide = volumes.shape[1], nodes.shape[1], 3 * nodes.shape[1] * LANES
     v, X = np.empty((points, ROWS * LANES)), np.empty(wide)
     local, rest, theta, whole = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
     first, energy = gradients.ctypes.data, 0.0
     for e in range(len(nodes)):
-        for a in range(count):
-            for q in range(LANES):
-                n, to = nodes[e, a, q], 3 * a * LANES + q
-                X[to], X[to + LANES], X[to + 2 * LANES] = x[n, 0], x[n, 1], x[n, 2]
+        gathered(x, nodes[e], X)
         v[:, DEFORMATION : DEFORMATION + 9 * LANES] = 0.0
         for p in range(points):
             at = v[p].ctypes.data + 8 * DEFORMATION
@@ -140,10 +157,5 @@ def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type:
                 energy += 0.5 * (v[p, SHEAR + q] * v[p, ROOM + q] + v[p, VOLUME + q] * local[q] * v[p, TRACE + q] ** 2)
             at = v[p].ctypes.data + 8 * DEFORMATION
             add_divergence(gradients, X.ctypes.data, at, first + 8 * (e * points + p) * wide, count)
-        for a in range(count):
-            for q in range(LANES):
-                n, to = nodes[e, a, q], 3 * a * LANES + q
-                forces[n, 0] += X[to]
-                forces[n, 1] += X[to + LANES]
-                forces[n, 2] += X[to + 2 * LANES]
+        scattered(X, nodes[e], forces)
     return energy

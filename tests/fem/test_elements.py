@@ -174,10 +174,10 @@ def test_inverted_corotational_elements_are_finite_and_right() -> None:
     assert np.isfinite(point.energy) and np.isfinite(point.forces).all() and np.isfinite(point.blocks).all()
 
 
-@pytest.mark.parametrize("quadratic", [False, True])
+@pytest.mark.parametrize(("law", "quadratic"), CASES)
 @pytest.mark.parametrize("folds", [False, True])
 @pytest.mark.parametrize("scale", [1.0, 1.3])
-def test_forces_side_by_side_are_those_that_come_with_the_stiffness(quadratic: bool, folds: bool, scale: float) -> None:
+def test_forces_side_by_side_are_those_that_come_with_the_stiffness(law: str, quadratic: bool, folds: bool, scale: float) -> None:
     """Without a stiffness eight elements are worked on at once; 18 leave places empty in the last group.
 
     Some are inside out, or the body has grown.
@@ -185,7 +185,8 @@ def test_forces_side_by_side_are_those_that_come_with_the_stiffness(quadratic: b
     rng = np.random.default_rng(11)
     mesh = block_mesh((3, 1, 1), (0.09, 0.04, 0.03))
     mesh = to_quadratic(mesh) if quadratic else mesh
-    body = make_body(mesh, young_modulus=1e5 * rng.uniform(0.5, 2, 18), poisson_ratio=rng.uniform(0.1, 0.49, 18))
+    body = make_body(mesh, young_modulus=1e5 * rng.uniform(0.5, 2, 18), poisson_ratio=rng.uniform(0.1, 0.49, 18), law=law)
+    body = body.with_material(replace(body.material, stretch_limit=4.0)) if law == "gent" else body
     internal(body, mesh.nodes, tangent=False)  # what is kept with a body is not that of one that grew from it
     body = body.scaled(scale)
     x = distorted(body.mesh, rng, noise=0.03)
@@ -193,12 +194,14 @@ def test_forces_side_by_side_are_those_that_come_with_the_stiffness(quadratic: b
     alone, beside = internal(body, x, tangent=False), internal(body, x)
     assert alone.blocks is None
     assert alone.energy == pytest.approx(beside.energy, rel=1e-12)
-    np.testing.assert_allclose(alone.forces, beside.forces, atol=1e-12 * np.abs(beside.forces).max())
+    finite = np.isfinite(beside.energy)
+    assert finite or (folds and law != "corotational")
+    np.testing.assert_allclose(finite * alone.forces, finite * beside.forces, atol=1e-12 * np.abs(beside.forces).max())
 
 
-@pytest.mark.parametrize("quadratic", [False, True])
-def test_forces_of_positions_that_are_no_numbers_are_none(quadratic: bool) -> None:
-    body = small_body("corotational", quadratic)
+@pytest.mark.parametrize(("law", "quadratic"), CASES)
+def test_forces_of_positions_that_are_no_numbers_are_none(law: str, quadratic: bool) -> None:
+    body = small_body(law, quadratic)
     x = body.mesh.nodes.copy()
     x[3] = np.nan
     there = internal(body, x, tangent=False)
@@ -208,13 +211,15 @@ def test_forces_of_positions_that_are_no_numbers_are_none(quadratic: bool) -> No
 @pytest.mark.parametrize("law", ["neo_hookean", "gent"])
 def test_inverted_hyperelastic_elements_have_infinite_energy(law: str) -> None:
     body = small_body(law, False)
-    assert internal(body, body.mesh.nodes * [1.0, 1.0, -0.5]).energy == np.inf
+    for tangent in (False, True):
+        assert internal(body, body.mesh.nodes * [1.0, 1.0, -0.5], tangent=tangent).energy == np.inf
 
 
 def test_gent_beyond_its_limit_has_infinite_energy() -> None:
     body = small_body("gent", False)
-    assert np.isfinite(internal(body, body.mesh.nodes * [1.8, 1.0, 1.0]).energy)
-    assert internal(body, body.mesh.nodes * [3.0, 1.0, 1.0]).energy == np.inf
+    for tangent in (False, True):
+        assert np.isfinite(internal(body, body.mesh.nodes * [1.8, 1.0, 1.0], tangent=tangent).energy)
+        assert internal(body, body.mesh.nodes * [3.0, 1.0, 1.0], tangent=tangent).energy == np.inf
 
 
 # Closed forms
