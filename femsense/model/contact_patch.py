@@ -94,11 +94,13 @@ def patch_at(
     clamped: IntArray,
     *,
     facing: FloatArray | None = None,
+    along: FloatArray | None = None,
 ) -> ContactPatch:
     """Return the contact patch around the point of the surface that is closest to a place.
 
-    The pressure p ∝ √(1 − r²/a²) is Hertz's, a the given radius. Its nodal shares are those of the virtual work that it does on the element's own shape
-    functions: quadratic elements carry nothing at the corners of an evenly pressed face, and shares by area would dent them.
+    The pressure p ∝ √(1 − r²/a²) is Hertz's, a the given radius; with `along`, that on an ellipse whose other half axis is this one. Its nodal
+    shares are those of the virtual work that it does on the element's own shape functions: quadratic elements carry nothing at the corners of an
+    evenly pressed face, and shares by area would dent them.
 
     Arguments:
         surface: the boundary.
@@ -107,11 +109,22 @@ def patch_at(
         radius: [m].
         clamped: nodes that cannot move.
         facing: the outward normal that was seen there, shape (3,): faces that look elsewhere do not count.
+        along: the half axis of the patch in the direction of a line contact [m], shape (3,); it has an effect where it is longer than the radius.
     """
     centre = closest_surface_point(surface, positions, place, facing=facing)
     values = _shape_values(LATTICE, surface.faces.shape[1])  # at each point of a face, (p, 3 or 6)
     share = np.zeros(len(positions))
-    _press(read_only(positions), read_only(surface.faces), read_only(values), read_only(centre), radius, surface.edge, share)
+    x = positions if along is None else centre + _shortened(positions - centre, along, radius)
+    _press(
+        read_only(positions),
+        read_only(x),
+        read_only(surface.faces),
+        read_only(values),
+        read_only(centre),
+        radius,
+        surface.edge,
+        share,
+    )
     share[clamped] = 0.0
     if share.sum() <= 0.0:  # a place on the clamp: its nearest free node
         free = np.setdiff1d(surface.nodes, clamped)
@@ -120,9 +133,21 @@ def patch_at(
     return ContactPatch(nodes, share[nodes] / share.sum())
 
 
+def _shortened(ways: FloatArray, along: FloatArray, radius: float) -> FloatArray:
+    """Return vectors (n, 3) compressed along a half axis (3,), so that its ellipse becomes a circle of the given radius."""
+    half = float(np.linalg.norm(along))
+    if half <= radius:
+        return ways
+    line = along / half
+    return np.asarray(ways - (1.0 - radius / half) * np.outer(ways @ line, line))
+
+
 @njit(cache=True)
-def _press(x, faces, values, centre, radius, edge, share):  # type: ignore[no-untyped-def]
-    """Write the nodal shares of Hertz's pressure about a centre, over the radius or what holds three points of the faces."""
+def _press(nodes, x, faces, values, centre, radius, edge, share):  # type: ignore[no-untyped-def]
+    """Write the nodal shares of Hertz's pressure about a centre, over the radius or what holds three points of the faces.
+
+    Distances are those between positions `x`, areas those of `nodes`, both (n, 3).
+    """
     corners, points = faces.shape[1], len(values)
     beyond, nearest = np.empty(len(faces)), np.inf
     for f in range(len(faces)):
@@ -144,7 +169,7 @@ def _press(x, faces, values, centre, radius, edge, share):  # type: ignore[no-un
     reach = max(radius, 1.01 * np.partition(distance.ravel(), 2)[2])
     for k in range(len(chosen)):
         face = faces[chosen[k]]
-        u, v = x[face[1]] - x[face[0]], x[face[2]] - x[face[0]]
+        u, v = nodes[face[1]] - nodes[face[0]], nodes[face[2]] - nodes[face[0]]
         area = np.sqrt((u[1] * v[2] - u[2] * v[1]) ** 2 + (u[2] * v[0] - u[0] * v[2]) ** 2 + (u[0] * v[1] - u[1] * v[0]) ** 2)
         for p in range(points):
             pressure = area * np.sqrt(max(1.0 - (distance[k, p] / reach) ** 2, 0.0))

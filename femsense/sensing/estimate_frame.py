@@ -19,7 +19,7 @@ from femsense.model.drive import has_history
 from femsense.sensing.camera_moved import camera_verdict
 from femsense.sensing.contact_free import FEWEST
 from femsense.sensing.fit import TOLERANCE, fit
-from femsense.sensing.law import BETWEEN, moved_by_law
+from femsense.sensing.law import BETWEEN, moved_by_law, moved_by_zones
 from femsense.sensing.model import Fit, Frame, Model, pixels_of
 from femsense.sensing.no_penetration import is_with
 from femsense.sensing.objects_of_frame import touching_objects, with_expected_objects, with_segmented_objects
@@ -117,13 +117,14 @@ def estimate_frame(model: Model, k: int, previous: SensedFrame | None) -> Estima
 
 
 def covariances_of(model: Model, best: Fit) -> list[FloatArray]:
-    """Return the covariance of the force of each contact [N²], each (3, 3): of the fit, of the compliance, and of the constitutive law."""
-    by_law = BETWEEN * moved_by_law(model, best)
+    """Return the covariance of the force of each contact [N²], each (3, 3): of the fit, of the compliance, of the
+    constitutive law, and of the zones of line and face contacts."""
+    model_errors = np.vstack([BETWEEN * moved_by_law(model, best), moved_by_zones(model, best)])
     result = []
     for i, force in enumerate(best.forces):
         own = slice(3 * i, 3 * i + 3)
-        model_error = model.compliance_std**2 * np.outer(force, force) + np.outer(by_law[own], by_law[own])
-        result.append(best.covariance[own, own] + model_error)
+        moved = model_errors[:, own]
+        result.append(best.covariance[own, own] + model.compliance_std**2 * np.outer(force, force) + moved.T @ moved)
     return result
 
 

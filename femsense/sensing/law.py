@@ -18,6 +18,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_near
 from femsense.sensing.fit import force_of, whitened
 from femsense.sensing.model import Fit, Model
+from femsense.sensing.touches import with_half_zone
 from femsense.sensing.types import Sensor
 
 
@@ -58,12 +59,33 @@ def moved_by_law(model: Model, fit: Fit) -> FloatArray:
     displacement = fit.linearised.tangent.respond(unbalanced[0][None]) - tangent_near(body, predicted).respond(
         unbalanced[1][None]
     )
-    moved = fit.rows.of(displacement)[:, 0]
-    scale = whitened(model, fit, trust=False)[0]
+    return np.asarray(_compensated(model, fit, displacement)[0])
+
+
+def moved_by_zones(model: Model, fit: Fit) -> FloatArray:
+    """Return the change of the forces if the zone of one line or face contact were half as long, to first order [N], shape (k, 3m) for k such contacts.
+
+    How far a rod or plate touches depends on the curvature of the body and on the force; the gaps by which the zone is estimated tell it within a factor of
+    two. A shorter zone dents the body more under the same force.
+    """
+    forces, n = zip(fit.contacts, fit.forces), len(fit.state.positions)
+    loads = [
+        with_half_zone(model.sensor, one).patch.spread(f, n) - one.patch.spread(f, n)
+        for one, f in forces
+        if one.along is not None
+    ]
+    if not loads:
+        return np.zeros((0, 3 * len(fit.contacts)))
+    return _compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads)))
+
+
+def _compensated(model: Model, fit: Fit, displacements: FloatArray) -> FloatArray:
+    """Return the changes of the forces by which the fit makes up for displacements (k, n, 3) that the model misses [m], shape (k, 3m) [N]."""
+    m, scale = len(fit.contacts), whitened(model, fit, trust=False)[0]
     X = np.hstack([fit.D * scale, fit.N])
     WX = X * fit.weight[:, None]
-    change = scale * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ moved)[: 5 * m]
-    return np.concatenate([axes.T @ change[force_of(i)] for i, axes in enumerate(fit.axes)])
+    change = scale[:, None] * np.linalg.solve(np.eye(X.shape[1]) + X.T @ WX, WX.T @ fit.rows.of(displacements))[: 5 * m]
+    return np.concatenate([axes.T @ change[force_of(i)] for i, axes in enumerate(fit.axes)]).T
 
 
 def _unbalanced(body: BodyModel, other: BodyModel, positions: FloatArray) -> FloatArray:

@@ -29,8 +29,8 @@ FACETS = 1.5e-4
 """Standard deviation of gaps: the surface of the model is flat between nodes [m]."""
 ZONE = 0.15
 """Maximum extent of a contact about its nearest point, relative to the body's diagonal."""
-HERTZ = float(np.sqrt(5.0 / 2.0))
-"""Radius of Hertz's pressure over its root mean square radius."""
+HERTZ = float(np.sqrt(5.0))
+"""Half axis of Hertz's pressure over the root mean square of the coordinate along it."""
 AHEAD = 1e-4
 """Step of the finite difference of a distance [m]."""
 WINDOWED = 2.0
@@ -250,13 +250,15 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     if _on_clamp(sensor, middle):
         return None
     curvature = shape.radius_at(places[best], 0.5 * sensor.surface.edge)
+    is_flat = shape.kind in ("plate", "known") and bool(np.isinf(curvature))
     touch = make_touch(
         sensor,
         middle,
         source="cloud",
         std_m=float(np.hypot(std, radius)),
         radius=curvature,
-        spread=HERTZ * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
+        spread=HERTZ * float(spread[1]) if is_flat else 0.0,
+        along=HERTZ * float(spread[0]) * axes[0] if is_flat or shape.kind == "cylinder" else None,
     )
     return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])), shape=shape)
 

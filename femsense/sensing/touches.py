@@ -33,19 +33,21 @@ def make_touch(
     normal: FloatArray | None = None,
     radius: float = np.inf,
     spread: float = 0.0,
+    along: FloatArray | None = None,
 ) -> Touch:
     """Return a contact at the surface point closest to a given point, both at rest [m], shape (3,)."""
     nodes = sensor.robot.body.mesh.nodes
     at = closest_surface_point(sensor.surface, nodes, place, facing=normal)
-    patch = _patch(sensor, at, normal, spread)
+    patch = _patch(sensor, at, normal, spread, along)
     outward = patch.mean(vertex_normals(nodes, sensor.surface.triangles))
     outward = outward / max(float(np.linalg.norm(outward)), 1e-12) if normal is None else normal
-    return Touch(at, outward, patch, at, std_m, source, radius, spread)
+    return Touch(at, outward, patch, at, std_m, source, radius, spread, along)
 
 
-def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None, spread: float) -> ContactPatch:
+def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None, spread: float, along: FloatArray | None) -> ContactPatch:
     body = sensor.robot.body
-    return patch_at(sensor.surface, body.mesh.nodes, place, max(_radius(sensor), spread), body.clamped, facing=normal)
+    radius = max(_radius(sensor), spread)
+    return patch_at(sensor.surface, body.mesh.nodes, place, radius, body.clamped, facing=normal, along=along)
 
 
 def _radius(sensor: Sensor) -> float:
@@ -63,7 +65,15 @@ def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
     least = _radius(sensor)
     if abs(max(spread, least) - max(touch.spread_m, least)) < ALIKE * least:
         return touch
-    return replace(touch, patch=_patch(sensor, touch.place, None, spread), spread_m=spread)
+    return replace(touch, patch=_patch(sensor, touch.place, None, spread, touch.along), spread_m=spread)
+
+
+def with_half_zone(sensor: Sensor, touch: Touch) -> Touch:
+    """Return a line or face contact whose zone has half axes of half the length."""
+    assert touch.along is not None
+    half = 0.5 * touch.along
+    spread = 0.5 * touch.spread_m
+    return replace(touch, patch=_patch(sensor, touch.place, None, spread, half), spread_m=spread, along=half)
 
 
 def contact_radius(sensor: Sensor, radius: float, force: float) -> float:
@@ -98,7 +108,7 @@ def ways_of(touch: Touch) -> tuple[FloatArray, FloatArray]:
 
 def moved_to(sensor: Sensor, touch: Touch, place: FloatArray) -> Touch:
     """Return the contact moved to the surface point closest to another point at rest [m], shape (3,); its prior is kept."""
-    there = make_touch(sensor, place, source=touch.source, spread=touch.spread_m)
+    there = make_touch(sensor, place, source=touch.source, spread=touch.spread_m, along=touch.along)
     return replace(touch, place=there.place, normal=there.normal, patch=there.patch)
 
 
@@ -112,5 +122,6 @@ def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, for
     n, step = len(sensor.robot.body.mesh.nodes), 0.5 * sensor.surface.edge
     if touch.std_m == 0 or not force.any():
         return np.zeros((n, 3))
-    ahead, behind = (_patch(sensor, touch.place + s * step * tangent, touch.normal, touch.spread_m) for s in (1.0, -1.0))
+    there = (touch.place + s * step * tangent for s in (1.0, -1.0))
+    ahead, behind = (_patch(sensor, place, touch.normal, touch.spread_m, touch.along) for place in there)
     return np.asarray((ahead.spread(force, n) - behind.spread(force, n)) / (2.0 * step))

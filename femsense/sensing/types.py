@@ -185,6 +185,7 @@ class Touch:
     source: str  # "cloud", "shape" or "given"
     object_radius_m: float = np.inf  # radius of curvature [m]; inf: flat or unknown
     spread_m: float = 0.0  # radius of the contact zone, if larger than the resolution of the mesh [m]
+    along: FloatArray | None = None  # longer half axis of the zone of a line contact at rest [m], shape (3,)
     line: FloatArray = field(default_factory=lambda: np.zeros(3))
     """Direction at rest to which `std_m` applies, such as the axis of a rod, unit vector; zero: to all tangential directions."""
     across_m: float = 0.0  # prior standard deviation across the line [m]

@@ -46,3 +46,22 @@ def test_an_even_pressure_loads_no_corner_of_a_quadratic_face():
     top = mesh.nodes[patch.nodes, 2] > 0.0099
     corner = patch.nodes < len(slab().nodes)
     assert np.abs(patch.weights[top & corner]).sum() < 0.02 * patch.weights[top].sum()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_the_patch_of_a_line_contact_has_two_half_axes(angle):
+    mesh, line = slab(16), np.array([np.cos(angle), np.sin(angle), 0.0])
+    patch = patch_at(body_surface(mesh), mesh.nodes, np.array([0.02, 0.02, 0.01]), 0.006, NONE, along=0.016 * line)
+    ways = mesh.nodes[patch.nodes] - patch.mean(mesh.nodes)
+    across = np.cross([0.0, 0.0, 1.0], line)
+    half = [np.sqrt(5.0 * patch.weights @ (ways @ way) ** 2) for way in (line, across)]
+    np.testing.assert_allclose(half, [0.016, 0.006], rtol=0.15)
+
+
+def test_a_half_axis_shorter_than_the_radius_has_no_effect():
+    mesh, place = slab(8), np.array([0.02, 0.02, 0.01])
+    surface = body_surface(mesh)
+    short, round_one = (
+        patch_at(surface, mesh.nodes, place, 0.006, NONE, along=along) for along in (np.array([0.005, 0.0, 0.0]), None)
+    )
+    np.testing.assert_array_equal(short.weights, round_one.weights)

@@ -1,4 +1,4 @@
-"""The constitutive law of the fitted states, and the deviation of forces that it causes."""
+"""The constitutive law of the fitted states, and the deviations of forces due to it and to the zones of contacts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from arm import arm
 from touched_arm import touched
 
 from femsense import calibrate
+from femsense.core.arrays import FloatArray
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import covariances_of, estimate_frame
 from femsense.sensing.fit import whitened
-from femsense.sensing.law import moved_by_law
+from femsense.sensing.law import moved_by_law, moved_by_zones
 from femsense.sensing.model import Fit, Model
 from femsense.sensing.prepare import make_sensor
+from femsense.sensing.touches import make_touch
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +43,21 @@ def test_states_with_clouds_are_neo_hookean_where_no_law_is_declared(pushed):
     assert model.sensor.robot.body.material.law == "neo_hookean" and not model.sensor.declares_law
 
 
+def that_makes_up_for(model: Model, best: Fit, displacement: FloatArray) -> FloatArray:
+    """Return the change of the force by which a fit with one contact makes up for a displacement of its model (n, 3)."""
+    scale = whitened(model, best, trust=False)[0]
+    X = np.hstack([best.D * scale, best.N])
+    root = np.sqrt(best.weight)
+    right = np.append(-root * best.rows.of(displacement[None])[:, 0], np.zeros(X.shape[1]))
+    change = np.linalg.lstsq(np.vstack([root[:, None] * X, np.eye(X.shape[1])]), right)[0]
+    return best.axes[0].T @ (scale * change[:5])[:3]
+
+
 def test_the_change_under_the_other_law_makes_up_for_how_far_it_moves_the_body(pushed):
     model, best = pushed
     state = with_law(model, "corotational").solve(best.frame, best.contacts, best.forces, best.state)
     assert state is not None
-    moved = -best.rows.of((state.positions - best.state.positions)[None])[:, 0]
-    scale = whitened(model, best, trust=False)[0]
-    X = np.hstack([best.D * scale, best.N])
-    root = np.sqrt(best.weight)
-    rows, right = np.vstack([root[:, None] * X, np.eye(X.shape[1])]), np.append(root * moved, np.zeros(X.shape[1]))
-    change = best.axes[0].T @ (scale * np.linalg.lstsq(rows, right)[0][:5])[:3]
+    change = that_makes_up_for(model, best, state.positions - best.state.positions)
     assert np.linalg.norm(change) > 0.02
     assert np.linalg.norm(change - moved_by_law(model, best)) < 0.5 * np.linalg.norm(change)  # first order in the strain
 
@@ -61,6 +68,21 @@ def test_the_difference_of_the_laws_is_part_of_the_covariance(pushed):
     compliance = model.compliance_std**2 * np.outer(best.forces, best.forces)
     np.testing.assert_allclose(
         covariances_of(model, best)[0], best.covariance + compliance + np.outer(change, change) / 3.0, rtol=1e-9
+    )
+
+
+def test_half_the_zone_of_a_line_contact_is_part_of_the_covariance(pushed):
+    model, best = pushed
+    own = best.contacts[0]
+    made = [make_touch(model.sensor, own.place, source=own.source, along=np.array([a, 0.0, 0.0])) for a in (0.016, 0.008)]
+    whole, half = (replace(own, along=one.along, patch=one.patch) for one in made)
+    states = [model.solve(best.frame, (one,), best.forces, best.state) for one in (whole, half)]
+    change = that_makes_up_for(model, best, states[1].positions - states[0].positions)
+    with_zone = replace(best, contacts=(whole,))
+    (moved,) = moved_by_zones(model, with_zone)
+    assert np.linalg.norm(change) > 1e-3 and np.linalg.norm(moved - change) < 0.3 * np.linalg.norm(change)
+    np.testing.assert_allclose(
+        covariances_of(model, with_zone)[0], covariances_of(model, best)[0] + np.outer(moved, moved), rtol=1e-9
     )
 
 

@@ -45,6 +45,9 @@ def test_a_rod_is_placed_well_across_it_and_anywhere_along_it(sensor):
         assert stds[1] < 0.003
         assert abs(touch.place[1] - 0.001) < 0.001
         assert abs(touch.place[0] - 0.05) < 2.0 * stds[0]
+        ways = sensor.robot.body.mesh.nodes[touch.patch.nodes] - touch.place
+        long, wide, _ = np.sqrt(touch.patch.weights @ ways**2)
+        assert long > 0.008 and wide < 0.004  # the force is spread along the rod
 
 
 def test_a_plate_on_a_bent_arm_is_placed_as_well_as_its_tilt_is_known(sensor):
