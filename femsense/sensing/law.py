@@ -18,7 +18,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_near
 from femsense.sensing.fit import force_of, whitened
 from femsense.sensing.model import Fit, Model
-from femsense.sensing.touches import with_half_zone
+from femsense.sensing.touches import with_longer_zone
 from femsense.sensing.types import Sensor
 
 
@@ -63,20 +63,20 @@ def moved_by_law(model: Model, fit: Fit) -> FloatArray:
 
 
 def moved_by_zones(model: Model, fit: Fit) -> FloatArray:
-    """Return the change of the forces if the zone of one line or face contact were half as long, to first order [N], shape (k, 3m) for k such contacts.
+    """Return the changes of the forces, to first order [N], if the zone of one line or face contact were half or twice as long, over √2: shape (2k, 3m) for
+    k such contacts.
 
     How far a rod or plate touches depends on the curvature of the body and on the force; the gaps by which the zone is estimated tell it within a factor of
     two. A shorter zone dents the body more under the same force.
     """
-    forces, n = zip(fit.contacts, fit.forces), len(fit.state.positions)
-    loads = [
-        with_half_zone(model.sensor, one).patch.spread(f, n) - one.patch.spread(f, n)
-        for one, f in forces
-        if one.along is not None
-    ]
+    n, loads = len(fit.state.positions), []
+    for contact, force in zip(fit.contacts, fit.forces):
+        if contact.along is not None:
+            own = contact.patch.spread(force, n)
+            loads += [with_longer_zone(model.sensor, contact, times).patch.spread(force, n) - own for times in (0.5, 2.0)]
     if not loads:
         return np.zeros((0, 3 * len(fit.contacts)))
-    return _compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads)))
+    return _compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads))) / np.sqrt(2.0)
 
 
 def _compensated(model: Model, fit: Fit, displacements: FloatArray) -> FloatArray:

@@ -31,6 +31,8 @@ ZONE = 0.15
 """Maximum extent of a contact about its nearest point, relative to the body's diagonal."""
 HERTZ = float(np.sqrt(5.0))
 """Half axis of Hertz's pressure over the root mean square of the coordinate along it."""
+LINE = 2.0
+"""A zone that is this many times as long as wide is that of a line contact."""
 AHEAD = 1e-4
 """Step of the finite difference of a distance [m]."""
 WINDOWED = 2.0
@@ -251,6 +253,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         return None
     curvature = shape.radius_at(places[best], 0.5 * sensor.surface.edge)
     is_flat = shape.kind in ("plate", "known") and bool(np.isinf(curvature))
+    is_line = shape.kind != "points" and spread[0] > LINE * spread[1]
     touch = make_touch(
         sensor,
         middle,
@@ -258,7 +261,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         std_m=float(np.hypot(std, radius)),
         radius=curvature,
         spread=HERTZ * float(spread[1]) if is_flat else 0.0,
-        along=HERTZ * float(spread[0]) * axes[0] if is_flat or shape.kind == "cylinder" else None,
+        along=HERTZ * float(spread[0]) * axes[0] if is_flat or is_line else None,
     )
     return replace(touch, line=axes[0], across_m=float(np.hypot(std, spread[1])), shape=shape)
 

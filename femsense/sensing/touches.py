@@ -68,12 +68,11 @@ def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
     return replace(touch, patch=_patch(sensor, touch.place, None, spread, touch.along), spread_m=spread)
 
 
-def with_half_zone(sensor: Sensor, touch: Touch) -> Touch:
-    """Return a line or face contact whose zone has half axes of half the length."""
+def with_longer_zone(sensor: Sensor, touch: Touch, times: float) -> Touch:
+    """Return a line or face contact whose zone has half axes of so many times the length."""
     assert touch.along is not None
-    half = 0.5 * touch.along
-    spread = 0.5 * touch.spread_m
-    return replace(touch, patch=_patch(sensor, touch.place, None, spread, half), spread_m=spread, along=half)
+    spread, along = times * touch.spread_m, times * touch.along
+    return replace(touch, patch=_patch(sensor, touch.place, None, spread, along), spread_m=spread, along=along)
 
 
 def contact_radius(sensor: Sensor, radius: float, force: float) -> float:

@@ -71,19 +71,18 @@ def test_the_difference_of_the_laws_is_part_of_the_covariance(pushed):
     )
 
 
-def test_half_the_zone_of_a_line_contact_is_part_of_the_covariance(pushed):
+def test_the_length_of_a_line_contact_is_part_of_the_covariance(pushed):
     model, best = pushed
     own = best.contacts[0]
-    made = [make_touch(model.sensor, own.place, source=own.source, along=np.array([a, 0.0, 0.0])) for a in (0.016, 0.008)]
-    whole, half = (replace(own, along=one.along, patch=one.patch) for one in made)
-    states = [model.solve(best.frame, (one,), best.forces, best.state) for one in (whole, half)]
-    change = that_makes_up_for(model, best, states[1].positions - states[0].positions)
+    made = [make_touch(model.sensor, own.place, source=own.source, along=np.array([a, 0.0, 0.0])) for a in (0.006, 0.012, 0.024)]
+    half, whole, double = (replace(own, along=one.along, patch=one.patch) for one in made)
     with_zone = replace(best, contacts=(whole,))
-    (moved,) = moved_by_zones(model, with_zone)
-    assert np.linalg.norm(change) > 1e-3 and np.linalg.norm(moved - change) < 0.3 * np.linalg.norm(change)
-    np.testing.assert_allclose(
-        covariances_of(model, with_zone)[0], covariances_of(model, best)[0] + np.outer(moved, moved), rtol=1e-9
-    )
+    moved = moved_by_zones(model, with_zone)
+    states = [model.solve(best.frame, (one,), best.forces, best.state) for one in (half, whole, double)]
+    for at, change in ((0, moved[0]), (2, moved[1])):
+        wanted = that_makes_up_for(model, best, states[at].positions - states[1].positions) / np.sqrt(2.0)
+        assert np.linalg.norm(wanted) > 1e-4 and np.linalg.norm(change - wanted) < 0.3 * np.linalg.norm(wanted)
+    np.testing.assert_allclose(covariances_of(model, with_zone)[0], covariances_of(model, best)[0] + moved.T @ moved, rtol=1e-9)
 
 
 def test_a_robot_that_declares_its_law_keeps_it(tmp_path):
