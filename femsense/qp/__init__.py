@@ -3,7 +3,7 @@
 from femsense.qp.forces import ForceEstimate, estimate_forces
 from femsense.qp.friction_cone import FrictionCone
 from femsense.qp.problem import ForceOptions, Multipliers, Problem, Residuals, build_force_problem, kkt_residuals
-from femsense.qp.solve import SOLVERS, Solution, Status, solve
+from femsense.qp.solve import SOLVERS, ProgramStatus, Solution, solve
 
 __all__ = [
     "SOLVERS",
@@ -12,9 +12,9 @@ __all__ = [
     "FrictionCone",
     "Multipliers",
     "Problem",
+    "ProgramStatus",
     "Residuals",
     "Solution",
-    "Status",
     "build_force_problem",
     "estimate_forces",
     "kkt_residuals",

@@ -26,7 +26,7 @@ _OPTIONS: dict[str, dict[str, float | int | bool]] = {
 }
 
 
-class Status(StrEnum):
+class ProgramStatus(StrEnum):
     """How a solve ended, with its cause and remedy."""
 
     SOLVED = "solved"
@@ -47,25 +47,25 @@ class Status(StrEnum):
 
 
 _TEXTS = {
-    Status.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
-    Status.INFEASIBLE: (
+    ProgramStatus.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
+    ProgramStatus.INFEASIBLE: (
         "no point obeys all constraints: bounds that cross, measured inputs outside their bounds, or measured "
         "displacements that no"
         " allowed tension and force can make",
         "check the signs and units of the cable inputs; widen the bounds of tension and force; drop the friction cone",
     ),
-    Status.UNBOUNDED: (
+    ProgramStatus.UNBOUNDED: (
         (
             "the objective falls for ever along some direction: an unknown that no row of the compliance sees and no "
             "constraint holds"
         ),
         "use fewer contacts, add rows, or a small ridge",
     ),
-    Status.NOT_CONVEX: (
+    ProgramStatus.NOT_CONVEX: (
         "P has a negative eigenvalue: the objective is not a sum of squares",
         "check the weights (≥ 0) and how P was made",
     ),
-    Status.INACCURATE: (
+    ProgramStatus.INACCURATE: (
         "no solver reached the tolerance: the problem is badly conditioned (contacts that the rows do not distinguish)",
         "merge contacts that lie close together, add a ridge, or loosen the tolerance",
     ),
@@ -88,7 +88,7 @@ class Solution:
     """Difference of primal and dual objective, in the problem's units."""
     certificate: float
     """Largest of primal residual, dual residual and gap of the scaled problem [1]; compared with the tolerance."""
-    status: Status
+    status: ProgramStatus
     """`solved`, or the reason of the failure; with `.cause` and `.advice`."""
     solver: str
     """Name of the solver that gave the answer; empty without an answer."""
@@ -96,7 +96,7 @@ class Solution:
     @property
     def solved(self) -> bool:
         """Whether x is the answer."""
-        return self.status is Status.SOLVED
+        return self.status is ProgramStatus.SOLVED
 
 
 Answer = tuple[FloatArray | None, Multipliers | None]
@@ -127,11 +127,11 @@ def solve(
     if solver not in SOLVERS:
         raise InputError("unknown solver", where="solver", found=solver, expected=", ".join(SOLVERS))
     if (problem.parts()[6] > problem.parts()[7]).any():
-        return _without_answer(Status.INFEASIBLE)
+        return _without_answer(ProgramStatus.INFEASIBLE)
     scaling = _scaling(problem)
     scaled = _scaled(problem, scaling)
     if _most_negative(scaled.P) < -1e-9:
-        return _without_answer(Status.NOT_CONVEX)
+        return _without_answer(ProgramStatus.NOT_CONVEX)
     order = (solver, *(name for name in SOLVERS if name != solver)) if fallback else (solver,)
     best, best_error, best_solver = None, np.inf, ""
     for name in order:
@@ -143,10 +143,10 @@ def solve(
             break
     if best_error > tolerance:
         status = _diagnosis(scaled)
-        if status is not Status.INACCURATE:
+        if status is not ProgramStatus.INACCURATE:
             return _without_answer(status)
     if best is None:
-        return _without_answer(Status.INACCURATE)
+        return _without_answer(ProgramStatus.INACCURATE)
     return _unscaled(problem, best, scaling, best_error, best_solver, tolerance)
 
 
@@ -216,11 +216,11 @@ def _unscaled(
         z_box=freeze(scaling.energy * scaled.z_box / scaling.unknowns),
     )
     residuals = kkt_residuals(problem, x, multipliers)
-    status = Status.SOLVED if error <= tolerance else Status.INACCURATE
+    status = ProgramStatus.SOLVED if error <= tolerance else ProgramStatus.INACCURATE
     return Solution(freeze(x), multipliers, residuals.primal, residuals.dual, residuals.gap, error, status, solver)
 
 
-def _without_answer(status: Status) -> Solution:
+def _without_answer(status: ProgramStatus) -> Solution:
     return Solution(None, None, np.inf, np.inf, np.inf, np.inf, status, "")
 
 
@@ -283,15 +283,15 @@ def _most_negative(P: FloatArray) -> float:
     return float(values[0] / max(np.abs(values).max(), 1e-300))
 
 
-def _diagnosis(scaled: Problem) -> Status:
+def _diagnosis(scaled: Problem) -> ProgramStatus:
     """Return why no solver had an answer: two linear programmes tell infeasible and unbounded from inaccurate."""
     P, q, G, h, A, b, lb, ub = scaled.parts()
     if _linear(np.zeros(len(q)), G, h, A, b, lb, ub)[0] == 2:
-        return Status.INFEASIBLE
+        return ProgramStatus.INFEASIBLE
     down, up = np.where(np.isfinite(lb), 0.0, -1.0), np.where(np.isfinite(ub), 0.0, 1.0)
     flat = np.vstack([A, P])
     status, slope = _linear(q, G, np.zeros(len(h)), flat, np.zeros(len(flat)), down, up)
-    return Status.UNBOUNDED if status == 0 and slope < -1e-9 else Status.INACCURATE
+    return ProgramStatus.UNBOUNDED if status == 0 and slope < -1e-9 else ProgramStatus.INACCURATE
 
 
 def _linear(

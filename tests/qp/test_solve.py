@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from femsense.core.errors import InputError
-from femsense.qp import SOLVERS, Problem, Status, kkt_residuals, solve
+from femsense.qp import SOLVERS, Problem, ProgramStatus, kkt_residuals, solve
 from femsense.qp.problem import Multipliers
 from femsense.qp.solve import call_solver
 
@@ -160,7 +160,7 @@ def test_infeasible_is_a_status_with_a_text() -> None:
         Problem(np.eye(2), [0.0, 0.0], G=[[1, 0], [-1, 0]], h=[-1, -1]),
     ):
         solution = solve(problem)
-        assert solution.status is Status.INFEASIBLE and solution.x is None and not solution.solved
+        assert solution.status is ProgramStatus.INFEASIBLE and solution.x is None and not solution.solved
         assert solution.primal_residual == solution.dual_residual == solution.gap == solution.certificate == np.inf
         assert "no point obeys all constraints" in solution.status.cause and "signs and units" in solution.status.advice
 
@@ -175,15 +175,15 @@ def test_infeasible_is_a_status_with_a_text() -> None:
 )
 def test_unbounded_is_a_status(problem: Problem) -> None:
     solution = solve(problem)
-    assert solution.status is Status.UNBOUNDED and "ridge" in solution.status.advice
+    assert solution.status is ProgramStatus.UNBOUNDED and "ridge" in solution.status.advice
 
 
 def test_not_convex_is_a_status() -> None:
-    assert solve(Problem(np.diag([1.0, -1.0]), [0.0, 0.0], lb=[-1, -1], ub=[1, 1])).status is Status.NOT_CONVEX
+    assert solve(Problem(np.diag([1.0, -1.0]), [0.0, 0.0], lb=[-1, -1], ub=[1, 1])).status is ProgramStatus.NOT_CONVEX
 
 
 def test_every_status_says_why_and_what_to_try() -> None:
-    for status in Status:
+    for status in ProgramStatus:
         assert len(status.cause) > 20 and status.advice
         assert str(status) == status.value
 
@@ -200,8 +200,10 @@ def test_a_failing_solver_hands_over() -> None:
     solution = solve(problem, call=broken)
     assert called[0] == "daqp" and len(called) > 1 and solution.solver != "daqp" and solution.solved
     alone = solve(problem, fallback=False, call=broken)
-    assert alone.status is Status.INACCURATE and alone.certificate > 0.01 and alone.solver == "daqp"
-    assert solve(KNOWN["free"].problem, fallback=False, call=broken).status is Status.INACCURATE, "bounded by its curvature"
+    assert alone.status is ProgramStatus.INACCURATE and alone.certificate > 0.01 and alone.solver == "daqp"
+    assert solve(KNOWN["free"].problem, fallback=False, call=broken).status is ProgramStatus.INACCURATE, (
+        "bounded by its curvature"
+    )
 
 
 def test_unknown_solvers_are_refused() -> None:
