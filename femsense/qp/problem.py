@@ -1,9 +1,8 @@
-"""The quadratic problem of force sensing, and the certificate of an answer.
+"""A quadratic problem, and the certificate of an answer.
 
     minimise   ½ xᵀ P x + qᵀ x    subject to   G x ≤ h,   A x = b,   lb ≤ x ≤ ub
 
-Source: "Calibration and force sensing with an RGB-D camera", section V.B, equations 10–14;
-signs of the multipliers as in qpsolvers.
+Signs of the multipliers are those of qpsolvers.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
-from femsense.qp.friction_cone import FrictionCone, pyramid_rows
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -93,90 +91,6 @@ class Residuals:
     """|xᵀ P x + qᵀ x + hᵀ z + bᵀ y + bounds · z_box| [objective]."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class ForceOptions:
-    """Inputs, bounds and priors of the force problem."""
-
-    cable_inputs: npt.ArrayLike | None = None
-    """Measured tensions [N], shape (a,). Without measured tensions or displacements, the tensions are unknowns."""
-    cable_displacements: npt.ArrayLike | None = None
-    """Measured displacements of the cables [m], shape (a,); require W_aa, W_af and delta_a_free."""
-    W_aa: npt.ArrayLike | None = None
-    """Displacement of the cables per tension [m/N], shape (a, a)."""
-    W_af: npt.ArrayLike | None = None
-    """Displacement of the cables per force [m/N], shape (a, f)."""
-    delta_a_free: npt.ArrayLike | None = None
-    """Displacement of the cables without tensions and contact forces [m], shape (a,)."""
-    force_lower: npt.ArrayLike | None = None
-    """Bounds of the forces [N]: a number, (f,), or (f/3, 3)."""
-    force_upper: npt.ArrayLike | None = None
-    tension_lower: npt.ArrayLike | None = None
-    """Bounds of the tensions [N]: a number or (a,)."""
-    tension_upper: npt.ArrayLike | None = None
-    friction_cone: FrictionCone | None = None
-    """For forces in three components (f = 3 n): the pyramid of each of the n contacts."""
-    ridge: float = 0.0
-    """Price of force [objective / N²]: 1/σ² for forces expected to be about σ."""
-    nuisance: npt.ArrayLike | None = None
-    """Columns of k nuisance parameters, shape (r, k); their factors are further unknowns."""
-    nuisance_std: npt.ArrayLike | None = None
-    """Prior standard deviations of the factors of `nuisance`, shape (k,); inf: no prior. Default 1."""
-
-
-def build_force_problem(
-    W_forces: npt.ArrayLike,
-    W_cables: npt.ArrayLike | None,
-    free: npt.ArrayLike,
-    target: npt.ArrayLike,
-    *,
-    weights: npt.ArrayLike | None = None,
-    options: ForceOptions | None = None,
-) -> Problem:
-    """Return the problem whose answer x = (tensions, forces, nuisance) moves the features to their targets.
-
-        minimise  ½ Σ_i weights_i (W_cables λ_a + W_forces λ_f + nuisance η + free − target)_i²  +  ½ ridge |λ_f|²  +  ½ Σ (η/nuisance_std)²
-        such that λ_a = cable_inputs                                              (13)
-               or W_aa λ_a + W_af λ_f + delta_a_free = cable_displacements        (14)
-
-    Arguments:
-        W_forces: displacement of each row (a feature along its normal) per force [m/N], shape (r, f).
-        W_cables: the same per cable tension [m/N], shape (r, a); None without cables.
-        free, target: displacement or position of each row without these forces, and as observed [m], shape (r,).
-        weights: 1 / variance of each row [1/m²], shape (r,); 1 where not given; 0 leaves a row out.
-        options: inputs, bounds and priors.
-    Returns:
-        The Problem, in a + f + k unknowns.
-    Raises:
-        InputError: shapes that do not fit, or (13) and (14) together.
-    """
-    o = options or ForceOptions()
-    forces = _columns(W_forces, None, "W_forces")
-    rows, f = forces.shape
-    cables = np.zeros((rows, 0)) if W_cables is None else _columns(W_cables, rows, "W_cables")
-    extra = np.zeros((rows, 0)) if o.nuisance is None else _columns(o.nuisance, rows, "nuisance")
-    a, k = cables.shape[1], extra.shape[1]
-    W = np.hstack([cables, forces, extra])
-    scale = _weights(weights, rows)
-    misfit = _sized(free, rows, "free") - _sized(target, rows, "target")
-    prior = np.concatenate([np.zeros(a), np.full(f, _not_negative(o.ridge, "ridge")), prior_precision(o.nuisance_std, k)])
-    A, b = _actuation(o.cable_inputs, o.cable_displacements, o.W_aa, o.W_af, o.delta_a_free, a, f, k)
-    G = None if o.friction_cone is None else pyramid_rows(o.friction_cone, a, f, k)
-    lower = np.concatenate(
-        [_limit(o.tension_lower, -np.inf, a, "tension_lower"), _limit(o.force_lower, -np.inf, f, "force_lower")]
-    )
-    upper = np.concatenate([_limit(o.tension_upper, np.inf, a, "tension_upper"), _limit(o.force_upper, np.inf, f, "force_upper")])
-    return Problem(
-        P=W.T @ (scale[:, None] * W) + np.diag(prior),
-        q=W.T @ (scale * misfit),
-        G=G,
-        h=None if G is None else np.zeros(len(G)),
-        A=A,
-        b=b,
-        lb=np.concatenate([lower, np.full(k, -np.inf)]),
-        ub=np.concatenate([upper, np.full(k, np.inf)]),
-    )
-
-
 def kkt_residuals(problem: Problem, x: FloatArray | None, multipliers: Multipliers | None) -> Residuals:
     """Return the residuals of the optimality conditions; inf for an answer that is missing or not finite.
 
@@ -222,14 +136,6 @@ def _matrix(values: npt.ArrayLike, columns: int, name: str) -> FloatArray:
     return array
 
 
-def _columns(values: npt.ArrayLike, rows: int | None, name: str) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
-    fits = array.ndim == 2 and (rows is None or array.shape[0] == rows)
-    if not fits or not np.isfinite(array).all():
-        raise InputError("not a matrix that fits", where=name, found=_brief(array), expected=f"finite, {rows or 'r'} rows")
-    return array
-
-
 def _brief(array: FloatArray) -> str:
     return f"shape {array.shape}" + ("" if np.isfinite(array).all() else ", with NaN or inf")
 
@@ -253,71 +159,6 @@ def _bounds(values: npt.ArrayLike | None, absent: float, n: int, name: str) -> F
     if array.shape != (n,) or np.isnan(array).any() or (array == -absent).any():
         raise InputError("bounds that do not fit", where=name, found=array.tolist(), expected=f"{n} numbers; {absent} for none")
     return array
-
-
-def _weights(weights: npt.ArrayLike | None, rows: int) -> FloatArray:
-    scale = np.ones(rows) if weights is None else _sized(weights, rows, "weights")
-    if (scale < 0.0).any():
-        raise InputError("negative weights", where="weights", found=float(scale.min()), expected="≥ 0")
-    return scale
-
-
-def _not_negative(value: float, name: str) -> float:
-    if not (np.isfinite(value) and value >= 0.0):
-        raise InputError(f"{name} must not be negative", where=name, found=value, expected="a finite number ≥ 0")
-    return float(value)
-
-
-def prior_precision(std: npt.ArrayLike | None, k: int) -> FloatArray:
-    """Return 1 / std² of k nuisance factors, shape (k,); std a number or (k,), 1 where not given. Raises InputError."""
-    values = np.ones(k) if std is None else np.broadcast_to(np.asarray(std, dtype=np.float64), (k,))
-    if k and not (values > 0.0).all():
-        raise InputError(
-            "standard deviations must be positive", where="nuisance_std", found=values.tolist(), expected="> 0, inf: free"
-        )
-    return np.asarray(1.0 / values**2)
-
-
-def _limit(values: npt.ArrayLike | None, absent: float, n: int, name: str) -> FloatArray:
-    array = np.asarray(absent if values is None else values, dtype=np.float64)
-    if array.ndim == 0:
-        return np.full(n, float(array))
-    if array.size != n:
-        raise InputError(
-            "as many bounds as unknowns", where=name, found=array.shape, expected=f"a number, ({n},) or ({n} / 3, 3)"
-        )
-    return array.ravel()
-
-
-# --- constraints ------------------------------------------------------------------------------------------------------
-
-
-def _actuation(
-    inputs: npt.ArrayLike | None,
-    displacements: npt.ArrayLike | None,
-    W_aa: npt.ArrayLike | None,
-    W_af: npt.ArrayLike | None,
-    delta_a_free: npt.ArrayLike | None,
-    a: int,
-    f: int,
-    k: int,
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return A and b of equation (13) or (14), None without either."""
-    if inputs is not None and displacements is not None:
-        found = "cable_inputs (13) and cable_displacements (14)"
-        raise InputError("two statements of the cables", where="cable_inputs", found=found, expected="one of them")
-    if inputs is not None:
-        return np.hstack([np.eye(a), np.zeros((a, f + k))]), _sized(inputs, a, "cable_inputs")
-    if displacements is None:
-        return None, None
-    for name, part in (("W_aa", W_aa), ("W_af", W_af), ("delta_a_free", delta_a_free)):
-        if part is None:
-            raise InputError(
-                f"{name} is missing", where=name, found="cable_displacements (14)", expected="W_aa, W_af, delta_a_free"
-            )
-    assert W_aa is not None and W_af is not None and delta_a_free is not None
-    A = np.hstack([_matrix(W_aa, a, "W_aa"), _matrix(W_af, f, "W_af"), np.zeros((a, k))])
-    return A, _sized(displacements, a, "cable_displacements") - _sized(delta_a_free, a, "delta_a_free")
 
 
 def _bound_work(bounds: FloatArray, multipliers: FloatArray) -> float:

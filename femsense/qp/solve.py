@@ -49,17 +49,12 @@ class ProgramStatus(StrEnum):
 _TEXTS = {
     ProgramStatus.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
     ProgramStatus.INFEASIBLE: (
-        "no point obeys all constraints: bounds that cross, measured inputs outside their bounds, or measured "
-        "displacements that no"
-        " allowed tension and force can make",
-        "check the signs and units of the cable inputs; widen the bounds of tension and force; drop the friction cone",
+        "no point obeys all constraints: bounds that cross, or constraints that exclude each other",
+        "widen the bounds; check the signs and units of inputs and limits",
     ),
     ProgramStatus.UNBOUNDED: (
-        (
-            "the objective falls for ever along some direction: an unknown that no row of the compliance sees and no "
-            "constraint holds"
-        ),
-        "use fewer contacts, add rows, or a small ridge",
+        "the objective falls for ever along some direction: an unknown that no row sees and no constraint holds",
+        "use fewer contacts or actuators, or bound the unknowns",
     ),
     ProgramStatus.NOT_CONVEX: (
         "P has a negative eigenvalue: the objective is not a sum of squares",
@@ -67,7 +62,7 @@ _TEXTS = {
     ),
     ProgramStatus.INACCURATE: (
         "no solver reached the tolerance: the problem is badly conditioned (contacts that the rows do not distinguish)",
-        "merge contacts that lie close together, add a ridge, or loosen the tolerance",
+        "merge contacts that lie close together, or loosen the tolerance",
     ),
 }
 

@@ -175,7 +175,7 @@ def test_infeasible_is_a_status_with_a_text() -> None:
 )
 def test_unbounded_is_a_status(problem: Problem) -> None:
     solution = solve(problem)
-    assert solution.status is ProgramStatus.UNBOUNDED and "ridge" in solution.status.advice
+    assert solution.status is ProgramStatus.UNBOUNDED and "bound" in solution.status.advice
 
 
 def test_not_convex_is_a_status() -> None:
