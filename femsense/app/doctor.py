@@ -231,25 +231,21 @@ def _tiny_solve() -> Finding:
     """Let a soft cube hang by one face: the equilibrium certifies itself by its residual, and the weight must be carried."""
     import numpy as np
 
+    from femsense.fem.blocks import block_mesh
     from femsense.fem.body import make_body
     from femsense.fem.equilibrium import solve_equilibrium
-    from femsense.fem.mesh import TetMesh
 
-    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.05
-    tets = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
-    x = corners[tets]
-    flip = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
-    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
+    mesh = block_mesh([[0.0, 0.05]] * 3)
     body = make_body(
-        TetMesh(corners, tets),
+        mesh,
         young_modulus=1e5,
         poisson_ratio=0.45,
         density=1000.0,
-        clamped=np.flatnonzero(corners[:, 2] > 0.04),
+        clamped=np.flatnonzero(mesh.nodes[:, 2] > 0.04),
         gravity=(0.0, 0.0, -9.81),
     )
     state = solve_equilibrium(body)
-    sag = 1e3 * float((corners - state.positions)[:, 2].max())
+    sag = 1e3 * float((mesh.nodes - state.positions)[:, 2].max())
     found = f"{state.status}, residual {state.residual_n:.1e} N, sag {sag:.3f} mm"
     solved = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
     return good(found) if solved else bad(found, "reinstall: pip install --force-reinstall femsense")
