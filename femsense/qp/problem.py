@@ -1,6 +1,6 @@
 """A quadratic problem, and the certificate of an answer.
 
-    minimise   ½ xᵀ P x + qᵀ x    subject to   G x ≤ h,   A x = b,   lb ≤ x ≤ ub
+    minimise   ½ xᵀ P x + qᵀ x    subject to   G x ≤ h,   lb ≤ x ≤ ub
 
 Signs of the multipliers are those of qpsolvers.
 """
@@ -31,10 +31,6 @@ class Problem:
     """Inequalities G x ≤ h, shape [m, n]."""
     h: FloatArray | None = None
     """Shape [m]."""
-    A: FloatArray | None = None
-    """Equalities A x = b, shape [k, n]."""
-    b: FloatArray | None = None
-    """Shape [k]."""
     lb: FloatArray | None = None
     """Lower bounds, shape [n]; −inf: none."""
     ub: FloatArray | None = None
@@ -49,10 +45,9 @@ class Problem:
         asymmetry = float(np.abs(P - P.T).max(initial=0.0))
         if asymmetry > 1e-9 * max(float(np.abs(P).max(initial=0.0)), 1e-300):
             raise InputError("P must be symmetric", where="P", found=f"|P − Pᵀ| up to {asymmetry:.3g}", expected="P = Pᵀ")
-        G, h = _rows(self.G, self.h, n, "G", "h")
-        A, b = _rows(self.A, self.b, n, "A", "b")
+        G, h = _rows(self.G, self.h, n)
         lb, ub = _bounds(self.lb, -np.inf, n, "lb"), _bounds(self.ub, np.inf, n, "ub")
-        for name, value in zip(["P", "q", "G", "h", "A", "b", "lb", "ub"], (0.5 * (P + P.T), q, G, h, A, b, lb, ub)):
+        for name, value in zip(["P", "q", "G", "h", "lb", "ub"], (0.5 * (P + P.T), q, G, h, lb, ub)):
             object.__setattr__(self, name, freeze(value))
 
     @property
@@ -60,11 +55,11 @@ class Problem:
         """Number of unknowns."""
         return len(self.q)
 
-    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return P, q, G, h, A, b, lb, ub, all of them arrays."""
-        G, h, A, b, lb, ub = self.G, self.h, self.A, self.b, self.lb, self.ub
-        assert G is not None and h is not None and A is not None and b is not None and lb is not None and ub is not None
-        return self.P, self.q, G, h, A, b, lb, ub
+    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return P, q, G, h, lb, ub, all of them arrays."""
+        G, h, lb, ub = self.G, self.h, self.lb, self.ub
+        assert G is not None and h is not None and lb is not None and ub is not None
+        return self.P, self.q, G, h, lb, ub
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,8 +68,6 @@ class Multipliers:
 
     z: FloatArray
     """Multipliers of G x ≤ h, ≥ 0, shape [m]."""
-    y: FloatArray
-    """Multipliers of A x = b, shape [k]."""
     z_box: FloatArray
     """Multipliers of the bounds, shape [n]: ≤ 0 at an active lower bound, ≥ 0 at an active upper bound."""
 
@@ -86,9 +79,9 @@ class Residuals:
     primal: float
     """Largest violation of a constraint [units of x and of the rows]."""
     dual: float
-    """Largest entry of P x + q + Gᵀ z + Aᵀ y + z_box, or a multiplier of the wrong sign [objective / unit of x]."""
+    """Largest entry of P x + q + Gᵀ z + z_box, or a multiplier of the wrong sign [objective / unit of x]."""
     gap: float
-    """|xᵀ P x + qᵀ x + hᵀ z + bᵀ y + bounds · z_box| [objective]."""
+    """|xᵀ P x + qᵀ x + hᵀ z + bounds · z_box| [objective]."""
 
 
 def kkt_residuals(problem: Problem, x: FloatArray | None, multipliers: Multipliers | None) -> Residuals:
@@ -96,15 +89,15 @@ def kkt_residuals(problem: Problem, x: FloatArray | None, multipliers: Multiplie
 
     Primal residual, dual residual and gap are all zero if and only if x is optimal, because the problem is convex.
     """
-    P, q, G, h, A, b, lb, ub = problem.parts()
+    P, q, G, h, lb, ub = problem.parts()
     if x is None or multipliers is None:
         return Residuals(np.inf, np.inf, np.inf)
-    z, y, z_box = multipliers.z, multipliers.y, multipliers.z_box
-    if not all(np.isfinite(part).all() for part in (x, z, y, z_box)):
+    z, z_box = multipliers.z, multipliers.z_box
+    if not all(np.isfinite(part).all() for part in (x, z, z_box)):
         return Residuals(np.inf, np.inf, np.inf)
-    violations = np.concatenate([G @ x - h, np.abs(A @ x - b), lb - x, x - ub])
-    gradient = P @ x + q + G.T @ z + A.T @ y + z_box
-    gap = x @ P @ x + q @ x + h @ z + b @ y + _bound_work(lb, np.minimum(z_box, 0.0)) + _bound_work(ub, np.maximum(z_box, 0.0))
+    violations = np.concatenate([G @ x - h, lb - x, x - ub])
+    gradient = P @ x + q + G.T @ z + z_box
+    gap = x @ P @ x + q @ x + h @ z + _bound_work(lb, np.minimum(z_box, 0.0)) + _bound_work(ub, np.maximum(z_box, 0.0))
     return Residuals(
         primal=float(np.max(violations, initial=0.0)),
         dual=float(np.max(np.concatenate([np.abs(gradient), -z]), initial=0.0)),
@@ -140,18 +133,14 @@ def _brief(array: FloatArray) -> str:
     return f"shape {array.shape}" + ("" if np.isfinite(array).all() else ", with NaN or inf")
 
 
-def _rows(
-    matrix: npt.ArrayLike | None, right: npt.ArrayLike | None, n: int, matrix_name: str, right_name: str
-) -> tuple[FloatArray, FloatArray]:
+def _rows(matrix: npt.ArrayLike | None, right: npt.ArrayLike | None, n: int) -> tuple[FloatArray, FloatArray]:
     if matrix is None and right is None:
         return np.zeros((0, n)), np.zeros(0)
     if matrix is None or right is None:
-        missing, there = (matrix_name, right_name) if matrix is None else (right_name, matrix_name)
-        raise InputError(
-            f"{missing} is missing", where=missing, found=f"{there} alone", expected=f"{matrix_name} and {right_name}"
-        )
-    rows = _matrix(matrix, n, matrix_name)
-    return rows, _sized(right, len(rows), right_name)
+        missing, there = ("G", "h") if matrix is None else ("h", "G")
+        raise InputError(f"{missing} is missing", where=missing, found=f"{there} alone", expected="G and h")
+    rows = _matrix(matrix, n, "G")
+    return rows, _sized(right, len(rows), "h")
 
 
 def _bounds(values: npt.ArrayLike | None, absent: float, n: int, name: str) -> FloatArray:
