@@ -73,8 +73,6 @@ def name_markers(
     frames: IntArray,
     *,
     allowed: BoolArray | None = None,
-    poses: Sequence[FloatArray | None] | None = None,
-    initial: FloatArray | None = None,
 ) -> Recording:
     """Return the recording with names for its unnamed markers in some frames; markers without an assignment are removed with a warning.
 
@@ -82,8 +80,6 @@ def name_markers(
         robot, recording: results of `load_robot` and `load_recording`.
         frames: indices of the frames, shape (f,).
         allowed: which marker each unnamed row may be (by its colour), shape (U, markers); by default any.
-        poses: pose of each camera, shape (4, 4), or None where it is unknown. Default: the declared poses.
-        initial: initial inputs where they are known; by default found with the pose.
 
     Raises:
         DataError: too few points, points in another unit, mirrored ones, or those that fit the robot under more than one pose.
@@ -93,8 +89,8 @@ def name_markers(
         return recording
     seen = [_nameless(robot, recording, frames, v, allowed) for v in range(len(recording.camera_names))]
     seen = [one for one in seen if len(one.frames)]
-    known = recording.T_robot_camera if poses is None else tuple(poses)
-    model = _modelled(robot, recording, frames, first_inputs(robot, recording) if initial is None else initial)
+    known = recording.T_robot_camera
+    model = _modelled(robot, recording, frames, first_inputs(robot, recording))
     readings = [_readings(robot, one, model, known[one.view]) for one in seen]
     best = _combined(recording, seen, [r[0] for r in readings])
     _check_units(seen, model, readings, _spread(robot))

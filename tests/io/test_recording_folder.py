@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import DATA, RECORDING_FILES, write_block_robot, write_small_recording
+from helpers import DATA, RECORDING_FILES, marker_grid, write_block_robot, write_small_recording
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,7 +22,7 @@ from femsense.io.recording_folder import load_recording, save_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.camera import Camera, CameraNoise
 from femsense.model.plausibility import doubts_of_recording, warn_of
-from femsense.model.recording import Recording, make_recording, marker_grid, select_frames, with_marker_table
+from femsense.model.recording import Recording, make_recording, select_frames, with_marker_table
 from femsense.model.recording_checks import check_against
 from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline, Tool, Views
 
