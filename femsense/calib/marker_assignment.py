@@ -27,6 +27,7 @@ from femsense.model.marker_units import check_marker_sizes
 from femsense.model.observation import make_scene
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
+from femsense.model.recording_checks import camera_text
 from femsense.model.robot import Robot
 
 ELSEWHERE = 0.1
@@ -259,9 +260,8 @@ def _require_one(
                 and away > ELSEWHERE * spread
                 and other_fit.error_m < _margin(one) * best.error_m
             ):
-                name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them equally well: the residuals are "
+                    f"the markers of {camera_text(recording.camera_names[one.view])} have no names, and two poses fit them equally well: the residuals are "
                     f"{1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm, and they place the markers "
                     f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, "
                     f"pull cables in free frames, or declare T_robot_camera"

@@ -56,6 +56,11 @@ def in_frames(recording: Recording) -> str:
     return " in frames.csv" if recording.folder else ""
 
 
+def camera_text(name: str) -> str:
+    """Return how messages refer to a camera; the only one of a recording has no name."""
+    return f"camera {name}" if name else "the camera"
+
+
 def how_to_free(recording: Recording) -> str:
     """Return how frames are said to be free of undeclared contact."""
     if recording.folder is None:

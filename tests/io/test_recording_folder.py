@@ -660,6 +660,11 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
     ({"recording_toml": TOML + "[camera]\n"}, "recording.toml: camera", ["the camera lacks its lens"]),
     ({"recording_toml": TOML + CAMERA + "[cameras.a]\n"}, "recording.toml", ["both [camera] and [cameras.NAME]"]),
     ({"recording_toml": POSE_TOML.replace("1.0", "2.0") + TOML}, "recording.toml: T_robot_camera", ["not a rigid transform"]),
+    (
+        {"recording_toml": "T_robot_camera = [[1, 0, 0, 0]]\n" + TOML},
+        "recording.toml: T_robot_camera",
+        ["should have at least 4 items, not 1"],
+    ),
     ({"recording_toml": POSE_TOML + TOML + "[cameras.a]\n"}, "recording.toml: T_robot_camera", ["one pose for several cameras"]),
     (
         {"recording_toml": POSE_TOML + TOML + CAMERA + POSE_TOML},
