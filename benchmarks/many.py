@@ -45,7 +45,7 @@ from femsense.many.drive import Progress, run_jobs
 from femsense.many.engines import processes
 from femsense.many.jobs import RECORDS, Job
 from femsense.many.limits import ONE_THREAD
-from femsense.many.outcome import Outcome, Status
+from femsense.many.outcome import JobStatus, Outcome
 from femsense.many.work import Result, work_on
 
 WORDS = [sys.executable, "-m", "femsense"]
@@ -248,7 +248,7 @@ def overhead(root: Path, count: int) -> None:
     again = time.perf_counter() - again
     print(
         f"{count} jobs on two processes: {1e3 * beside:.1f} ms of a worker beside each; driver {early:.0f} MB at a tenth, {late:.0f} MB at "
-        f"the end; a rerun that keeps all {sum(o.status is Status.KEPT for o in kept)}: {1e3 * again / count:.2f} ms each",
+        f"the end; a rerun that keeps all {sum(o.status is JobStatus.KEPT for o in kept)}: {1e3 * again / count:.2f} ms each",
         flush=True,
     )
 

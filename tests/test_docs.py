@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import femsense
-from femsense.many.outcome import Status as JobStatus
-from femsense.qp.solve import Status as ProgramStatus
+from femsense.many.outcome import JobStatus
+from femsense.qp.solve import ProgramStatus
 from femsense.sensing.status import Status as FrameStatus
 
 ROOT = Path(__file__).parent.parent

@@ -6,7 +6,7 @@
 #
 # The data are a block of Dragon Skin 10, 100 × 30 × 30 mm, clamped at one end, with six markers and a weight at the upper edge of its free end (Dubied et al. 2022,
 # [study](../studies/beam-study.md)). They are not part of femsense: set the environment variable `FEMSENSE_BEAM` to the folder `data/beam`. **Without it the virtual rig records a beam of
-# known properties instead.** All cells then run in a few seconds, and their numbers are those of a simulation.
+# known properties instead.** All cells then run in half a minute, and their numbers are those of a simulation.
 
 # %% tags=["setup"]
 import os

@@ -13,12 +13,11 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
 import femsense
+from femsense.core.packages import installed_version
 from femsense.core.parallel import available_cores
 from femsense.core.text import with_type
 
@@ -139,7 +138,7 @@ def _package(module: str, package: str) -> Finding:
         loaded = importlib.import_module(module)
     except Exception as error:  # OSError, ImportError, and errors of a broken binary
         return bad(with_type(error), import_hint(str(error), package))
-    return good(_version(package) or str(getattr(loaded, "__version__", "version not known")))
+    return good(installed_version(package) or str(getattr(loaded, "__version__", "version not known")))
 
 
 def import_hint(message: str, package: str) -> str:
@@ -155,7 +154,7 @@ def _tetrahedra() -> Finding:
     """pytetwild runs in a process of its own and is not loaded here."""
     if importlib.util.find_spec("pytetwild") is None:
         return note("not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
-    return good(_version("pytetwild") or "version not known")
+    return good(installed_version("pytetwild") or "version not known")
 
 
 def _libraries() -> Finding:
@@ -177,7 +176,7 @@ def _solver() -> Finding:
         return bad(f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
     from femsense.fem.linalg.factorization import pardiso_library
 
-    name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
+    name = f"PARDISO (pypardiso {installed_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
     return note(name, f"FEMSENSE_SOLVER={chosen} selects it: slower than the own solver")
 
 
@@ -213,7 +212,7 @@ def _kernels() -> Finding:
     each is a file where numba looks for it."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     found = [_kernel_version(file) for file in Path(chosen or Path(femsense.__file__).parent).rglob("*.nbi")]
-    mine = found.count(_version("numba"))
+    mine = found.count(installed_version("numba"))
     if mine >= FEW_KERNELS:
         return good(f"{mine} functions are compiled")
     other = f", and {len(found) - mine} by another version of numba" if mine < len(found) else ""
@@ -232,25 +231,21 @@ def _tiny_solve() -> Finding:
     """Let a soft cube hang by one face: the equilibrium certifies itself by its residual, and the weight must be carried."""
     import numpy as np
 
+    from femsense.fem.blocks import block_mesh
     from femsense.fem.body import make_body
     from femsense.fem.equilibrium import solve_equilibrium
-    from femsense.fem.mesh import TetMesh
 
-    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.05
-    tets = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
-    x = corners[tets]
-    flip = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
-    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
+    mesh = block_mesh([[0.0, 0.05]] * 3)
     body = make_body(
-        TetMesh(corners, tets),
+        mesh,
         young_modulus=1e5,
         poisson_ratio=0.45,
         density=1000.0,
-        clamped=np.flatnonzero(corners[:, 2] > 0.04),
+        clamped=np.flatnonzero(mesh.nodes[:, 2] > 0.04),
         gravity=(0.0, 0.0, -9.81),
     )
     state = solve_equilibrium(body)
-    sag = 1e3 * float((corners - state.positions)[:, 2].max())
+    sag = 1e3 * float((mesh.nodes - state.positions)[:, 2].max())
     found = f"{state.status}, residual {state.residual_n:.1e} N, sag {sag:.3f} mm"
     solved = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
     return good(found) if solved else bad(found, "reinstall: pip install --force-reinstall femsense")
@@ -301,10 +296,3 @@ def _writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version_of(package)
-    except PackageNotFoundError:
-        return None

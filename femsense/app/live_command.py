@@ -52,7 +52,6 @@ def sense_live(
     options: LiveOptions,
     *,
     say: Callable[[str], None],
-    on_url: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Run a session until the camera ends, a person ends it, or its time is over; return its figures.
 
@@ -61,7 +60,6 @@ def sense_live(
         camera: source of frames.
         options: everything else.
         say: called with lines for people.
-        on_url: called with the address of the page once it is there.
 
     Raises:
         FemsenseError: bad input, a source that cannot be used, no calibration that suffices.
@@ -111,7 +109,6 @@ def sense_live(
         with contextlib.suppress(KeyboardInterrupt):  # from the address on, Ctrl-C is the normal end
             if url:
                 say(url)
-                on_url(url)
             with shown(session.snapshot, lambda key: keys[key](), say, url):
                 session.run()
         session.close()

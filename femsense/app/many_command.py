@@ -19,7 +19,7 @@ from femsense.many.drive import Progress, run_jobs
 from femsense.many.engines import open_engine
 from femsense.many.jobs import expanded
 from femsense.many.limits import memory_share
-from femsense.many.outcome import Outcome, Scalar, Status
+from femsense.many.outcome import JobStatus, Outcome, Scalar
 from femsense.many.summary import check_no_result, check_summary_folder, read_summary, write_summary
 from femsense.report.words import duration
 
@@ -143,7 +143,7 @@ def row_of(command: str, document: Mapping[str, Any]) -> dict[str, Scalar]:
 def _answer(out: Path, command: str, outcomes: Sequence[Outcome]) -> Answer:
     counts = Counter(o.status.value for o in outcomes)
     bad = [o for o in outcomes if not o.is_good]
-    said = ", ".join(f"{n} {'were there' if status == Status.KEPT else status}" for status, n in counts.items())
+    said = ", ".join(f"{n} {'were there' if status == JobStatus.KEPT else status}" for status, n in counts.items())
     lines = [f"{command}: {said}, of {len(outcomes)} jobs"]
     lines += [f"  {o.name}: {o.status.value}: {o.reason.splitlines()[0] if o.reason else ''}" for o in bad[:LISTED]]
     lines += [f"  … and {len(bad) - LISTED} more"] if len(bad) > LISTED else []

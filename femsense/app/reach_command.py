@@ -78,7 +78,7 @@ def reach_targets(
 
 
 def _amount(value: float, unit: str) -> str:
-    return f"{1e3 * value:+.3f} mm" if unit == "m" else f"{value:.4g} {unit}"
+    return f"{1e3 * value:+.3f} mm" if unit == "m" else f"{round(value, 9):.4g} {unit}"
 
 
 def _check_size(robot: Robot, wanted: Mapping[Any, FloatArray]) -> None:

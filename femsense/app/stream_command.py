@@ -107,7 +107,7 @@ def quiet(_text: str) -> None:
 
 
 def stream_runs(
-    runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, clouds: bool = True, say: Callable[[str], None] = quiet
+    runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, say: Callable[[str], None] = quiet
 ) -> LiveStream:
     """Play runs at their own times to whoever watches; return at once. `say` is called before a long step.
 
@@ -121,7 +121,7 @@ def stream_runs(
     for run in runs:
         if (run / "states.npz").is_file() and not has_current_glb(run):
             say(f"making the mesh of {run}")
-    opened = [open_run(run, clouds=clouds) for run in runs]
+    opened = [open_run(run) for run in runs]
     names = _distinct([one.twin.name for one in opened])
     live = _serve(options, names[0])
     for one, name in zip(opened, names):
@@ -135,7 +135,6 @@ def stream_sensors(
     model_file: Path,
     options: StreamOptions,
     *,
-    name: str | None = None,
     skin: UserSkin | None = None,
     say: Callable[[str], None] = quiet,
 ) -> LiveStream:
@@ -153,7 +152,7 @@ def stream_sensors(
     from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
 
     model = load_model(model_file)
-    twin = sensor_twin(model, name or model_file.stem, skin)
+    twin = sensor_twin(model, model_file.stem, skin)
     stop = Event()
     readings = readings_of(source, model.channels, stop)  # opened before anything is served, so that errors are reported at once
     live = _serve(options, twin.name, stop)

@@ -44,6 +44,8 @@ from femsense.model.recording_checks import check_against, how_to_free
 from femsense.model.repeats import marker_repeatability
 from femsense.model.robot import Robot
 
+TURNS = 3
+"""Largest number of turns of Algorithm 1, which only finds the start of the joint fit."""
 MAX_FRAMES = 16
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
 START_FRAMES = 5
@@ -227,7 +229,7 @@ def _thinned(frames: IntArray) -> IntArray:
 
 
 def _alternate(
-    robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 3
+    robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float]
 ) -> tuple[list[FloatArray], FloatArray]:
     """Algorithm 1: rigid pose and bounded inputs in turns."""
     from scipy.optimize import lsq_linear
@@ -236,7 +238,7 @@ def _alternate(
     low, high = input_bounds(robot, scene.recording)
     plain, starts = Hypothesis(robot), dict[int, Equilibrium]()
     empty, pivot = np.zeros(0), robot.marker_points.mean(axis=0)
-    for _ in range(rounds):
+    for _ in range(TURNS):
         jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=True, vary_initial=True, pivot=pivot, starts=starts)
         history.append(root_mean_square(jet.residual))
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled

@@ -13,6 +13,7 @@ from femsense.calib.marker_readings import opened
 from femsense.calib.readings import EXPLAINED, Reading, first_order, rigid_misfit
 from femsense.core.arrays import freeze
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import camera_text
 
 FRAMES, ROWS, MARKERS = 4, 4, 3
 """Least number of frames of a camera that may have moved, of its rows before and after, and of different markers for a pose."""
@@ -78,10 +79,11 @@ def moved_camera(fit: MarkerFit) -> Iterator[Reading]:
         left, split = min((_split_misfit(fit, v, k), k) for k in frames[1:].tolist())
         before, after = (int(recording.frame_numbers[k]) for k in (frames[frames < split].max(), split))
         yield Reading(
-            f"camera {name or '(only one)'} or the robot's base seems to have moved between frames {before} and {after}",
+            f"{camera_text(name)} or the robot's base seems to have moved between frames {before} and {after}",
             left / max(plain, 1e-300),
             _split(recording, v, split),
-            advice="Calibrate the frames of one pose: make two recordings of it.",
+            advice="Calibrate the frames of one pose: make two recordings of it. If something touches the robot in frames that the column free marks "
+            "with 1, write 0 there.",
             parameters=6,
             reported=EXPLAINED,
             refused=EXPLAINED,

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from femsense.calib.marker_fit import MarkerFit, root_mean_square
 from femsense.calib.marker_readings import UNNAMED, with_robot_markers
 from femsense.calib.readings import EXPLAINED
-from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, rows_alike
 from femsense.core.errors import DataError
 from femsense.model.observation import Scene
 from femsense.model.recording import Recording, with_marker_table
@@ -70,12 +70,11 @@ def relabelled(fit: MarkerFit, *, strict: bool = True) -> Recording | None:
         np.zeros(len(scene.marker), dtype=np.bool_),
         root_mean_square(fit.jet.residual) / 60.0,
     )
-    for view, frame in np.unique(np.column_stack([scene.view, scene.frame]), axis=0):
-        mine = (scene.view == view) & (scene.frame == frame)
+    for mine in rows_alike(scene.view, scene.frame):
         places = np.full((len(robot.marker_names), 3), 1e3)  # those that the camera does not see are far away
         places[scene.marker[mine]] = modelled[mine]
         marker[mine] = true_labels(places, measured[mine], scene.marker[mine], noise=noise)
-        far[mine] = _outliers(np.linalg.norm(fit.jet.residual[mine], axis=1), fit.spread_of(view))
+        far[mine] = _outliers(np.linalg.norm(fit.jet.residual[mine], axis=1), fit.spread_of(scene.view[mine[0]]))
     renamed = marker != scene.marker
     swapped = len(np.unique(scene.frame[renamed]))
     if swapped > 0.5 * len(scene.frames):  # a swap in all frames is one of the whole recording
@@ -101,14 +100,14 @@ def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
 
 def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None:
     """Warn of corrected labels and removed outliers, frame by frame."""
-    texts = []
-    for k in np.unique(scene.frame[renamed | far]):
+    texts, frames = [], np.unique(scene.frame[renamed | far])
+    for k in frames[:6]:
         parts = []
         for rows, what in ((renamed, "labels were swapped, and are corrected"), (far, "outliers, left out")):
             names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
             parts += [f"{names} ({what})"] if names else []
         texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")
-    text = "; ".join(texts[:6]) + (f"; and {len(texts) - 6} frames more" if len(texts) > 6 else "")
+    text = "; ".join(texts) + (f"; and {len(frames) - 6} frames more" if len(frames) > 6 else "")
     warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=5)
 
 

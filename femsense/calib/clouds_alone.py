@@ -22,7 +22,7 @@ from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
 from femsense.model.marker_correction import recorded_inputs
 from femsense.model.recording import Recording
-from femsense.model.recording_checks import how_to_free
+from femsense.model.recording_checks import camera_text, how_to_free
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.segmentation import color_mask
@@ -147,7 +147,7 @@ def _check_determined(recording: Recording, start: Calibration, fitted: Calibrat
         values, vectors = np.linalg.eigh(scale[:, None] * fitted.joint_covariance[own, own] * scale)
         if values[-1] > UNDETERMINED**2:
             raise DataError(
-                f"the clouds do not determine the pose of camera {recording.camera_names[v] or '(only one)'} "
+                f"the clouds do not determine the pose of {camera_text(recording.camera_names[v])} "
                 f"{_direction(vectors[:, -1])}: the fitted pose may be far off. Record contact-free frames in which other inputs bend the "
                 "robot in other directions, or three markers; or declare T_robot_camera"
             )

@@ -9,6 +9,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import camera_text
 
 DECLARED_STD = np.repeat([np.radians(0.5), 1e-3], 3)
 """Prior standard deviation of a declared pose when clouds are fitted: rotation [rad] and translation [m] along each axis
@@ -31,10 +32,10 @@ def pose_error(
         declared, fitted: T_robot_camera of all cameras, shape (4, 4) each.
         middles: point at which the translation is stated, one per view [m], shape (3,).
     """
-    names = [recording.camera_names[v] or "(only one)" for v in views]
+    names = [recording.camera_names[v] for v in views]
     off = [_difference(declared[v], fitted[v], middle) for v, middle in zip(views, middles)]
     if len(views) == 1:
-        return f"the declared pose of camera {names[0]} is {off[0]}"
+        return f"the declared pose of {camera_text(names[0])} is {off[0]}"
     each = "; that of ".join(f"{name} is {text}" for name, text in zip(names, off))
     return f"the declared poses of cameras {', '.join(names)} are off: that of {each}"
 

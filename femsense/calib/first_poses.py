@@ -12,6 +12,7 @@ from femsense.fem.equilibrium import SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
 from femsense.model.observation import Scene
+from femsense.model.recording_checks import camera_text
 from femsense.model.robot import Robot
 
 IN_LINE = 0.1
@@ -49,7 +50,7 @@ def _pose_from_frames(robot: Robot, scene: Scene, view: int, name: str) -> Float
     if not many:
         most = max((int(((scene.frame == k) & mine).sum()) for k in scene.frames), default=0)
         raise DataError(
-            f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. "
+            f"{camera_text(name)} needs a frame with three markers for its pose; the most in one frame is {most}. "
             f"Give T_robot_camera, or show more markers"
         )
     used = many if in_line(scene.points[(scene.frame == many[0]) & mine]) else many[:1]

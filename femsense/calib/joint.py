@@ -35,14 +35,13 @@ def fit_joint(
     initial: FloatArray | None,
     history: list[float],
     *,
-    free_inputs: bool = True,
     solver: PathSolver | None = None,
 ) -> MarkerFit:
     """Fit poses and initial inputs together; the weights of noise and outliers are re-estimated from the residual until they converge.
 
     Declared poses stay fixed. States are solved with the `solver`.
     """
-    problem = _Problem(robot, scene, poses, initial, free_inputs=free_inputs, solver=solver)
+    problem = _Problem(robot, scene, poses, initial, solver=solver)
     low, high = problem.bounds()
     theta, huber = problem.start(), np.ones(len(scene.points))
     for again in range(MAX_REWEIGHTINGS):
@@ -68,7 +67,7 @@ def moved_by_law(fit: MarkerFit) -> FloatArray:
     other, nothing, jet = with_other_law(fit.robot), np.zeros(len(fit.result.theta)), fit.jet
     if other is None or not np.isfinite(fit.result.covariance).all():
         return nothing
-    there = _Problem(other, fit.scene, list(fit.poses), fit.initial, free_inputs=True, solver=PathSolver(look_at))
+    there = _Problem(other, fit.scene, list(fit.poses), fit.initial, solver=PathSolver(look_at))
     there.starts = dict(jet.states)
     there.weigh(jet, _huber_weights(jet.residual), len(fit.result.theta))
     row = (there.weights / there.std)[:, None, None]
@@ -91,7 +90,6 @@ class _Problem:
         poses: list[FloatArray],
         initial: FloatArray | None,
         *,
-        free_inputs: bool,
         solver: PathSolver | None,
     ) -> None:
         self.plain, self.scene, self.solver = Hypothesis(robot), scene, solver
@@ -99,14 +97,14 @@ class _Problem:
         self.pivot = robot.marker_points.mean(axis=0)
         self.moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
         self.declared = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is not None]
-        self.free_inputs = len(initial) if initial is not None and free_inputs else 0
+        self.free_inputs = 0 if initial is None else len(initial)
         self.repeats = _repeats(scene)
         self.weights, self.std, self.placement_std = self.repeats, 5e-4, PLACEMENT_STD_FLOOR
         self.starts: dict[int, Equilibrium] = {}
         self.jet: SceneJet | None = None
 
     def start(self) -> FloatArray:
-        inputs = self.initial if self.free_inputs and self.initial is not None else np.zeros(0)
+        inputs = np.zeros(0) if self.initial is None else self.initial
         return np.concatenate([np.zeros(6 * len(self.moving)), inputs])
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:

@@ -27,6 +27,7 @@ from femsense.model.marker_units import check_marker_sizes
 from femsense.model.observation import make_scene
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
+from femsense.model.recording_checks import camera_text
 from femsense.model.robot import Robot
 
 ELSEWHERE = 0.1
@@ -73,8 +74,6 @@ def name_markers(
     frames: IntArray,
     *,
     allowed: BoolArray | None = None,
-    poses: Sequence[FloatArray | None] | None = None,
-    initial: FloatArray | None = None,
 ) -> Recording:
     """Return the recording with names for its unnamed markers in some frames; markers without an assignment are removed with a warning.
 
@@ -82,8 +81,6 @@ def name_markers(
         robot, recording: results of `load_robot` and `load_recording`.
         frames: indices of the frames, shape (f,).
         allowed: which marker each unnamed row may be (by its colour), shape (U, markers); by default any.
-        poses: pose of each camera, shape (4, 4), or None where it is unknown. Default: the declared poses.
-        initial: initial inputs where they are known; by default found with the pose.
 
     Raises:
         DataError: too few points, points in another unit, mirrored ones, or those that fit the robot under more than one pose.
@@ -93,8 +90,8 @@ def name_markers(
         return recording
     seen = [_nameless(robot, recording, frames, v, allowed) for v in range(len(recording.camera_names))]
     seen = [one for one in seen if len(one.frames)]
-    known = recording.T_robot_camera if poses is None else tuple(poses)
-    model = _modelled(robot, recording, frames, first_inputs(robot, recording) if initial is None else initial)
+    known = recording.T_robot_camera
+    model = _modelled(robot, recording, frames, first_inputs(robot, recording))
     readings = [_readings(robot, one, model, known[one.view]) for one in seen]
     best = _combined(recording, seen, [r[0] for r in readings])
     _check_units(seen, model, readings, _spread(robot))
@@ -263,9 +260,8 @@ def _require_one(
                 and away > ELSEWHERE * spread
                 and other_fit.error_m < _margin(one) * best.error_m
             ):
-                name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them equally well: the residuals are "
+                    f"the markers of {camera_text(recording.camera_names[one.view])} have no names, and two poses fit them equally well: the residuals are "
                     f"{1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm, and they place the markers "
                     f"{1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, "
                     f"pull cables in free frames, or declare T_robot_camera"

@@ -15,6 +15,7 @@ from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
 from femsense.model.as_it_is import evaluate_robot
 from femsense.model.recording import Recording
+from femsense.model.recording_checks import camera_text
 from femsense.model.robot import Robot
 
 LEFT_HANDED = "Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
@@ -147,7 +148,7 @@ def marker_scale(fit: MarkerFit) -> Iterator[Reading]:
         scale, std = 1.0 / (1.0 - found.value[0]), found.std[0] / (1.0 - found.value[0]) ** 2
         if abs(scale - 1.0) < KNOWN * std or scale <= 0.0:
             continue
-        which = "all cameras" if len(views) > 1 else f"camera {fit.scene.recording.camera_names[views[0]] or '(only one)'}"
+        which = "all cameras" if len(views) > 1 else camera_text(fit.scene.recording.camera_names[views[0]])
         yield Reading(
             f"the markers of {which} are {scale:.3f} ± {std:.1g} times too large",
             found.share,

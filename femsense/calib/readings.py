@@ -106,11 +106,13 @@ def compare_readings(fit: MarkerFit, rereads: Sequence[Reread], refit: Refit, *,
         if one.ratio <= alike:
             of_kind.setdefault(one.kind, one)
     best, *others = of_kind.values()
-    text = f"{best.text}: the markers then fit to {1e3 * best.left:.3g} mm instead of {1e3 * best.before:.3g} mm. {best.reading.advice}"
+    text = f"{best.text}: the markers then fit to {1e3 * best.left:.3g} mm instead of {1e3 * best.before:.3g} mm."
+    if best.reading.advice:
+        text += f" {best.reading.advice}"
     if others:
         text += f" As good: {'; '.join(f'{one.text} ({1e3 * one.left:.3g} mm)' for one in others)}."
     if is_suspicious(fit) and all(one.ratio * one.reading.refused < 1.0 for one in (best, *others)):
-        raise DataError(text.strip())
+        raise DataError(text)
     warnings.warn(f"{text} Or the model errs by as much: femsense improve", stacklevel=5)
 
 

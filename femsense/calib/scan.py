@@ -18,7 +18,7 @@ from femsense.model.camera_frame import undo_depth
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
-from femsense.pointcloud.rays import Surface, SurfaceHits, together
+from femsense.pointcloud.rays import Surface, SurfaceHits
 from femsense.pointcloud.segmentation import color_mask
 
 REACH = 0.04
@@ -184,7 +184,6 @@ def ray_rows(
     noises: Sequence[CameraNoise],
     *,
     reach: float,
-    catch: float = 0.0,
 ) -> RayRows:
     """Cast the ray of each measured point onto the deformed surface, and return one residual row per hit.
 
@@ -197,15 +196,9 @@ def ray_rows(
         poses: T_robot_camera of each camera, shape (4, 4).
         noises: depth noise of each camera.
         reach: maximum distance between a point and its face [m]; points farther away belong to another object.
-        catch: maximum distance of the fallback [m]: a point whose ray misses the surface is compared with the closest face. It helps in states
-            far from the solution.
     """
-    points, origins = scan.points(poses), scan.origins(poses)
-    hits = surface.cast(points, origins, reach=reach)
-    if catch > 0.0:
-        missed = np.setdiff1d(np.arange(len(points)), hits.index)
-        near = surface.near(points[missed], origins[missed], reach=catch)
-        hits = together(hits, SurfaceHits(missed[near.index], near.nodes, near.weights, near.normal, near.distance, near.cosine))
+    points = scan.points(poses)
+    hits = surface.cast(points, scan.origins(poses), reach=reach)
     std = scan.ray_std(noises)[hits.index] * np.maximum(hits.cosine, 1e-3)
     return RayRows(hits, points[hits.index], scan.view[hits.index], hits.distance, std)
 

@@ -16,7 +16,7 @@ from femsense.core.pose import std_of_entries
 from femsense.model.camera_frame import in_robot_frame
 from femsense.model.observation import Scene, rest_residual
 from femsense.model.recording import Recording
-from femsense.model.recording_checks import how_to_free
+from femsense.model.recording_checks import camera_text, how_to_free
 from femsense.model.robot import Robot
 
 
@@ -63,10 +63,10 @@ def from_rest(robot: Robot, recording: Recording) -> Calibration:
 
 def as_declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibration:
     """Return the calibration of a recording without markers whose poses are declared."""
-    missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
+    missing = [camera_text(name) for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise DataError(
-            f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record "
+            f"no markers, no clouds and no T_robot_camera: the pose of {', '.join(missing)} is not known. Record "
             f"markers or clouds, or write T_robot_camera in recording.toml"
         )
     unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)

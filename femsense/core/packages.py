@@ -24,3 +24,13 @@ def needed(module: str, extra: str, doing: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingDependency(f"{doing}: {one_line(error)}\n  try:      pip install 'femsense[{extra}]'") from None
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of an installed package; None where it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

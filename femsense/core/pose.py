@@ -25,8 +25,10 @@ def check_pose(T: npt.ArrayLike, name: str) -> FloatArray:
         pose = np.asarray(T, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError("not a matrix of numbers", where=name, found=repr(T)[:80], expected="4 rows of 4 numbers") from None
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError("not a rigid transform", where=name, found=f"shape {pose.shape}", expected="4 rows of 4 finite numbers")
+    unknown = pose[~np.isfinite(pose)]
+    if pose.shape != (4, 4) or len(unknown):
+        found = f"shape {pose.shape}" if pose.shape != (4, 4) else f"{len(unknown)} of 16 numbers are {unknown[0]}"
+        raise InputError("not a rigid transform", where=name, found=found, expected="4 rows of 4 finite numbers")
     off = float(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max())
     if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0 or not np.allclose(pose[3], [0, 0, 0, 1]):
         raise InputError(

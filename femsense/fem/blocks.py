@@ -62,13 +62,3 @@ def block_mesh(
     used, tets = np.unique(numbers[:, KUHN].reshape(-1, 4), return_inverse=True)
     nodes = points[used]
     return oriented(TetMesh(nodes if place is None else place(nodes), tets.reshape(-1, 4)))
-
-
-def rounded_square(points: FloatArray, *, roundness: float) -> FloatArray:
-    """Return points (n, 2) of the square [−1, 1]² moved towards the disc of the same half width.
-
-    `roundness` 0 leaves the square, 1 gives the disc (x √(1 − y²/2), y √(1 − x²/2)), whose four corner cells are flat.
-    """
-    x, y = points[:, 0], points[:, 1]
-    disc = np.stack([x * np.sqrt(1.0 - y**2 / 2.0), y * np.sqrt(1.0 - x**2 / 2.0)], axis=1)
-    return (1.0 - roundness) * points + roundness * disc

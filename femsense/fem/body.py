@@ -100,8 +100,8 @@ class BodyModel:
         """Return weight plus other dead forces [N], shape (n, 3)."""
         return self.weight() + self.dead_forces
 
-    def is_held(self) -> bool:
-        """Return whether the clamp or its springs prevent every rigid motion of every connected part: each has three held nodes that are not on a line."""
+    def is_clamped(self) -> bool:
+        """Return whether the clamp or its springs prevent every rigid motion of every connected part: each has three such nodes that are not on a line."""
         held = self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes  # a plate holds all of them
         return all(_spread_out(self.mesh.nodes[held[self.parts[held] == part]]) for part in range(int(self.parts.max()) + 1))
 

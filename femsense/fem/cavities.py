@@ -11,8 +11,7 @@ import scipy.sparse as sp
 from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import Chamber
-from femsense.fem.closest_point import FACES
-from femsense.fem.mesh import FACE_EDGES, TetMesh
+from femsense.fem.mesh import TetMesh, boundary_faces
 
 _A, _B, _C, _D = 0.816847572980459, 0.091576213509771, 0.108103018168070, 0.445948490915965
 
@@ -93,7 +92,7 @@ def find_chamber(
     """
     where = where or f"seed of chamber {name}"
     point = as_points(seed, where)[0]
-    faces = _boundary_faces(mesh)
+    faces = boundary_faces(mesh)
     part = _surface_parts(faces)
     angles = _solid_angles(mesh.nodes, faces, point)
     turns = np.bincount(part, weights=angles) / (4.0 * np.pi)
@@ -107,7 +106,7 @@ def find_chamber(
 
 def cavity_seeds(mesh: TetMesh) -> list[FloatArray]:
     """Return a point inside each cavity of a mesh that is closed [m], each (3,), the largest cavity first."""
-    faces = _boundary_faces(mesh)
+    faces = boundary_faces(mesh)
     part, seeds = _surface_parts(faces), list[tuple[float, FloatArray]]()
     corners = mesh.nodes[faces[:, :3]]
     volumes = np.bincount(part, weights=np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
@@ -158,17 +157,6 @@ def _not_a_cavity(mesh: TetMesh, faces: IntArray, seed: FloatArray, turns: float
         expected=expected,
         hint="close the hole in the mesh (a plug where the tube enters)",
     )
-
-
-def _boundary_faces(mesh: TetMesh) -> IntArray:
-    """Return the boundary faces, outward from the material, shape (t, 3) or (t, 6): corners, then the middles of ab, bc, ca."""
-    faces = mesh.tets[:, FACES].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = np.sort(first[count == 1])
-    if not mesh.is_quadratic:
-        return np.asarray(faces[outer])
-    middles = mesh.tets[:, 4:][:, FACE_EDGES].reshape(-1, 3)
-    return np.hstack([faces[outer], middles[outer]])
 
 
 def _surface_parts(faces: IntArray) -> IntArray:

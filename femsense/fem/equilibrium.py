@@ -1,12 +1,16 @@
 """Static equilibrium under dead loads, cables and pressures: Newton's method with the exact tangent, a line search, and load steps
 when needed.
 
-The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the free nodes, where cables pull with given tensions t and
-chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
-chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless `bilateral`): it becomes slack when T would be
-negative, and taut again when its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
+The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the free nodes, where cables pull with imposed tensions t and
+chambers press with imposed pressures p. A drive whose travel is imposed instead is *held*: a cable adds the constraint  δ(x) + T/k = d
+with its tension T as multiplier, a chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless `bilateral`), so its
+constraint is *active*, or the cable is *slack*: it becomes slack when T would be negative, and active again when its shortening would fall
+below d (complementarity). A held chamber always is active and may pull: it is full of liquid.
 Friction changes the tensions along a cable (`capstan.capstan_tensions`); these are updated in and between Newton solves until they
-converge. `Loads` and `State` (in `newton_state`) name the quantities of cables and chambers: effort, travel, target, lever, shares.
+converge.
+
+The way down: `solve_equilibrium` tries all loads at once, then load steps; each attempt calls `newton.settle` (active set and friction),
+and that `newton.newton`. `newton_state` defines `Loads`, which a solve does not change, and `State`, which it moves.
 """
 
 from __future__ import annotations
@@ -18,12 +22,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
+from femsense.core.arrays import BoolArray, FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.work import count
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
-from femsense.fem.chambers import volume_gradient
+from femsense.fem.imposed_loads import collect_loads
 from femsense.fem.linalg.factorization import Factorization
 from femsense.fem.newton import settle
 from femsense.fem.newton_state import (
@@ -33,6 +37,7 @@ from femsense.fem.newton_state import (
     State,
     drive_compliance,
     drive_rows,
+    is_cable,
     travel_of,
     unbalanced_force,
 )
@@ -40,12 +45,6 @@ from femsense.fem.stability import can_fall, holds_itself, is_doubtful
 
 SMALLEST_STEP = 2e-3
 """Smallest load step, as a share of the load: a path that needs smaller steps ends as `overload`."""
-SOFTNESS = 1e-2
-"""Stiffness of a body relative to its modulus times its size: the order of magnitude for slender bodies. It converts travels to forces."""
-LEAST_TRAVEL = 1e-6
-"""A load counts at least as the force that moves a body by this share of its size: a body without loads has a tolerance, too."""
-ROUNDING = 1e-13
-"""Rounding errors of the internal forces relative to modulus times size²."""
 ADVICE = {
     SolveStatus.CONVERGED: "the unbalanced force is below its tolerance",
     SolveStatus.UNSTABLE: (
@@ -100,7 +99,7 @@ class Equilibrium:
     segment_tensions: tuple[FloatArray, ...]
     """Tension along each cable, far end first [N], one array (s,) a cable."""
     held: BoolArray
-    """Cables that are held at a displacement and taut, then chambers that are held at a volume, shape (a + c,)."""
+    """Cables that are held at a shortening and not slack, then chambers that are held at a volume, shape (a + c,)."""
     nodal_forces: FloatArray
     """Nodal forces in addition to the body's own dead load [N], shape (n, 3)."""
     factor: Factorization | None
@@ -192,25 +191,29 @@ def solve_equilibrium(
         raise InputError("out of range", where="max_iterations, relative_tolerance", found=found, expected="≥ 1, between 0 and 1")
     if start is not None:
         _check_start(body, start)
-    loads = _collect_loads(body, given, nodal_forces, start, how.before, bilateral, how.relative_tolerance)
+    loads = collect_loads(
+        body,
+        given,
+        nodal_forces,
+        before=start.segment_tensions if how.before is None and start is not None else how.before,
+        bilateral=bilateral,
+        relative_tolerance=how.relative_tolerance,
+    )
     state, status, reached = _solve(body, loads, start, how)
-    has_friction = any(c.friction > 0 for c in body.cables)
-    if (
-        status is not SolveStatus.CONVERGED or has_friction
-    ):  # the tensions have changed since the last residual of Newton's method
-        state.residual = _residual(body, loads, state)
-    if status is not SolveStatus.CONVERGED:
-        status = status if body.is_held() else SolveStatus.SINGULAR
-    elif not body.is_held() and not holds_itself(body, state):
-        status = SolveStatus.SINGULAR
-    elif is_doubtful(loads, state, start is not None and start.converged) and can_fall(body, loads, state):
-        status = SolveStatus.UNSTABLE
+    if status is not SolveStatus.CONVERGED or any(c.friction > 0 for c in body.cables):
+        state.residual = _residual(
+            body, loads, state
+        )  # the last one is of other loads, or of the tensions before the last update
+    status = _checked(body, loads, state, status, follows_path=start is not None and start.converged)
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
     return _result(body, state, status, reached, extra)
 
 
+# --- attempts: all loads at once, or in steps ---
+
+
 class _Attempt(NamedTuple):
-    """How far an attempt came: a state, how its last Newton solve ended, and which share of the load the state balances."""
+    """How far an attempt came: a state, how its last Newton solve ended, and the share of the load that the state balances."""
 
     state: State
     status: SolveStatus
@@ -226,7 +229,7 @@ def _solve(body: BodyModel, loads: Loads, start: Equilibrium | None, options: So
     """Solve directly; if that fails, in load steps from the start; if that fails, in load steps from rest. A trial state is only solved
     directly."""
     attempt = _directly(body, loads, start, options)
-    if (options.rough and start is not None) or attempt.is_final or not body.is_held():
+    if (options.rough and start is not None) or attempt.is_final or not body.is_clamped():
         return attempt
     if start is not None and start.converged:
         attempt = _in_steps_from_start(body, loads, start, options, attempt.state)
@@ -244,7 +247,7 @@ def _directly(body: BodyModel, loads: Loads, start: Equilibrium | None, options:
 
 def _in_steps_from_start(body: BodyModel, loads: Loads, start: Equilibrium, options: SolveOptions, failed: State) -> _Attempt:
     """Go from the loads of the start to the wanted loads."""
-    first = _loads_of(body, start, loads)
+    first = _loads_at(body, start, loads)
     state = _initial_state(body, first, start, False, options.along)
     return _step_loads(body, first, loads, state, failed, options.max_iterations)
 
@@ -254,91 +257,47 @@ def _in_steps_from_rest(
 ) -> _Attempt:
     """Go from no loads to the wanted loads. Only the friction along cables is taken from the start."""
     nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
-    shares = _initial_state(body, loads, start, False, options.along).shares
-    rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
+    shares = _initial_shares(body, start, options.along)
+    rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _active_at_rest(body, loads), shares)
     return _step_loads(body, nothing, loads, rest, failed, options.max_iterations)
 
 
-def _collect_loads(
-    body: BodyModel,
-    given: Mapping[str, Mapping[str, float] | None],
-    nodal_forces: npt.ArrayLike | None,
-    start: Equilibrium | None,
-    before: tuple[FloatArray, ...] | None,
-    bilateral: bool,
-    relative_tolerance: float,
-) -> Loads:
-    n = len(body.mesh.nodes)
-    T, d, pulled = _drive_values(body.cable_names, "a cable", "tension", "shortening", given)
-    p, grown, filled = _drive_values(body.chamber_names, "a chamber", "pressure", "volume", given)
-    pushes = np.flatnonzero(T < 0)
-    if len(pushes) and not bilateral:
-        name = body.cable_names[pushes[0]]
-        raise InputError("a cable cannot push", where=f"tension[{name}]", found=f"{T[pushes[0]]:g} N", expected="≥ 0")
-    forces = body.dead_load()
-    if nodal_forces is not None:
-        extra = as_points(nodal_forces, "nodal_forces")
-        if extra.shape != (n, 3):
-            raise InputError("wrong shape", where="nodal_forces", found=extra.shape, expected=(n, 3))
-        forces = forces + extra
-    if before is None:
-        before = start.segment_tensions if start is not None else tuple(np.zeros(len(c.path)) for c in body.cables)
-    if [len(b) for b in before] != [len(c.path) for c in body.cables] or not all(np.isfinite(b).all() for b in before):
-        raise InputError(
-            "not the tensions along these cables",
-            where="before",
-            found=[len(b) for b in before],
-            expected=f"finite, segments {[len(c.path) for c in body.cables]}",
-        )
-    areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
-    lever = np.concatenate([np.ones(len(T)), areas])
-    effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
-    tolerance = _tolerance(body, forces, np.abs(effort) * lever, np.abs(target) / lever, relative_tolerance)
-    return Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, tolerance)
-
-
-def _tolerance(body: BodyModel, forces: FloatArray, pulls: FloatArray, travels: FloatArray, relative_tolerance: float) -> float:
-    """Return the largest unbalanced nodal force of an equilibrium [N].
-
-    The tolerance is a share of the sum of all loads, plus rounding errors of the internal forces.
+def _step_loads(body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int) -> _Attempt:
+    """Go from the first loads to the wanted loads in load steps, which shrink after a failure and grow after a success.
 
     Arguments:
-        forces: dead nodal forces [N], shape (n, 3).
-        pulls: forces of the drives with imposed efforts [N], shape (a + c,).
-        travels: imposed travels as lengths [m], shape (a + c,), which count as the forces that they cause in a body of typical stiffness.
-        relative_tolerance: the share [1].
+        good: a state near the equilibrium under the first loads. It is replaced by that of each step that succeeds.
+        failed: the state of the attempt before, whose Newton steps count.
     """
-    size, modulus = body.reach, float(np.median(body.material.young_modulus))
-    stiffness = SOFTNESS * modulus * size  # [N/m]
-    total = np.linalg.norm(forces, axis=1).sum() + pulls.sum() + stiffness * travels.sum()
-    return float(relative_tolerance * max(total, stiffness * LEAST_TRAVEL * size) + ROUNDING * modulus * size**2)
+    done, step = 0.0, 0.25
+    spent, good.indefinite_steps, good.options = failed.iterations, failed.indefinite_steps, failed.options
+    status = settle(body, first, good, max_iterations)
+    while status is SolveStatus.CONVERGED and done < 1.0:
+        part = min(1.0, done + step)
+        there, state = loads.part_way(first, part), _copied(good)
+        state.T = np.where(loads.held, good.T, there.effort)
+        ended = settle(body, there, state, max_iterations)
+        count(equilibria=1)
+        spent += state.iterations - good.iterations
+        if ended is SolveStatus.CONVERGED:
+            good, done, step = state, part, 1.5 * step
+        elif 0.4 * step >= SMALLEST_STEP and spent < good.options.most_steps:
+            step = 0.4 * step
+        else:
+            status = ended if ended in (SolveStatus.SINGULAR, SolveStatus.CABLES) else SolveStatus.OVERLOAD
+    good.iterations = spent
+    return _Attempt(good, status, done)
 
 
-def _drive_values(
-    names: tuple[str, ...], kind: str, effort: str, travel: str, given: Mapping[str, Mapping[str, float] | None]
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the inputs of cables or chambers: efforts, travels, and which travels are imposed."""
-    tables = {where: dict(given[where] or {}) for where in (effort, travel)}
-    for where, values in tables.items():
-        for name, value in values.items():
-            if name not in names:
-                raise InputError(
-                    f"unknown {kind.split()[1]}",
-                    where=where,
-                    found=name,
-                    expected=", ".join(names) or f"a body with {kind.split()[1]}s",
-                )
-            if not np.isfinite(value):
-                raise InputError("must be finite", where=f"{where}[{name}]", found=value)
-    twice = set(tables[effort]) & set(tables[travel])
-    if twice:
-        what = "pulled or held" if effort == "tension" else "under pressure or held"
-        raise InputError(f"{kind} is either {what}", where=travel, found=f"{sorted(twice)} in {effort} too")
-    return (
-        np.array([tables[effort].get(name, 0.0) for name in names], dtype=float),
-        np.array([tables[travel].get(name, 0.0) for name in names], dtype=float),
-        np.array([name in tables[travel] for name in names], dtype=bool),
+def _copied(state: State) -> State:
+    """Return a copy of a state without its factor, which Newton's method may move."""
+    shares, x = [s.copy() for s in state.shares], state.x.copy()
+    return replace(
+        state, x=x, T=state.T.copy(), active=state.active.copy(), shares=shares, factor=None, borrowed=False, here=None
     )
+
+
+# --- where an attempt starts ---
 
 
 def _check_start(body: BodyModel, start: Equilibrium) -> None:
@@ -353,54 +312,64 @@ def _check_start(body: BodyModel, start: Equilibrium) -> None:
         )
 
 
-def _loads_of(body: BodyModel, start: Equilibrium, loads: Loads) -> Loads:
-    """Return the loads under which a start was in equilibrium, with imposed travels for the same drives as in `loads`."""
-    effort = np.array([*start.tension.values(), *start.pressure.values()])
-    travel = travel_of(body, start.positions) + drive_compliance(body) * effort
-    free = ~loads.controlled
-    return replace(
-        loads,
-        forces=body.dead_load() + start.nodal_forces,
-        effort=np.where(free, np.maximum(effort, 0.0) if not loads.bilateral else effort, 0.0),
-        target=np.where(free, 0.0, travel),
-    )
-
-
-def _first_taut(body: BodyModel, loads: Loads) -> BoolArray:
-    """Return which held drives carry load at rest, shape (a + c,): all but cables that are paid out."""
-    cable = np.arange(len(loads.effort)) < len(body.cables)
-    return loads.controlled & (~cable | (loads.target >= 0.0) | loads.bilateral)
-
-
 def _initial_state(
     body: BodyModel, loads: Loads, start: Equilibrium | None, reuse_factor: bool, along: tuple[FloatArray, ...] | None
 ) -> State:
-    shares = [np.ones(len(c.path)) for c in body.cables] if along is None else [np.array(share) for share in along]
+    """Return the state from which Newton's method starts: the body at rest, or `start` with the imposed efforts of `loads`."""
+    shares = _initial_shares(body, start, along)
     if start is None:
-        return State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
+        return State(body.mesh.nodes.copy(), loads.effort.copy(), _active_at_rest(body, loads), shares)
     x = start.positions.copy()
     clamped = _clamped(body)
-    x[clamped] = body.mesh.nodes[clamped]
+    x[clamped] = body.mesh.nodes[clamped]  # the start may belong to a body with another rest shape
     last = [start.tension[name] for name in body.cable_names] + [start.pressure[name] for name in body.chamber_names]
-    T = np.where(loads.controlled, last, loads.effort)
-    cable = np.arange(len(T)) < len(body.cables)
-    taut = loads.controlled & (start.held | (T > 0) | ~cable)
-    if loads.bilateral or not start.held.any():
-        taut = _first_taut(body, loads)
-    T[loads.controlled & ~taut] = 0.0
-    for i, tensions in enumerate(start.segment_tensions):
-        motor = start.tension[body.cable_names[i]]
-        if motor > 0 and body.cables[i].friction > 0 and along is None:
-            shares[i] = tensions / motor
+    T = np.where(loads.held, last, loads.effort)
+    active = _active_at_rest(body, loads)
+    if start.held.any() and not loads.bilateral:
+        active = loads.held & (start.held | (T > 0) | ~is_cable(body))
+    T[loads.held & ~active] = 0.0
     far = np.inf if start.status == SolveStatus.UNSTABLE else 0.0  # stability is checked even if nothing moves
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
-    return State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
+    return State(x, np.asarray(T, dtype=float), active, shares, start.factor if usable else None, usable, factored_at=far)
+
+
+def _initial_shares(body: BodyModel, start: Equilibrium | None, along: tuple[FloatArray, ...] | None) -> list[FloatArray]:
+    """Return the tension of each segment relative to its motor [1]: as given, as in the start for cables with friction, else 1."""
+    if along is not None:
+        return [np.array(share) for share in along]
+    shares = [np.ones(len(c.path)) for c in body.cables]
+    if start is not None:
+        for i, (cable, tensions) in enumerate(zip(body.cables, start.segment_tensions)):
+            motor = start.tension[cable.name]
+            if motor > 0 and cable.friction > 0:
+                shares[i] = tensions / motor
+    return shares
+
+
+def _active_at_rest(body: BodyModel, loads: Loads) -> BoolArray:
+    """Return the active set at rest, shape (a + c,): all held drives but cables that are paid out."""
+    return loads.held & (~is_cable(body) | (loads.target >= 0.0) | loads.bilateral)
 
 
 def _clamped(body: BodyModel) -> BoolArray:
     free = np.zeros(body.mesh.nodes.size, dtype=bool)
     free[body.free_map.dofs] = True
     return ~free.reshape(-1, 3)[:, 0]
+
+
+def _loads_at(body: BodyModel, start: Equilibrium, loads: Loads) -> Loads:
+    """Return the loads under which `start` was in equilibrium, with the same drives held as in `loads`."""
+    effort = np.array([*start.tension.values(), *start.pressure.values()])
+    travel = travel_of(body, start.positions) + drive_compliance(body) * effort
+    return replace(
+        loads,
+        forces=body.dead_load() + start.nodal_forces,
+        effort=np.where(loads.held, 0.0, effort if loads.bilateral else np.maximum(effort, 0.0)),
+        target=np.where(loads.held, travel, 0.0),
+    )
+
+
+# --- what a solve returns ---
 
 
 def _residual(body: BodyModel, loads: Loads, state: State) -> float:
@@ -411,37 +380,15 @@ def _residual(body: BodyModel, loads: Loads, state: State) -> float:
     return size if np.isfinite(here.energy) and np.isfinite(size) else np.inf
 
 
-def _step_loads(body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int) -> _Attempt:
-    """Go from the first loads to the wanted loads in load steps, which shrink after a failure and grow after a success.
-
-    Arguments:
-        good: the state under the first loads, or near it.
-        failed: the state of the attempt before, whose Newton steps count.
-    """
-    done, step = 0.0, 0.25
-    spent, good.indefinite_steps, good.options = failed.iterations, failed.indefinite_steps, failed.options
-    status = settle(body, first, good, max_iterations)
-    while status is SolveStatus.CONVERGED and done < 1.0:
-        part = min(1.0, done + step)
-        there, state = loads.part_way(first, part), _copied(good)
-        state.T = np.where(loads.controlled, good.T, there.effort)
-        status = settle(body, there, state, max_iterations)
-        count(equilibria=1)
-        spent += state.iterations - good.iterations
-        if status is SolveStatus.CONVERGED:
-            good, done, step = state, part, 1.5 * step
-        elif 0.4 * step >= SMALLEST_STEP and spent < good.options.most_steps:
-            status, step = SolveStatus.CONVERGED, 0.4 * step
-        elif status not in (SolveStatus.SINGULAR, SolveStatus.CABLES):
-            status = SolveStatus.OVERLOAD
-    good.iterations = spent
-    return _Attempt(good, status, done)
-
-
-def _copied(state: State) -> State:
-    """Return a copy of a state without its factor, which Newton's method may move."""
-    shares, x = [s.copy() for s in state.shares], state.x.copy()
-    return replace(state, x=x, T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False, here=None)
+def _checked(body: BodyModel, loads: Loads, state: State, status: SolveStatus, *, follows_path: bool) -> SolveStatus:
+    """Return the status with what Newton's method does not see: a body that nothing holds, and a balance that is unstable."""
+    if status is not SolveStatus.CONVERGED:
+        return status if body.is_clamped() else SolveStatus.SINGULAR
+    if not body.is_clamped() and not holds_itself(body, state):
+        return SolveStatus.SINGULAR
+    if is_doubtful(loads, state, follows_path) and can_fall(body, loads, state):
+        return SolveStatus.UNSTABLE
+    return status
 
 
 def _result(body: BodyModel, state: State, status: SolveStatus, reached: float, nodal_forces: FloatArray) -> Equilibrium:
@@ -459,7 +406,7 @@ def _result(body: BodyModel, state: State, status: SolveStatus, reached: float, 
         reached=reached,
         indefinite_steps=state.indefinite_steps,
         segment_tensions=tuple(freeze(T * s) for T, s in zip(state.T, state.shares)),
-        held=freeze(state.taut, bool),
+        held=freeze(state.active, bool),
         nodal_forces=freeze(nodal_forces),
         factor=state.factor,
     )

@@ -35,23 +35,23 @@ def line_search(
     """Move `state` along a Newton step until the potential decreases sufficiently (Armijo); return the internal forces there,
     or None where no step length does, and `state` stays.
 
-    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions. `tangent`: assemble the tangent stiffness at the
+    Active drives enter the merit as an exact penalty ρ |gap| with ρ above their tensions. `tangent`: assemble the tangent stiffness at the
     first trial, which is accepted in most cases.
     """
-    held, gap, force = equations.held, equations.gap, equations.force
+    active, gap, force = equations.active, equations.gap, equations.force
     free = body.free_map.dofs
     x0, T0 = state.x, state.T
     step = np.zeros(x0.shape)
     step.reshape(-1)[free] = du
-    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / equations.lever
-    # a held cable with friction is no pure constraint: the friction at its bends is a given force, the tension that is lost there
+    penalty = 2.0 * np.abs(T0[active] + dT) + 1e-3 / equations.lever
+    # an active cable with friction is no pure constraint: the friction at its bends is a given force, the tension that is lost there
     lost = np.zeros(len(T0))
     rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
-    lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
-    base = _merit(body, loads, state, held, here, penalty, lost)
+    lost[active] = np.where(rubs[active], T0[active] + dT, 0.0)
+    base = _merit(body, loads, state, active, here, penalty, lost)
     slope = -float(force @ du)
-    if len(held):
-        slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
+    if len(active):
+        slope = _slope(body, loads, state, active, here, step, lost) - float(penalty @ np.abs(gap))
     # rounding errors of the potential
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
@@ -60,10 +60,10 @@ def line_search(
     for trial in range(MOST_TRIALS):
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
-        state.T[held] = T0[held] + length * dT
+        state.T[active] = T0[active] + length * dT
         there = internal(body, state.x, tangent=trial == 0 and tangent)
         if np.isfinite(there.energy):
-            merit = _merit(body, loads, state, held, there, penalty, lost)
+            merit = _merit(body, loads, state, active, there, penalty, lost)
             if merit <= base + SUFFICIENT * length * slope + noise:
                 return there
         if turned is None:
@@ -77,24 +77,24 @@ def _merit(
     body: BodyModel,
     loads: Loads,
     state: State,
-    held: npt.NDArray[np.intp],
+    active: npt.NDArray[np.intp],
     here: Internal,
     penalty: FloatArray,
     lost: FloatArray,
 ) -> float:
     value = here.energy - float((loads.forces * (state.x - body.mesh.nodes)).sum())
     for i, cable in enumerate(body.cables):
-        if not state.taut[i] and state.T[i] != 0.0:
+        if not state.active[i] and state.T[i] != 0.0:
             value += state.T[i] * _weighted_length(cable, state.x, state.shares[i])
         if lost[i] != 0.0:
             value += lost[i] * _weighted_length(cable, state.x, state.shares[i] - 1.0)
     for i, chamber in enumerate(body.chambers, len(body.cables)):
-        if not state.taut[i] and state.T[i] != 0.0:
+        if not state.active[i] and state.T[i] != 0.0:
             value -= state.T[i] * (chamber_volume(chamber, state.x) - chamber_volume(chamber, body.mesh.nodes))
-    if len(held):
-        stretch = drive_compliance(body)[held]
-        gap = loads.target[held] - travel_of(body, state.x)[held] - stretch * state.T[held]
-        value += float(penalty @ np.abs(gap)) + 0.5 * float(stretch @ state.T[held] ** 2)
+    if len(active):
+        stretch = drive_compliance(body)[active]
+        gap = loads.target[active] - travel_of(body, state.x)[active] - stretch * state.T[active]
+        value += float(penalty @ np.abs(gap)) + 0.5 * float(stretch @ state.T[active] ** 2)
     return value
 
 
@@ -103,13 +103,13 @@ def _weighted_length(cable: Cable, x: FloatArray, share: FloatArray) -> float:
 
 
 def _slope(
-    body: BodyModel, loads: Loads, state: State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
+    body: BodyModel, loads: Loads, state: State, active: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
 ) -> float:
-    """Return the derivative of the potential along a step; held cables contribute their friction only."""
+    """Return the derivative of the potential along a step; active drives contribute their friction only."""
     gradient = here.forces - loads.forces
     rows = drive_rows(body, state)
     loose = state.T.copy()
-    loose[held] = 0.0
+    loose[active] = 0.0
     if not len(rows):
         return float((gradient * step).sum())
     pull = loose @ rows + lost @ (rows - kinematic_rows(body, state, rows))

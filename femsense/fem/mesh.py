@@ -175,16 +175,23 @@ def body_parts(mesh: TetMesh) -> IntArray:
     return labels
 
 
-def surface_triangles(mesh: TetMesh) -> IntArray:
-    """Return the triangles of the boundary, outward, shape (t, 3); a face of a quadratic element gives four."""
+def boundary_faces(mesh: TetMesh) -> IntArray:
+    """Return the boundary faces, outward from the material, shape (t, 3) or (t, 6): corners, then the middles of ab, bc, ca."""
     faces = mesh.tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     outer = np.sort(first[count == 1])
-    corners = faces[outer]
     if not mesh.is_quadratic:
-        return np.asarray(corners)
-    ab, bc, ca = mesh.tets[:, 4:][:, FACE_EDGES].reshape(-1, 3)[outer].T
-    a, b, c = corners.T
+        return np.asarray(faces[outer])
+    middles = mesh.tets[:, 4:][:, FACE_EDGES].reshape(-1, 3)
+    return np.hstack([faces[outer], middles[outer]])
+
+
+def surface_triangles(mesh: TetMesh) -> IntArray:
+    """Return the triangles of the boundary, outward, shape (t, 3); a face of a quadratic element gives four."""
+    faces = boundary_faces(mesh)
+    if not mesh.is_quadratic:
+        return faces
+    a, b, c, ab, bc, ca = faces.T
     return np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
 
 

@@ -1,4 +1,4 @@
-"""The linear equations of a Newton step: the nodes, bordered by the held cables and chambers."""
+"""The linear equations of a Newton step: the nodes, bordered by the active drives."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from femsense.fem.body import BodyModel
 from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, kinematic_rows, travel_of, unbalanced_force
 
 CLOSED = 1e-12
-"""How far a held cable may miss its length [m]."""
+"""How far an active cable may miss its length [m]."""
 CONTRADICTION = 1e-3
-"""Held cables contradict each other if a step leaves more than this share of the largest gap open [1]."""
+"""Active cables contradict each other if a step leaves more than this share of the largest gap open [1]."""
 
 
 class Solver(Protocol):
@@ -33,22 +33,22 @@ class NewtonEquations:
         K du − Cᵀ dT = force
         H du + S dT  = gap,      S = diag(stretch)
 
-    The unknowns are the displacements du (f,) [m] and the change dT (h,) of the efforts: tensions [N] of held cables and pressures [Pa]
-    of held chambers. The travel of a drive is the shortening of a cable [m] or the growth of a chamber [m³].
+    The unknowns are the displacements du (f,) [m] and the changes dT (h,) of the efforts of the active drives: tensions of cables [N],
+    then pressures of chambers [Pa]. `Loads` and `State` define effort, travel and the active set.
     """
 
-    held: IntArray
-    """Indices of the held drives (taut cables with an imposed shortening, then chambers with an imposed growth), shape (h,)."""
+    active: IntArray
+    """Indices of the active drives, shape (h,)."""
     force: FloatArray
     """Unbalanced forces on the free unknowns [N], shape (f,)."""
     gap: FloatArray
-    """Travel that each held drive still misses [m or m³], shape (h,)."""
+    """Travel that each active drive still misses [m or m³], shape (h,)."""
     H: FloatArray
-    """Derivative of the travel of each held drive, shape (h, f)."""
+    """Derivative of the travel of each active drive, shape (h, f)."""
     C: FloatArray
-    """Forces that a unit effort of each held drive exerts on the unknowns; H without friction, shape (h, f)."""
+    """Forces that a unit effort of each active drive exerts on the unknowns; H without friction, shape (h, f)."""
     stretch: FloatArray
-    """Compliance of each held cable itself [m/N]; 0 for a chamber, shape (h,)."""
+    """Compliance of each active cable itself [m/N]; 0 for a chamber, shape (h,)."""
     lever: FloatArray
     """Scale that makes drives comparable: effort × lever is a force, travel / lever a length. 1 for a cable, the surface of a
     chamber [m²], shape (h,)."""
@@ -60,12 +60,12 @@ class NewtonEquations:
 
     @property
     def is_closed(self) -> bool:
-        """Whether every held drive has its imposed travel."""
+        """Whether every active drive has its imposed travel."""
         return bool((np.abs(self.gap) / self.lever).max(initial=0.0) <= CLOSED)
 
     def step(self, stiffness: Solver) -> tuple[FloatArray, FloatArray]:
         """Return du (f,) and dT (h,), by elimination of du (Schur complement)."""
-        if not len(self.held):
+        if not len(self.active):
             return stiffness.solve(self.force), self.gap
         columns = stiffness.solve(np.column_stack([self.force, self.C.T]))
         alone, per_effort = columns[:, 0], columns[:, 1:]
@@ -74,14 +74,14 @@ class NewtonEquations:
         return alone + per_effort @ dT, np.asarray(dT, dtype=np.float64)
 
     def is_contradicted_by(self, du: FloatArray, dT: FloatArray) -> bool:
-        """Return whether a step leaves gaps open, because the rows of held drives are linearly dependent."""
+        """Return whether a step leaves gaps open, because the rows of active drives are linearly dependent."""
         if self.is_closed:
             return False
         left = np.abs(self.H @ du + self.stretch * dT - self.gap) / self.lever
         return bool(left.max() > CONTRADICTION * (np.abs(self.gap) / self.lever).max() + CLOSED)
 
     def is_definite(self, stiffness: Solver, negative: int) -> bool:
-        """Return whether a stiffness with some negative eigenvalues is positive definite on all motions that the held drives allow.
+        """Return whether a stiffness with some negative eigenvalues is positive definite on all motions that the active drives allow.
 
         Inertia is additive (Haynsworth 1968): the complement H K⁻¹ Cᵀ + S then has as many negative eigenvalues as K.
         """
@@ -97,18 +97,18 @@ class NewtonEquations:
 
 def equations_at(body: BodyModel, loads: Loads, state: State, here: Internal) -> NewtonEquations:
     """Return the equations at a state with its internal forces."""
-    free, held = body.free_map.dofs, np.flatnonzero(state.taut)
-    rows, stretch = drive_rows(body, state), drive_compliance(body)[held]
+    free, active = body.free_map.dofs, np.flatnonzero(state.active)
+    rows, stretch = drive_rows(body, state), drive_compliance(body)[active]
     gap, H = np.zeros(0), np.zeros((0, len(free)))
-    if len(held):  # travels of many cables take as long as a solve
-        gap = (loads.target - travel_of(body, state.x))[held] - stretch * state.T[held]
-        H = kinematic_rows(body, state, rows)[held][:, free]
+    if len(active):  # travels of many cables take as long as a solve
+        gap = (loads.target - travel_of(body, state.x))[active] - stretch * state.T[active]
+        H = kinematic_rows(body, state, rows)[active][:, free]
     return NewtonEquations(
-        held=held,
+        active=active,
         force=unbalanced_force(loads, state, here, rows)[free],
         gap=gap,
         H=H,
-        C=rows[held][:, free],
+        C=rows[active][:, free],
         stretch=stretch,
-        lever=loads.lever[held],
+        lever=loads.lever[active],
     )

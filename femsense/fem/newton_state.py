@@ -54,7 +54,7 @@ class Loads:
     """Dead loads and drives of a body. The drives are its a cables, then its c chambers.
 
     The effort of a drive is the tension of a cable [N] or the pressure of a chamber [Pa]; its travel is the shortening of a cable [m] or
-    the growth of a chamber [m³] since rest. Either is imposed; a drive with an imposed travel is called held.
+    the growth of a chamber [m³] since rest. One of the two is imposed. A drive is *held* if that is its travel.
     """
 
     forces: FloatArray
@@ -62,9 +62,9 @@ class Loads:
     effort: FloatArray
     """Imposed efforts, 0 for held drives, shape (a + c,)."""
     target: FloatArray
-    """Imposed travels, 0 for other drives, shape (a + c,)."""
-    controlled: BoolArray
-    """Whether the travel is imposed, shape (a + c,)."""
+    """Imposed travels, 0 for the other drives, shape (a + c,)."""
+    held: BoolArray
+    """Whether a drive is held, shape (a + c,)."""
     lever: FloatArray
     """Effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], shape (a + c,)."""
     bilateral: bool
@@ -89,9 +89,10 @@ class State:
     x: FloatArray
     """Node positions [m], shape (n, 3)."""
     T: FloatArray
-    """Efforts: motor tensions [N], then pressures [Pa], shape (a + c,)."""
-    taut: BoolArray
-    """Whether a drive is held and carries load; chambers that are held always do, shape (a + c,)."""
+    """Present efforts: motor tensions [N], then pressures [Pa], shape (a + c,)."""
+    active: BoolArray
+    """The active set: held drives whose imposed travel is a constraint now, so that their efforts are unknowns, shape (a + c,). A held
+    chamber always is active; a held cable is slack otherwise, and its tension is 0."""
     shares: list[FloatArray]
     """Tension of each segment of each cable relative to the motor tension [1]: below or above 1 by friction."""
     factor: Factorization | None = None
@@ -116,6 +117,11 @@ class State:
     here: Internal | None = None
     """Internal forces at x."""
     options: NewtonOptions = field(default_factory=NewtonOptions)
+
+
+def is_cable(body: BodyModel) -> BoolArray:
+    """Return which drives are cables, shape (a + c,)."""
+    return np.arange(len(body.cables) + len(body.chambers)) < len(body.cables)
 
 
 def unbalanced_force(loads: Loads, state: State, here: Internal, rows: FloatArray) -> FloatArray:

@@ -51,7 +51,7 @@ def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> Fl
     """Return where a step [m], shape (n, 3), leads from node positions [m] when elements turn; None where nothing is clamped."""
     kept = body.free_map.laplacian
     if not kept:
-        kept.append(corners_of(body) if body.clamp_is_rigid and body.is_held() else None)
+        kept.append(corners_of(body) if body.clamp_is_rigid and body.is_clamped() else None)
     corners: Corners | None = kept[0]
     if corners is None:
         return None

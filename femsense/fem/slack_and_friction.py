@@ -1,4 +1,4 @@
-"""Updates between Newton steps: which held cables are slack, and the tensions along cables with friction."""
+"""Updates between Newton solves: the active set of held cables, and the tensions along cables with friction."""
 
 from __future__ import annotations
 
@@ -7,35 +7,34 @@ import numpy as np
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
 from femsense.fem.capstan import capstan_tensions
-from femsense.fem.newton_state import Loads, State, travel_of
+from femsense.fem.newton_state import Loads, State, is_cable, travel_of
 
 
-def let_go(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Make one of several contradicting held cables slack: the one that exceeds its imposed shortening most. Return whether there was one."""
-    cable = np.arange(len(state.T)) < len(body.cables)
-    candidates = np.flatnonzero(state.taut & cable)
+def release_one(body: BodyModel, loads: Loads, state: State) -> bool:
+    """Make one of several contradicting cables slack: the one that exceeds its imposed shortening most. Return whether there was one."""
+    candidates = np.flatnonzero(state.active & is_cable(body))
     if loads.bilateral or not len(candidates):
         return False
     over = (travel_of(body, state.x) - loads.target)[candidates]
-    worst = candidates[np.argmax(over)]
-    state.taut[worst], state.T[state.taut | (np.arange(len(state.T)) == worst)] = False, 0.0
+    state.T[state.active] = 0.0  # the efforts that contradicted each other are no start for the next solve
+    state.active[candidates[np.argmax(over)]] = False
     return True
 
 
-def update_slack(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Release held cables that would push and tighten slack ones that became too long; return whether anything changed."""
-    if loads.bilateral or not loads.controlled.any():
+def update_active_set(body: BodyModel, loads: Loads, state: State) -> bool:
+    """Release the active cable that pushes most, else tighten the slack cable that became too long by most; return whether there was one."""
+    if loads.bilateral or not loads.held.any():
         return False
-    cable = np.arange(len(state.T)) < len(body.cables)
-    push = state.taut & cable & (state.T < -1e-12)
-    if push.any():
-        worst = np.flatnonzero(push)[np.argmin(state.T[push])]
-        state.taut[worst], state.T[worst] = False, 0.0
+    held_cable = loads.held & is_cable(body)
+    pushes = held_cable & state.active & (state.T < -1e-12)
+    if pushes.any():
+        worst = np.flatnonzero(pushes)[np.argmin(state.T[pushes])]
+        state.active[worst], state.T[worst] = False, 0.0
         return True
     gap = travel_of(body, state.x) - loads.target
-    loose = loads.controlled & cable & ~state.taut & (gap < -1e-9)
-    if loose.any():
-        state.taut[np.flatnonzero(loose)[np.argmin(gap[loose])]] = True
+    too_long = held_cable & ~state.active & (gap < -1e-9)
+    if too_long.any():
+        state.active[np.flatnonzero(too_long)[np.argmin(gap[too_long])]] = True
         return True
     return False
 

@@ -41,7 +41,7 @@ def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:
     """
     here, free = internal(body, state.x), body.free_map.dofs
     equations = equations_at(body, loads, state, here)
-    equations = replace(equations, H=equations.C, gap=np.zeros(len(equations.held)))  # a self-adjoint problem without friction
+    equations = replace(equations, H=equations.C, gap=np.zeros(len(equations.active)))  # a self-adjoint problem without friction
     factor = factor_here(body, here, state, equations)
     if factor is None or not state.shifted:
         return False

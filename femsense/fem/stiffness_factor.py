@@ -114,7 +114,7 @@ class FactorKeeper:
         if state.factor is None:
             return None
         updated = self._updated = self._updated or Secants(state.factor)
-        if not self._has_friction and not len(equations.held):  # else the force changes with the tensions, too
+        if not self._has_friction and not len(equations.active):  # else the force changes with the tensions, too
             updated.learn(state.x.ravel()[self._body.free_map.dofs], equations.force)
         return updated
 
@@ -126,13 +126,13 @@ def _ratio(now: float, before: float) -> float:
 def factor_here(body: BodyModel, here: Internal, state: State, equations: NewtonEquations) -> Factorization | None:
     """Factorise the stiffness at a state, shifted where it is not positive definite, so that steps lead downhill.
 
-    A stiffness that is indefinite only along motions that held drives prevent is not shifted. Sets `state.shifted`.
+    A stiffness that is indefinite only along motions that active drives prevent is not shifted. Sets `state.shifted`.
     """
     values = reduced_values(body, stiffness_blocks(body, here, state))
     plain = definite_factor(body.free_map.pattern, values, state)
     whole = with_turning_plate(body, state.x, plain)
     state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
-    if state.shifted and len(equations.held):
+    if state.shifted and len(equations.active):
         exact = with_turning_plate(body, state.x, factorize(body.free_map.pattern, values))
         state.shifted = exact is None or not equations.is_definite(exact, exact.negative)
         whole = whole if state.shifted else exact

@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import femsense
+from femsense.core.packages import installed_version
 from femsense.io.files import file_hash, json_text, plain
 from femsense.io.result_folder import RUN_FILES
 from femsense.model.effects.user_defined import find_own_file
@@ -73,7 +72,7 @@ def versions() -> dict[str, str]:
     """Return the versions of femsense and of the packages that its numbers depend on."""
     found = {"femsense": femsense.__version__}
     for package, names in (("numpy", ("numpy",)), ("scipy", ("scipy",)), ("open3d", ("open3d-cpu", "open3d"))):
-        found[package] = next((v for v in map(_installed, names) if v), "not installed")
+        found[package] = next((v for v in map(installed_version, names) if v), "not installed")
     return found
 
 
@@ -93,10 +92,3 @@ def _without_hash(value: Any) -> bool:
     if isinstance(value, Mapping):
         return ("sha256" in value and value["sha256"] is None) or any(map(_without_hash, value.values()))
     return any(map(_without_hash, value)) if isinstance(value, list | tuple) else False
-
-
-def _installed(package: str) -> str | None:
-    try:
-        return version_of(package)
-    except PackageNotFoundError:
-        return None

@@ -226,7 +226,7 @@ def _problem(schema: type[Any], item: Any, path: Path) -> InputError:
         found = short(item["input"]) if location else ", ".join(item["input"])  # of the whole document its keys are enough
         return InputError(str(error), where=where, found=found, expected=expected)
     what = str(item["msg"]).replace("Input should", "should").replace(", got inf or nan", "")
-    what = what.replace("List should have", "should have").replace("String should", "should")
+    what = what.replace("List should have", "should have").replace("String should", "should").replace(" after validation", "")
     return InputError(what, where=where, found=short(item["input"]), expected=expected)
 
 

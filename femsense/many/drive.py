@@ -18,7 +18,7 @@ from femsense.core.text import with_type
 from femsense.many import limits
 from femsense.many.engines import GONE, Death, Engine
 from femsense.many.jobs import Job
-from femsense.many.outcome import Outcome, Status
+from femsense.many.outcome import JobStatus, Outcome
 from femsense.many.records import Record, Stats, is_valid, log_of, read_record, running_mark, shortened, stamp_of, write_record
 
 MOST_DEATHS = 2
@@ -61,7 +61,7 @@ class _Gathered:
     def add(self, outcome: Outcome, *, ran: bool) -> None:
         self.found[outcome.name] = outcome
         self.ran += ran
-        if ran and outcome.status is not Status.KEPT and (self.slowest is None or outcome.seconds > self.slowest.seconds):
+        if ran and outcome.status is not JobStatus.KEPT and (self.slowest is None or outcome.seconds > self.slowest.seconds):
             self.slowest = outcome
 
     def progress(self, running: int) -> Progress:
@@ -69,7 +69,7 @@ class _Gathered:
         return Progress(
             total=len(self.jobs),
             finished=len(self.found),
-            kept=sum(o.status is Status.KEPT for o in self.found.values()),
+            kept=sum(o.status is JobStatus.KEPT for o in self.found.values()),
             failed=sum(not o.is_good for o in self.found.values()),
             running=running,
             seconds=seconds,
@@ -87,7 +87,7 @@ def recorded(jobs: Iterable[Job]) -> dict[str, Outcome]:
         if record is None or record.stamp != stamp_of(job, known):
             continue
         if is_valid(job, record):
-            found[job.name] = replace(record.outcome, status=Status.KEPT)
+            found[job.name] = replace(record.outcome, status=JobStatus.KEPT)
         elif record.outcome.deaths >= MOST_DEATHS:
             found[job.name] = record.outcome
     return found
@@ -152,7 +152,7 @@ def run_jobs(
 
 
 def _check_disk(outcome: Outcome, gathered: _Gathered) -> None:
-    if outcome.status is Status.DISK_FULL:
+    if outcome.status is JobStatus.DISK_FULL:
         raise DataError(
             f"the disk is full: {outcome.reason}\n{len(gathered.found) - 1} of {len(gathered.jobs)} jobs are done; "
             f"make room, and the same command continues"
@@ -195,9 +195,9 @@ def _after_death(job: Job, death: Death, mark: Mapping[str, object]) -> Outcome 
     local = host == socket.gethostname() and isinstance(counted, int)
     by_kernel = death.exit_code in (None, OOM_SIGNAL) and local and isinstance(counted, int) and limits.oom_kills() > counted
     if by_kernel:
-        status, why = Status.OUT_OF_MEMORY, "the kernel ended its worker because the memory was used up"
+        status, why = JobStatus.OUT_OF_MEMORY, "the kernel ended its worker because the memory was used up"
     else:
-        status, why = Status.CRASHED, death.text + (f" on {host}" if host and not local else "")
+        status, why = JobStatus.CRASHED, death.text + (f" on {host}" if host and not local else "")
     said = _last_lines(log_of(job))
     outcome = Outcome(job.name, status, shortened(why + (f"; its log ends: {said}" if said else "")), host=host, deaths=deaths)
     with contextlib.suppress(OSError, InputError):

@@ -12,7 +12,7 @@ LONGEST_REASON = 1000
 Scalar = str | int | float | bool | None
 
 
-class Status(StrEnum):
+class JobStatus(StrEnum):
     """How a job has ended."""
 
     DONE = "done"
@@ -29,7 +29,7 @@ class Status(StrEnum):
     """Its worker died, and not for memory."""
 
 
-GOOD = frozenset({Status.DONE, Status.KEPT})
+GOOD = frozenset({JobStatus.DONE, JobStatus.KEPT})
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Outcome:
     """How a job has ended, and its result in a few numbers."""
 
     name: str
-    status: Status
+    status: JobStatus
     reason: str = ""
     """Why there is no result."""
     row: Mapping[str, Scalar] = field(default_factory=dict)

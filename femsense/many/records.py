@@ -22,7 +22,7 @@ from typing import Any
 import femsense
 from femsense.io.files import PART_PREFIX, file_hash, folder_hash, json_text, write_json
 from femsense.many.jobs import Job
-from femsense.many.outcome import LONGEST_REASON, Outcome, Status
+from femsense.many.outcome import LONGEST_REASON, JobStatus, Outcome
 
 RECORD_FORMAT = "femsense-job-1"
 AGAIN = "--again"
@@ -46,7 +46,7 @@ def read_record(file: Path) -> Record | None:
     """Return the record of a job; None where there is none that can be read."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
-        outcome = Outcome(**{**document["outcome"], "status": Status(document["outcome"]["status"])})
+        outcome = Outcome(**{**document["outcome"], "status": JobStatus(document["outcome"]["status"])})
         if document["format"] != RECORD_FORMAT:
             return None
         return Record(outcome, str(document["stamp"]), str(document["key"]), dict(document["outputs"]))

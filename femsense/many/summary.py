@@ -18,7 +18,7 @@ from femsense.core.errors import InputError
 from femsense.io.files import check_target, json_text, write_beside, write_csv, write_json, write_text
 from femsense.io.own_files import FileKind, check_files
 from femsense.many.jobs import MANY, RECORDS
-from femsense.many.outcome import Outcome, Scalar, Status
+from femsense.many.outcome import JobStatus, Outcome, Scalar
 from femsense.many.records import read_record
 from femsense.report.page import Chapter, render
 from femsense.report.words import counted, duration
@@ -79,7 +79,7 @@ def write_summary(folder: Path, command: str, outcomes: Sequence[Outcome], folde
     names, rows = table_of(lines)
     write_csv(folder / "summary.csv", names, rows)
     _write_parquet(folder / "summary.parquet", names, rows)
-    poisoned = [o for o in outcomes if o.deaths and not o.is_good and o.status in (Status.CRASHED, Status.OUT_OF_MEMORY)]
+    poisoned = [o for o in outcomes if o.deaths and not o.is_good and o.status in (JobStatus.CRASHED, JobStatus.OUT_OF_MEMORY)]
     if poisoned:
         write_csv(folder / "poison.csv", POISON_COLUMNS, [(o.name, o.reason, o.deaths) for o in poisoned])
     else:
@@ -127,7 +127,7 @@ def table_of(lines: Sequence[Line]) -> tuple[list[str], list[list[Scalar]]]:
 
 def _status(outcome: Outcome) -> str:
     """Return a status as files have it: they are the same whether a result is new or was there."""
-    return Status.DONE.value if outcome.status is Status.KEPT else outcome.status.value
+    return JobStatus.DONE.value if outcome.status is JobStatus.KEPT else outcome.status.value
 
 
 def _from(folder: Path, place: Path) -> str:

@@ -22,7 +22,7 @@ from femsense.io.files import json_text, write_text
 from femsense.io.folder_lock import only_writer
 from femsense.many import limits
 from femsense.many.jobs import Job
-from femsense.many.outcome import Outcome, Scalar, Status
+from femsense.many.outcome import JobStatus, Outcome, Scalar
 from femsense.many.records import (
     Record,
     clear_parts,
@@ -72,7 +72,7 @@ def work_on(job: Job, call: Call, *, memory_bytes: int | None = None, in_process
             stamp, key = stamp_of(job), key_of(job)
             if known is not None and known.key == key and is_valid(job, known):
                 write_record(job, replace(known, stamp=stamp))
-                return replace(known.outcome, status=Status.KEPT)
+                return replace(known.outcome, status=JobStatus.KEPT)
         except (OSError, FemsenseError):
             stamp = key = ""  # the command reports what is wrong with the input
         deaths = 0 if known is None else known.outcome.deaths
@@ -90,11 +90,11 @@ def _called(job: Job, call: Call) -> Outcome:
     row: Mapping[str, Scalar] = {}
     try:
         result = call(job.words)
-        status, reason, row = Status.NO_RESULT if result.reason else Status.DONE, result.reason, result.row
+        status, reason, row = JobStatus.NO_RESULT if result.reason else JobStatus.DONE, result.reason, result.row
     except Exception as error:
         status, cause = _kind_of(error)
         reason = str(cause) if isinstance(cause, FemsenseError) else with_type(cause, 1000)
-    if status is Status.OUT_OF_MEMORY:
+    if status is JobStatus.OUT_OF_MEMORY:
         reason += "; a worker may not take more memory: --memory, or fewer --workers"
     return Outcome(
         name=job.name,
@@ -107,17 +107,17 @@ def _called(job: Job, call: Call) -> Outcome:
     )
 
 
-def _kind_of(error: BaseException) -> tuple[Status, BaseException]:
+def _kind_of(error: BaseException) -> tuple[JobStatus, BaseException]:
     """Return the status of a job that raised an error, and the error to report: a full disk or memory is often its cause."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError):
-            return Status.OUT_OF_MEMORY, error
+            return JobStatus.OUT_OF_MEMORY, error
         if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
-            return Status.DISK_FULL, cause
+            return JobStatus.DISK_FULL, cause
         cause = cause.__cause__ or cause.__context__
     no_result = isinstance(error, FemsenseError) and error.exit_status == 1
-    return Status.NO_RESULT if no_result else Status.FAILED, error
+    return JobStatus.NO_RESULT if no_result else JobStatus.FAILED, error
 
 
 # Around a job

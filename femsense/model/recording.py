@@ -269,14 +269,6 @@ def state_key(recording: Recording, frame: int) -> bytes:
     return np.concatenate([np.asarray(p, dtype=float).ravel() for p in parts]).tobytes()
 
 
-def marker_grid(recording: Recording, *, view: int = 0) -> FloatArray:
-    """Return the markers as one camera saw them [m], camera frame, shape (F, markers, 3); NaN where hidden."""
-    grid = np.full((recording.frame_count, len(recording.marker_names), 3), np.nan)
-    mine = recording.marker_view == view
-    grid[recording.marker_frame[mine], recording.marker_index[mine]] = recording.marker_xyz[mine]
-    return grid
-
-
 def _timeline_fields(timeline: Timeline, times: FloatArray) -> dict[str, Any]:
     t, F = timeline, len(times)
     return {

@@ -11,6 +11,7 @@ import numpy as np
 from femsense.core.arrays import diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, look_alike, plain_name
+from femsense.fem.cables import cable_length
 from femsense.fem.mesh import embed_points
 from femsense.model.marker_units import check_marker_distances
 from femsense.model.plausibility import doubts_of_recording, place_of, warn_of
@@ -53,6 +54,11 @@ def _composed(recording: Recording) -> Recording:
 def in_frames(recording: Recording) -> str:
     """Return " in frames.csv" where a recording has one."""
     return " in frames.csv" if recording.folder else ""
+
+
+def camera_text(name: str) -> str:
+    """Return how messages refer to a camera; the only one of a recording has no name."""
+    return f"camera {name}" if name else "the camera"
 
 
 def how_to_free(recording: Recording) -> str:
@@ -171,8 +177,7 @@ def _check_displacements(robot: Robot, recording: Recording) -> None:
     if recording.actuation != "displacement":
         return
     for cable, pulled in zip(robot.body.cables, recording.inputs.T):
-        points = np.vstack([cable.path.positions(robot.body.mesh.nodes), cable.pull_point])
-        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        length = cable_length(cable, robot.body.mesh.nodes)
         span = float(np.ptp(pulled)) if recording.actuation_zero == "unknown" else float(pulled.max(initial=0.0))
         if span > max(length, 1e-3):
             raise InputError(

@@ -1,22 +1,15 @@
-"""The quadratic problem of force sensing: build it, solve it with a certificate, and say how far the forces can be trusted."""
+"""Quadratic problems: build them, solve them, and certify the answer."""
 
-from femsense.qp.forces import ForceEstimate, estimate_forces
-from femsense.qp.friction_cone import FrictionCone
-from femsense.qp.problem import ForceOptions, Multipliers, Problem, Residuals, build_force_problem, kkt_residuals
-from femsense.qp.solve import SOLVERS, Solution, Status, solve
+from femsense.qp.problem import Multipliers, Problem, Residuals, kkt_residuals
+from femsense.qp.solve import SOLVERS, ProgramStatus, Solution, solve
 
 __all__ = [
     "SOLVERS",
-    "ForceEstimate",
-    "ForceOptions",
-    "FrictionCone",
     "Multipliers",
     "Problem",
+    "ProgramStatus",
     "Residuals",
     "Solution",
-    "Status",
-    "build_force_problem",
-    "estimate_forces",
     "kkt_residuals",
     "solve",
 ]

@@ -26,7 +26,7 @@ _OPTIONS: dict[str, dict[str, float | int | bool]] = {
 }
 
 
-class Status(StrEnum):
+class ProgramStatus(StrEnum):
     """How a solve ended, with its cause and remedy."""
 
     SOLVED = "solved"
@@ -47,27 +47,22 @@ class Status(StrEnum):
 
 
 _TEXTS = {
-    Status.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
-    Status.INFEASIBLE: (
-        "no point obeys all constraints: bounds that cross, measured inputs outside their bounds, or measured "
-        "displacements that no"
-        " allowed tension and force can make",
-        "check the signs and units of the cable inputs; widen the bounds of tension and force; drop the friction cone",
+    ProgramStatus.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
+    ProgramStatus.INFEASIBLE: (
+        "no point obeys all constraints: bounds that cross, or constraints that exclude each other",
+        "widen the bounds; check the signs and units of inputs and limits",
     ),
-    Status.UNBOUNDED: (
-        (
-            "the objective falls for ever along some direction: an unknown that no row of the compliance sees and no "
-            "constraint holds"
-        ),
-        "use fewer contacts, add rows, or a small ridge",
+    ProgramStatus.UNBOUNDED: (
+        "the objective falls for ever along some direction: an unknown that no row sees and no constraint holds",
+        "use fewer contacts or actuators, or bound the unknowns",
     ),
-    Status.NOT_CONVEX: (
+    ProgramStatus.NOT_CONVEX: (
         "P has a negative eigenvalue: the objective is not a sum of squares",
         "check the weights (≥ 0) and how P was made",
     ),
-    Status.INACCURATE: (
+    ProgramStatus.INACCURATE: (
         "no solver reached the tolerance: the problem is badly conditioned (contacts that the rows do not distinguish)",
-        "merge contacts that lie close together, add a ridge, or loosen the tolerance",
+        "merge contacts that lie close together, or loosen the tolerance",
     ),
 }
 
@@ -88,7 +83,7 @@ class Solution:
     """Difference of primal and dual objective, in the problem's units."""
     certificate: float
     """Largest of primal residual, dual residual and gap of the scaled problem [1]; compared with the tolerance."""
-    status: Status
+    status: ProgramStatus
     """`solved`, or the reason of the failure; with `.cause` and `.advice`."""
     solver: str
     """Name of the solver that gave the answer; empty without an answer."""
@@ -96,7 +91,7 @@ class Solution:
     @property
     def solved(self) -> bool:
         """Whether x is the answer."""
-        return self.status is Status.SOLVED
+        return self.status is ProgramStatus.SOLVED
 
 
 Answer = tuple[FloatArray | None, Multipliers | None]
@@ -126,12 +121,12 @@ def solve(
     """
     if solver not in SOLVERS:
         raise InputError("unknown solver", where="solver", found=solver, expected=", ".join(SOLVERS))
-    if (problem.parts()[6] > problem.parts()[7]).any():
-        return _without_answer(Status.INFEASIBLE)
+    if (problem.parts()[4] > problem.parts()[5]).any():
+        return _without_answer(ProgramStatus.INFEASIBLE)
     scaling = _scaling(problem)
     scaled = _scaled(problem, scaling)
     if _most_negative(scaled.P) < -1e-9:
-        return _without_answer(Status.NOT_CONVEX)
+        return _without_answer(ProgramStatus.NOT_CONVEX)
     order = (solver, *(name for name in SOLVERS if name != solver)) if fallback else (solver,)
     best, best_error, best_solver = None, np.inf, ""
     for name in order:
@@ -143,10 +138,10 @@ def solve(
             break
     if best_error > tolerance:
         status = _diagnosis(scaled)
-        if status is not Status.INACCURATE:
+        if status is not ProgramStatus.INACCURATE:
             return _without_answer(status)
     if best is None:
-        return _without_answer(Status.INACCURATE)
+        return _without_answer(ProgramStatus.INACCURATE)
     return _unscaled(problem, best, scaling, best_error, best_solver, tolerance)
 
 
@@ -159,24 +154,23 @@ class _Scaling:
 
     unknowns: FloatArray
     inequality: FloatArray
-    equality: FloatArray
     energy: float
 
 
 def _scaling(problem: Problem) -> _Scaling:
-    P, q, G, h, A, b, lb, ub = problem.parts()
+    P, q, G, h, lb, ub = problem.parts()
     curvature = np.sqrt(np.maximum(np.diag(P), 0.0))
     largest = float(curvature.max(initial=0.0))
     weak = curvature <= 1e-12 * largest
     D = 1.0 / np.where(weak, largest if largest > 0.0 else 1.0, curvature)
-    rows_G, rows_A = _inverse_lengths(G * D), _inverse_lengths(A * D)
-    sizes = np.concatenate([np.abs(D * q), np.abs(rows_A * b), np.abs(rows_G * h)])
+    rows = _inverse_lengths(G * D)
+    sizes = np.concatenate([np.abs(D * q), np.abs(rows * h)])
     limits = np.abs(np.concatenate([lb / D, ub / D]))
     widest = float(limits[np.isfinite(limits)].max(initial=0.0))
     size = float(sizes.max(initial=0.0)) or widest or 1.0
     if widest > 0.0 and np.isfinite(limits).all():  # no answer is larger, however flat the objective
         size = min(size, widest)
-    return _Scaling(size * D, rows_G / size, rows_A / size, size * max(size, float(np.abs(D * q).max(initial=0.0))))
+    return _Scaling(size * D, rows / size, size * max(size, float(np.abs(D * q).max(initial=0.0))))
 
 
 def _inverse_lengths(rows: FloatArray) -> FloatArray:
@@ -185,15 +179,13 @@ def _inverse_lengths(rows: FloatArray) -> FloatArray:
 
 
 def _scaled(problem: Problem, scaling: _Scaling) -> Problem:
-    P, q, G, h, A, b, lb, ub = problem.parts()
+    P, q, G, h, lb, ub = problem.parts()
     D = scaling.unknowns
     return Problem(
         P=D[:, None] * P * D / scaling.energy,
         q=D * q / scaling.energy,
         G=scaling.inequality[:, None] * G * D,
         h=scaling.inequality * h,
-        A=scaling.equality[:, None] * A * D,
-        b=scaling.equality * b,
         lb=lb / D,
         ub=ub / D,
     )
@@ -212,15 +204,14 @@ def _unscaled(
     x = scaling.unknowns * x
     multipliers = Multipliers(
         z=freeze(scaling.energy * scaling.inequality * scaled.z),
-        y=freeze(scaling.energy * scaling.equality * scaled.y),
         z_box=freeze(scaling.energy * scaled.z_box / scaling.unknowns),
     )
     residuals = kkt_residuals(problem, x, multipliers)
-    status = Status.SOLVED if error <= tolerance else Status.INACCURATE
+    status = ProgramStatus.SOLVED if error <= tolerance else ProgramStatus.INACCURATE
     return Solution(freeze(x), multipliers, residuals.primal, residuals.dual, residuals.gap, error, status, solver)
 
 
-def _without_answer(status: Status) -> Solution:
+def _without_answer(status: ProgramStatus) -> Solution:
     return Solution(None, None, np.inf, np.inf, np.inf, np.inf, status, "")
 
 
@@ -233,11 +224,10 @@ def call_solver(problem: Problem, solver: str) -> Answer:
 
     if solver not in qpsolvers.available_solvers:
         return None, None
-    P, q, G, h, A, b, lb, ub = problem.parts()
+    P, q, G, h, lb, ub = problem.parts()
     lower, upper = (lb, ub) if np.isfinite(np.concatenate([lb, ub])).any() else (None, None)
     inequality = (G, h) if len(h) else (None, None)
-    equality = (A, b) if len(b) else (None, None)
-    quadratic = qpsolvers.Problem(np.array(P), np.array(q), *map(_writable, (*inequality, *equality, lower, upper)))
+    quadratic = qpsolvers.Problem(np.array(P), np.array(q), *map(_writable, (*inequality, None, None, lower, upper)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -246,24 +236,20 @@ def call_solver(problem: Problem, solver: str) -> Answer:
             return None, None
     if not answer.found or answer.x is None:
         return None, None
-    return answer.x, _cleaned(problem, answer.z, answer.y, answer.z_box)
+    return answer.x, _cleaned(problem, answer.z, answer.z_box)
 
 
 def _writable(part: FloatArray | None) -> FloatArray | None:
     return None if part is None else np.array(part)
 
 
-def _cleaned(problem: Problem, z: FloatArray | None, y: FloatArray | None, z_box: FloatArray | None) -> Multipliers:
+def _cleaned(problem: Problem, z: FloatArray | None, z_box: FloatArray | None) -> Multipliers:
     """Return multipliers with zeros for absent parts and absent bounds."""
-    _, q, _, h, _, b, lb, ub = problem.parts()
+    _, q, _, h, lb, ub = problem.parts()
     box = _first(z_box, len(q))
     box[(box < 0.0) & ~np.isfinite(lb)] = 0.0
     box[(box > 0.0) & ~np.isfinite(ub)] = 0.0
-    return Multipliers(
-        z=_first(z, len(h)),
-        y=_first(y, len(b)),
-        z_box=box,
-    )
+    return Multipliers(z=_first(z, len(h)), z_box=box)
 
 
 def _first(values: FloatArray | None, length: int) -> FloatArray:
@@ -283,15 +269,14 @@ def _most_negative(P: FloatArray) -> float:
     return float(values[0] / max(np.abs(values).max(), 1e-300))
 
 
-def _diagnosis(scaled: Problem) -> Status:
+def _diagnosis(scaled: Problem) -> ProgramStatus:
     """Return why no solver had an answer: two linear programmes tell infeasible and unbounded from inaccurate."""
-    P, q, G, h, A, b, lb, ub = scaled.parts()
-    if _linear(np.zeros(len(q)), G, h, A, b, lb, ub)[0] == 2:
-        return Status.INFEASIBLE
+    P, q, G, h, lb, ub = scaled.parts()
+    if _linear(np.zeros(len(q)), G, h, P[:0], q[:0], lb, ub)[0] == 2:
+        return ProgramStatus.INFEASIBLE
     down, up = np.where(np.isfinite(lb), 0.0, -1.0), np.where(np.isfinite(ub), 0.0, 1.0)
-    flat = np.vstack([A, P])
-    status, slope = _linear(q, G, np.zeros(len(h)), flat, np.zeros(len(flat)), down, up)
-    return Status.UNBOUNDED if status == 0 and slope < -1e-9 else Status.INACCURATE
+    status, slope = _linear(q, G, np.zeros(len(h)), P, np.zeros(len(q)), down, up)
+    return ProgramStatus.UNBOUNDED if status == 0 and slope < -1e-9 else ProgramStatus.INACCURATE
 
 
 def _linear(

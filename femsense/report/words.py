@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from femsense.core.text import numbers_text
 from femsense.loop.result.loop_result import Verdict
 
 NOTHING = "–"
@@ -124,13 +125,7 @@ def parameter(value: Any, std: Any, unit: str | None) -> str:
 
 def frame_list(frames: Sequence[int]) -> str:
     """Return numbers of frames with runs drawn together: 0–3, 7."""
-    runs: list[list[int]] = []
-    for frame in sorted(set(frames)):
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = frame
-        else:
-            runs.append([frame, frame])
-    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs) or "none"
+    return numbers_text(sorted(set(frames))) or "none"
 
 
 def joined(text: str, unit: str) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 
 from femsense import TetMesh, block_mesh
 from femsense.core.arrays import FloatArray
-from femsense.fem.blocks import rounded_square
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
@@ -52,6 +51,16 @@ def hung(points: FloatArray) -> FloatArray:
     depth = -points[:, 2:]
     flat = rounded_square(points[:, :2], roundness=ROUNDNESS)
     return np.hstack([radius(depth) * flat, -LENGTH * depth]) * 1e-3
+
+
+def rounded_square(points: FloatArray, *, roundness: float) -> FloatArray:
+    """Return points (n, 2) of the square [−1, 1]² moved towards the disc of the same half width.
+
+    `roundness` 0 leaves the square, 1 gives the disc (x √(1 − y²/2), y √(1 − x²/2)), whose four corner cells are flat.
+    """
+    x, y = points[:, 0], points[:, 1]
+    disc = np.stack([x * np.sqrt(1.0 - y**2 / 2.0), y * np.sqrt(1.0 - x**2 / 2.0)], axis=1)
+    return (1.0 - roundness) * points + roundness * disc
 
 
 def radius(depth: FloatArray | float) -> Any:

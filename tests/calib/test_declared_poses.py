@@ -38,10 +38,10 @@ def test_a_pose_that_is_off_is_named_with_its_shift_and_turn(zero: str) -> None:
     recording = record(LEVELS, noise=2e-4, **({"zero": zero, "initial": INITIAL} if zero == "unknown" else {}))[0]
     with pytest.raises(
         DataError,
-        match=r"declared pose of camera .* shifted by (9\.\d+|10) mm \((9\.\d+|10), .*at the body: .* Leave T_robot_camera",
+        match=r"declared pose of the camera is .* shifted by (9\.\d+|10) mm \((9\.\d+|10), .*at the body: .* Leave T_robot_camera",
     ):
         calibrate(arm(), declared(recording, [0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
-    with pytest.raises(DataError, match=r"declared pose of camera .* turned by (4\.\d+|5|5\.\d+)° "):
+    with pytest.raises(DataError, match=r"declared pose of the camera is turned by (4\.\d+|5|5\.\d+)° "):
         calibrate(arm(), declared(recording, [0.0, np.radians(5.0), 0.0, 0.0, 0.0, 0.0]))
 
 

@@ -35,7 +35,7 @@ def test_a_flat_side_settles_and_the_holder_does_not_pull() -> None:
     near = settle_cloud_pose([View(ahead, np.ones(len(ahead), dtype=bool), surface)], nominal)
     assert near.gain > 0.6
     start = move_pose(near.T_robot_camera, [0.05, 0.03, -0.05, 0.003, 0.004, -0.003], pivot_a=state.mean(axis=0))
-    with pytest.raises(DataError, match="declared pose of camera"):  # 9 mm off
+    with pytest.raises(DataError, match="declared pose of the camera"):  # 9 mm off
         calibrate(robot, replace(recording, T_robot_camera=(start,)))
     declared = calibrate(robot, replace(recording, T_robot_camera=(start,), free=None))
     found = fit_clouds(robot, recording, replace(declared, joint_covariance=np.zeros((6, 6))))

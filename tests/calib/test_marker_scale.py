@@ -17,7 +17,7 @@ from femsense.core.errors import DataError
 from femsense.model.recording import Recording
 
 PULLS = np.array([[0.0, 0, 0, 0], [1.0, 0, 0, 0], [1.0, 0, 0.7, 0], [0, 0, 1.2, 0], [0, 0, 0, 1.0]])
-SAID = r"camera \(only one\) are ([\d.]+) ± [\d.]+ times too large"
+SAID = r"the camera are ([\d.]+) ± [\d.]+ times too large"
 
 
 @cache

@@ -64,7 +64,7 @@ def test_a_good_pose_passes_unchanged() -> None:
         (np.diag([1.0, 1, -1, 1]), "det R = -1"),
         (np.diag([2.0, 2, 2, 1]), "|R Rᵀ − I| = 3"),
         (np.vstack([np.eye(4)[:3], [0, 0, 1, 1]]), "last row"),
-        (np.full((4, 4), np.nan), "finite numbers"),
+        (np.diag([np.nan, 1, 1, 1]), "1 of 16 numbers are nan"),
         ([["a"]], "not a matrix of numbers"),
         ([[1, 2], [3]], "not a matrix of numbers"),
         (np.eye(4).T * [[1], [1], [1], [1000]], "last row"),

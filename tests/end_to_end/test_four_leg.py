@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, marker_grid
 from scipy.spatial import cKDTree
 from triangles import distances
 
@@ -23,7 +23,7 @@ from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
-from femsense.model.recording import Recording, marker_grid
+from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
 from femsense.rig.plan import plan_script

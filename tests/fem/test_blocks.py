@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from femsense.core.errors import InputError
-from femsense.fem.blocks import block_mesh, rounded_square
+from femsense.fem.blocks import block_mesh
 from femsense.fem.mesh import element_volumes, surface_triangles
 from femsense.fem.mesh_checks import check_mesh
 
@@ -47,12 +47,6 @@ def test_points_are_placed() -> None:
     check_mesh(mesh, "mirrored")
     assert element_volumes(mesh).sum() == pytest.approx(24.0)
     assert mesh.nodes[:, 0].min() == -3.0 and mesh.nodes[:, 1].max() == 4.0
-
-
-def test_a_rounded_square_goes_from_the_square_to_the_disc() -> None:
-    border = np.array([[1.0, y] for y in np.linspace(-1, 1, 7)])
-    np.testing.assert_allclose(np.linalg.norm(rounded_square(border, roundness=1.0), axis=1), 1.0)
-    np.testing.assert_array_equal(rounded_square(border, roundness=0.0), border)
 
 
 def test_what_cannot_be_built() -> None:

@@ -240,7 +240,7 @@ def on_a_hinge(gravity: list[float]) -> BodyModel:
 def test_a_body_on_a_hinge_hangs_below_it(gravity: list[float]) -> None:
     body = on_a_hinge(gravity)
     state = solve_equilibrium(body)
-    assert not body.is_held() and bar().is_held()
+    assert not body.is_clamped() and bar().is_clamped()
     assert state.converged and unbalanced(body, state) < 1e-7
     share = np.linalg.norm(body.weight(), axis=1)
     centre = share @ state.positions[:, :2] / share.sum()
@@ -253,10 +253,10 @@ def test_a_hinge_that_nothing_turns_is_singular_and_says_what_to_do() -> None:
     assert state.status == "singular" and "clamp more nodes" in state.advice
 
 
-def test_a_body_on_springs_is_held() -> None:
+def test_a_body_on_springs_is_clamped() -> None:
     body = bar().with_clamp_stiffness(100.0)
     state = solve_equilibrium(body)
-    assert body.is_held() and state.converged
+    assert body.is_clamped() and state.converged
     sag = body.mesh.nodes[body.clamp_nodes] - state.positions[body.clamp_nodes]
     np.testing.assert_allclose(100.0 * sag.sum(axis=0), -body.weight().sum(axis=0), atol=1e-6)  # the springs carry the weight
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import DATA, RECORDING_FILES, write_block_robot, write_small_recording
+from helpers import DATA, RECORDING_FILES, marker_grid, write_block_robot, write_small_recording
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,7 +22,7 @@ from femsense.io.recording_folder import load_recording, save_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.camera import Camera, CameraNoise
 from femsense.model.plausibility import doubts_of_recording, warn_of
-from femsense.model.recording import Recording, make_recording, marker_grid, select_frames, with_marker_table
+from femsense.model.recording import Recording, make_recording, select_frames, with_marker_table
 from femsense.model.recording_checks import check_against
 from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline, Tool, Views
 
@@ -660,6 +660,11 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
     ({"recording_toml": TOML + "[camera]\n"}, "recording.toml: camera", ["the camera lacks its lens"]),
     ({"recording_toml": TOML + CAMERA + "[cameras.a]\n"}, "recording.toml", ["both [camera] and [cameras.NAME]"]),
     ({"recording_toml": POSE_TOML.replace("1.0", "2.0") + TOML}, "recording.toml: T_robot_camera", ["not a rigid transform"]),
+    (
+        {"recording_toml": "T_robot_camera = [[1, 0, 0, 0]]\n" + TOML},
+        "recording.toml: T_robot_camera",
+        ["should have at least 4 items, not 1"],
+    ),
     ({"recording_toml": POSE_TOML + TOML + "[cameras.a]\n"}, "recording.toml: T_robot_camera", ["one pose for several cameras"]),
     (
         {"recording_toml": POSE_TOML + TOML + CAMERA + POSE_TOML},

@@ -14,7 +14,7 @@ from femsense.core.errors import DataError, InputError
 from femsense.many.drive import run_jobs
 from femsense.many.engines import open_engine
 from femsense.many.limits import ONE_THREAD
-from femsense.many.outcome import Status
+from femsense.many.outcome import JobStatus
 
 
 def test_a_local_cluster_sets_aside_what_kills_its_workers(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_a_local_cluster_sets_aside_what_kills_its_workers(tmp_path: Path) -> No
     jobs += [job(tmp_path, "threads", "environment", *ONE_THREAD)]
     with open_engine(2, "local", 2_000_000_000) as engine:
         found = run_jobs(jobs, work, engine)
-    assert (found[0].status, found[0].deaths) == (Status.CRASHED, 2)
+    assert (found[0].status, found[0].deaths) == (JobStatus.CRASHED, 2)
     assert all(o.is_good and o.deaths == 0 for o in found[1:])  # one whose answer died with its worker is found and kept
     assert (tmp_path / "out/threads/result.txt").read_text().split("\n") == ["1"] * len(ONE_THREAD)
 

@@ -17,19 +17,19 @@ from femsense.core.errors import DataError
 from femsense.many.drive import Progress, recorded, run_jobs
 from femsense.many.engines import InProcess, processes, spread
 from femsense.many.limits import ONE_THREAD
-from femsense.many.outcome import Status
+from femsense.many.outcome import JobStatus
 from femsense.many.records import log_of, running_mark
 
 
 def test_a_second_call_runs_nothing_and_one_with_another_input_runs_that_job(tmp_path: Path) -> None:
     jobs = [job(tmp_path, name, "write") for name in ("a", "b", "c")]
     first = run_jobs(jobs, work_here, InProcess())
-    assert [(o.name, o.status) for o in first] == [(name, Status.DONE) for name in "abc"]
+    assert [(o.name, o.status) for o in first] == [(name, JobStatus.DONE) for name in "abc"]
     assert set(recorded(jobs)) == {"a", "b", "c"}
     (tmp_path / "input/b").write_text("other", encoding="utf-8")
     assert set(recorded(jobs)) == {"a", "c"}
     second = run_jobs(jobs, work_here, InProcess())
-    assert [o.status for o in second] == [Status.KEPT, Status.DONE, Status.KEPT]
+    assert [o.status for o in second] == [JobStatus.KEPT, JobStatus.DONE, JobStatus.KEPT]
     assert (tmp_path / "out/b/result.txt").read_text() == "OTHER"
 
 
@@ -38,7 +38,7 @@ def test_a_copy_of_the_input_with_other_times_is_read_and_its_result_kept(tmp_pa
     run_jobs(jobs, work_here, InProcess())
     os.utime(tmp_path / "input/a", (1, 1))
     assert not recorded(jobs)
-    assert [o.status for o in run_jobs(jobs, work_here, InProcess())] == [Status.KEPT]
+    assert [o.status for o in run_jobs(jobs, work_here, InProcess())] == [JobStatus.KEPT]
     assert set(recorded(jobs)) == {"a"}
 
 
@@ -48,7 +48,7 @@ def test_a_result_that_is_not_whole_is_made_again(tmp_path: Path, spoil: str) ->
     run_jobs(jobs, work_here, InProcess())
     result = tmp_path / "out/a/result.txt"
     result.unlink() if spoil == "remove" else result.write_text("")
-    assert [o.status for o in run_jobs(jobs, work_here, InProcess())] == [Status.DONE]
+    assert [o.status for o in run_jobs(jobs, work_here, InProcess())] == [JobStatus.DONE]
     assert result.read_text() == "A"
 
 
@@ -62,14 +62,14 @@ def test_what_was_added_beside_a_result_does_not_count(tmp_path: Path) -> None:
 def test_again_runs_everything(tmp_path: Path) -> None:
     jobs = [job(tmp_path, "a", "write")]
     run_jobs(jobs, work_here, InProcess())
-    assert [o.status for o in run_jobs(jobs, work_here, InProcess(), again=True)] == [Status.DONE]
+    assert [o.status for o in run_jobs(jobs, work_here, InProcess(), again=True)] == [JobStatus.DONE]
 
 
 def test_each_failure_has_its_kind_and_a_rerun_tries_it_again(tmp_path: Path) -> None:
     jobs = [job(tmp_path, "a", "refuse"), job(tmp_path, "b", "misread"), job(tmp_path, "c", "write")]
     for _ in range(2):
         found = run_jobs(jobs, work_here, InProcess())
-        assert [o.status for o in found[:2]] == [Status.NO_RESULT, Status.FAILED] and found[2].is_good
+        assert [o.status for o in found[:2]] == [JobStatus.NO_RESULT, JobStatus.FAILED] and found[2].is_good
         assert found[0].reason == "too few markers" and "no such file" in found[1].reason
 
 
@@ -102,20 +102,20 @@ def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_others_go_on(tmp
     with processes(2) as engine:
         found = {o.name: o for o in run_jobs(jobs, work, engine)}
     assert found["a"].is_good and found["b"].is_good
-    assert (found["bad"].status, found["bad"].deaths) == (Status.CRASHED, 2) and "SIGKILL" in found["bad"].reason
-    assert found["worse"].status is Status.CRASHED and "Fatal Python error: Aborted" in found["worse"].reason
+    assert (found["bad"].status, found["bad"].deaths) == (JobStatus.CRASHED, 2) and "SIGKILL" in found["bad"].reason
+    assert found["worse"].status is JobStatus.CRASHED and "Fatal Python error: Aborted" in found["worse"].reason
     assert log_of(jobs[0]).read_text().startswith("write a") and not list(tmp_path.rglob("*.running"))
     again = run_jobs(jobs, work_here, InProcess())  # it would end this process
-    assert [o.status for o in again] == [Status.KEPT, Status.CRASHED, Status.CRASHED, Status.KEPT]
+    assert [o.status for o in again] == [JobStatus.KEPT, JobStatus.CRASHED, JobStatus.CRASHED, JobStatus.KEPT]
 
 
 def test_a_job_whose_worker_died_once_is_run_once_more_with_one_thread_in_each_library(tmp_path: Path) -> None:
     jobs = [job(tmp_path, "a", "die once"), job(tmp_path, "b", "environment", *ONE_THREAD), job(tmp_path, "eats", "eat")]
     with processes(2) as engine:
         late, told, eats = run_jobs(jobs, work, engine)
-    assert (late.status, late.deaths) == (Status.DONE, 1)
+    assert (late.status, late.deaths) == (JobStatus.DONE, 1)
     assert told.is_good and (tmp_path / "out/b/result.txt").read_text().split("\n") == ["1"] * len(ONE_THREAD)
-    assert eats.status is Status.OUT_OF_MEMORY and eats.deaths == 0 and "--memory" in eats.reason
+    assert eats.status is JobStatus.OUT_OF_MEMORY and eats.deaths == 0 and "--memory" in eats.reason
     assert late.row["pid"] != os.getpid()
 
 
@@ -142,7 +142,7 @@ def test_a_driver_that_is_killed_leaves_no_worker_and_a_second_one_finishes(tmp_
     driver.send_signal(signal.SIGKILL)
     driver.wait()
     found = run_jobs(jobs, work_here, InProcess())  # waits for the worker that still has b
-    assert found[0].status is Status.KEPT and all(o.is_good for o in found)
+    assert found[0].status is JobStatus.KEPT and all(o.is_good for o in found)
     assert not list(tmp_path.rglob("*.running"))
 
 

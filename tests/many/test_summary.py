@@ -11,14 +11,14 @@ import pytest
 from pyarrow import parquet
 
 from femsense.core.errors import InputError
-from femsense.many.outcome import Outcome, Status
+from femsense.many.outcome import JobStatus, Outcome
 from femsense.many.summary import check_summary_folder, write_summary
 
 OUTCOMES = (
-    Outcome("a", Status.DONE, row={"rms_m": 1e-3, "verdict": "none"}, seconds=2.0, peak_bytes=500_000_000, host="one"),
-    Outcome("b", Status.KEPT, row={"rms_m": 2e-3, "effects": "</script>"}, seconds=4.0, host="two"),
-    Outcome("c", Status.CRASHED, "its worker was ended by SIGSEGV", deaths=2),
-    Outcome("d", Status.DONE, deaths=1),
+    Outcome("a", JobStatus.DONE, row={"rms_m": 1e-3, "verdict": "none"}, seconds=2.0, peak_bytes=500_000_000, host="one"),
+    Outcome("b", JobStatus.KEPT, row={"rms_m": 2e-3, "effects": "</script>"}, seconds=4.0, host="two"),
+    Outcome("c", JobStatus.CRASHED, "its worker was ended by SIGSEGV", deaths=2),
+    Outcome("d", JobStatus.DONE, deaths=1),
 )
 
 

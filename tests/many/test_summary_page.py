@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from browser import CHROMIUM, said, start_browser
 
-from femsense.many.outcome import Outcome, Status
+from femsense.many.outcome import JobStatus, Outcome
 from femsense.many.summary import write_summary
 
 SCRIPT = """
@@ -30,9 +30,9 @@ await opened.close();
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 def test_the_table_is_sorted_and_filtered(tmp_path: Path, pytestconfig: pytest.Config) -> None:
     outcomes = [
-        Outcome("b", Status.DONE, row={"rms_m": 2e-3}),
-        Outcome("a", Status.DONE, row={"rms_m": 1e-3}),
-        Outcome("c", Status.CRASHED, "its worker was ended by SIGSEGV", deaths=2),
+        Outcome("b", JobStatus.DONE, row={"rms_m": 2e-3}),
+        Outcome("a", JobStatus.DONE, row={"rms_m": 1e-3}),
+        Outcome("c", JobStatus.CRASHED, "its worker was ended by SIGSEGV", deaths=2),
     ]
     write_summary(tmp_path, "calibrate", outcomes, {o.name: tmp_path / o.name for o in outcomes})
     browser = start_browser(pytestconfig, SCRIPT, (tmp_path / "summary.html").as_uri())

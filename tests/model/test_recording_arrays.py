@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import write_block_robot
+from helpers import marker_grid, write_block_robot
 
 import femsense as fs
 from femsense.core.errors import DataError, InputError
-from femsense.model.recording import marker_grid
 
 TIME = np.array([0.0, 0.5, 1.0])
 PLACES = {"tip": np.arange(9.0).reshape(3, 3), "back": np.array([[1.0, 2, 3], [np.nan] * 3, [4, 5, 6]])}

@@ -12,6 +12,7 @@ import numpy as np
 import tomli_w
 
 from femsense.fem.mesh import TetMesh
+from femsense.model.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -127,3 +128,11 @@ def write_small_recording(folder: Path, **files: str | None) -> Path:
         if text is not None:
             (folder / name).write_text(text, encoding="utf-8", newline="")
     return folder
+
+
+def marker_grid(recording: Recording, *, view: int = 0) -> np.ndarray:
+    """Return the markers as one camera saw them [m], camera frame, shape (F, markers, 3); NaN where hidden."""
+    grid = np.full((recording.frame_count, len(recording.marker_names), 3), np.nan)
+    mine = recording.marker_view == view
+    grid[recording.marker_frame[mine], recording.marker_index[mine]] = recording.marker_xyz[mine]
+    return grid

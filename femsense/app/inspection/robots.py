@@ -13,6 +13,7 @@ from femsense.app.inspection.reports import Problems, Report, attempt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import Cable, Chamber
+from femsense.fem.cables import bend_angles, cable_length
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, triangle_normals
 from femsense.fem.mesh_checks import check_mesh
@@ -149,18 +150,11 @@ def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:
 
 
 def _cable_report(cable: Cable, mesh: TetMesh) -> Report:
-    points = np.vstack([cable.path.positions(mesh.nodes), cable.pull_point])
-    legs = np.diff(points, axis=0)
-    length = np.linalg.norm(legs, axis=1)
-    units = legs[length > 0] / length[length > 0, None]
-    if cable.exit_direction is not None:
-        units = np.vstack([units, cable.exit_direction])
-    angles = np.arccos(np.clip(np.einsum("ic,ic->i", units[:-1], units[1:]), -1.0, 1.0))
     return {
         "name": cable.name,
         "points": len(cable.path),
-        "length_mm": 1e3 * float(length.sum()),
-        "bends_deg": float(np.degrees(angles.sum())),
+        "length_mm": 1e3 * cable_length(cable, mesh.nodes),
+        "bends_deg": float(np.degrees(bend_angles(cable, mesh.nodes).sum())),
         "outside_mm": 1e3 * float(cable.path.outside.max()),
         "max_tension_n": cable.max_tension,
     }

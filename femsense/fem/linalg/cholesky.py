@@ -1,14 +1,17 @@
 """Sparse Cholesky of stiffness matrices: multifrontal, supernodal, in single or double precision.
 
-The analysis (elimination tree, supernodes, positions of all entries) depends on the sparsity pattern only and is reused. A right-hand side
-with few entries, such as the force on a point, only visits the part of the tree above its entries, which makes `gram` (BᵀK⁻¹B without
-K⁻¹B) cheap. CHOLMOD takes 1.4 to 4 times as long for a factor, and 29 times or more for BᵀK⁻¹B (docs/results/speed.md).
+1. `symbolic.analyse` orders the unknowns and lays out the factor, from the sparsity pattern alone: once for all matrices of one pattern.
+2. `cholesky` computes the numbers of a factor (`multifrontal`).
+3. `Cholesky` solves with them (`substitution`). The compiled kernels number the unknowns in the order of elimination, and what comes in or
+   goes out is reordered here: `analysis.order` lists the unknowns as they are eliminated, `analysis.rank` the place of each unknown.
+
+A right-hand side with few entries, such as the force on a point, only visits the part of the elimination tree above its entries, which makes
+`gram` (BᵀK⁻¹B without K⁻¹B) cheap. CHOLMOD takes 1.4 to 4 times as long for a factor, and 29 times or more for BᵀK⁻¹B (docs/results/speed.md).
 References: Liu 1992 (multifrontal method), Ashcraft & Grimes 1989 (relaxed supernodes), Gilbert 1994 (reach of a sparse right-hand side).
 """
 
 from __future__ import annotations
 
-import weakref
 from typing import Any
 
 import numpy as np
@@ -25,41 +28,50 @@ FEW = 24
 """Largest number of right-hand sides that `solve_few` takes."""
 
 
+def cholesky(
+    analysis: Analysis, values: FloatArray, *, single: bool = False, source: npt.NDArray[np.int32] | None = None
+) -> Cholesky | None:
+    """Factorise a symmetric matrix of an analysed pattern; None where the matrix is not positive definite.
+
+    Arguments:
+        analysis: from `analyse`.
+        values: entries in CSC order, shape (nnz,).
+        single: work in single precision (errors of 1e-7 times the condition of the matrix: a preconditioner).
+        source: where `values` are in another order: entry j in CSC order is values[source[j]] for each j that `analysis.tree.source` lists, in its order.
+    """
+    tree, kind = analysis.tree, "f" if single else "d"
+    L, stack = analysis.pool.empty(kind, analysis.factor_entries), analysis.pool.empty(kind, tree.stack)
+    is_definite = factorize(tree, values, tree.source if source is None else source, L, stack)
+    return Cholesky(analysis, L) if is_definite else None
+
+
 class Cholesky:
-    """A factor K = LLᵀ of a positive definite matrix. It owns L, whose memory goes back to the pool of the analysis with the factor."""
+    """A factor K = LLᵀ of a positive definite matrix."""
 
     negative = 0
     """Negative eigenvalues of the matrix."""
 
     def __init__(self, analysis: Analysis, L: npt.NDArray[Any]) -> None:
         self.size = analysis.size
-        self.bytes = analysis.factor_entries * L.itemsize
+        self.bytes = L.nbytes
         self._analysis, self._L = analysis, L
-        weakref.finalize(self, analysis.pool.give_back, L)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return K⁻¹ right, shape (f,) or (f, k).
-
-        | right-hand sides | kernel | why |
-        |---|---|---|
-        | 1 to 24, matrix of 3 × 3 blocks | `solve_few` | plain loops: BLAS copies the panels of L first, which takes most of the time |
-        | others | `solve_many` | BLAS is faster for many, and works for any pattern |
-        """
+        """Return K⁻¹ right, shape (f,) or (f, k)."""
         if right.size == 0:
             return np.zeros(right.shape)
         a = self._analysis
         columns = np.asarray(right).reshape(a.size, -1)
-        count = columns.shape[1]
-        few = count <= FEW and a.tree.unit == 3
-        ordered = self._solve_few(columns) if few else self._solve_many(columns)
+        # for many columns BLAS is faster; for few, it would copy the panels of L first, which takes most of the time
+        ordered = self._solve_few(columns) if columns.shape[1] <= FEW else self._solve_many(columns)
         return ordered[a.rank].astype(np.float64, copy=False).reshape(right.shape)
 
     def _solve_few(self, columns: FloatArray) -> npt.NDArray[Any]:
         a, kind, count = self._analysis, self._L.dtype, columns.shape[1]
-        sides = 1 if count == 1 else -(-count // SIDES) * SIDES
-        x = np.zeros((sides, a.size), kind)
+        padded = 1 if count == 1 else -(-count // SIDES) * SIDES
+        x = np.zeros((padded, a.size), kind)  # a right-hand side is a row here, so that it is contiguous
         x[:count] = columns.T[:, a.order]
-        solve_few(a.tree, self._L, x, np.empty((sides, a.tallest()), kind))
+        solve_few(a.tree, self._L, x, np.empty((padded, a.tallest()), kind))
         return x[:count].T
 
     def _solve_many(self, columns: FloatArray) -> npt.NDArray[Any]:
@@ -74,29 +86,7 @@ class Cholesky:
         rows = a.rank[columns.indices]
         indptr = columns.indptr.astype(np.int64)
         start, active = reach(a.tree.parent, a.owner, indptr, rows)
-        X, W = a.pool.take_zeros(kind.char, a.size, k), np.zeros((k, k))
+        X, W = np.zeros((a.size, k), kind), np.zeros((k, k))
         X[rows, np.repeat(np.arange(k), np.diff(indptr))] = columns.data
         add_gram(a.tree, blas_of(kind.char), start, active, self._L, X, np.empty(a.tallest(k) * k, kind), W)
-        a.pool.give_back_zeros(X)  # add_gram has made it zero again
         return np.asarray(W + np.tril(W, -1).T)
-
-
-def cholesky(
-    analysis: Analysis, values: FloatArray, *, single: bool = False, source: npt.NDArray[np.int32] | None = None
-) -> Cholesky | None:
-    """Factorise a symmetric matrix of an analysed pattern; None where the matrix is not positive definite.
-
-    Arguments:
-        analysis: from `analyse`.
-        values: entries in CSC order, shape (nnz,).
-        single: work in single precision (errors of 1e-7 times the condition of the matrix: a preconditioner).
-        source: where `values` are in another order: entry j in CSC order is values[source[j]] for each j that `analysis.tree.source` lists, in its order.
-    """
-    tree, pool, kind = analysis.tree, analysis.pool, "f" if single else "d"
-    L, stack = pool.take(kind, analysis.factor_entries), pool.take(kind, tree.stack)
-    definite = factorize(tree, values, tree.source if source is None else source, L, stack)
-    pool.give_back(stack)
-    if definite:
-        return Cholesky(analysis, L)
-    pool.give_back(L)
-    return None

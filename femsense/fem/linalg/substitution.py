@@ -77,7 +77,7 @@ def _backward(sides: int, like: FloatArray, at: int, step: int, y: int, line: in
 
 @njit(cache=True, nogil=True)
 def solve_few(tree: Tree, L: FloatArray, x: FloatArray, fronts: FloatArray) -> None:
-    """Solve in place for right-hand sides x (k, f), k = 1 or a multiple of SIDES, in the order of elimination, where a node has 3 unknowns.
+    """Solve in place for right-hand sides x (k, f), k = 1 or a multiple of SIDES, in the order of elimination.
 
     All of them go through a panel while it is in the cache. `fronts` (k, …) is work memory for the tallest front.
     """
@@ -122,28 +122,28 @@ def solve_few(tree: Tree, L: FloatArray, x: FloatArray, fronts: FloatArray) -> N
 @njit(cache=True, nogil=True)
 def solve_many(tree: Tree, blas: Blas, L: FloatArray, X: FloatArray, work: FloatArray) -> None:
     """Solve in place for the columns of X (f, k) in the order of elimination; `work` holds k times the tallest front."""
-    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
+    firsts, begin, below, offset = tree.firsts, tree.begin, tree.below, tree.offset
     width, k, after = L.itemsize, X.shape[1], work.ctypes.data
     for s in range(len(firsts) - 1):
-        c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
-        height, panel, here = columns + unit * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        c0, columns, rows = 3 * firsts[s], 3 * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
+        height, panel, here = columns + 3 * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
         trsm(blas, True, k, columns, panel, height, here, k)
         if rows > 0:
-            gemm(blas, False, True, k, unit * rows, columns, 1.0, here, k, panel + width * columns, height, 0.0, after, k)
+            gemm(blas, False, True, k, 3 * rows, columns, 1.0, here, k, panel + width * columns, height, 0.0, after, k)
         for q in range(rows):
-            for a in range(unit):
-                line, part = X[unit * below[begin[s] + q] + a], work[(unit * q + a) * k : (unit * q + a + 1) * k]
+            for a in range(3):
+                line, part = X[3 * below[begin[s] + q] + a], work[(3 * q + a) * k : (3 * q + a + 1) * k]
                 for r in range(k):
                     line[r] -= part[r]
     for s in range(len(firsts) - 2, -1, -1):
-        c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
-        height, panel, here = columns + unit * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        c0, columns, rows = 3 * firsts[s], 3 * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
+        height, panel, here = columns + 3 * rows, L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
         for q in range(rows):
-            for a in range(unit):
+            for a in range(3):
                 for r in range(k):
-                    work[(unit * q + a) * k + r] = X[unit * below[begin[s] + q] + a, r]
+                    work[(3 * q + a) * k + r] = X[3 * below[begin[s] + q] + a, r]
         if rows > 0:
-            gemm(blas, False, False, k, columns, unit * rows, -1.0, after, k, panel + width * columns, height, 1.0, here, k)
+            gemm(blas, False, False, k, columns, 3 * rows, -1.0, after, k, panel + width * columns, height, 1.0, here, k)
         trsm(blas, False, k, columns, panel, height, here, k)
 
 
@@ -183,15 +183,15 @@ def add_gram(
         start, active: which columns of X each supernode sees (`reach`).
         work: memory for k columns of the tallest front, or of a supernode with k rows below.
     """
-    unit, firsts, begin, below, offset = tree.unit, tree.firsts, tree.begin, tree.below, tree.offset
+    firsts, begin, below, offset = tree.firsts, tree.begin, tree.below, tree.offset
     width, here = L.itemsize, work.ctypes.data
     for s in range(len(firsts) - 1):
         seen = active[start[s] : start[s + 1]]
         k = len(seen)
         if k == 0:
             continue
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        rest = unit * (begin[s + 1] - begin[s])
+        c0, columns = 3 * firsts[s], 3 * (firsts[s + 1] - firsts[s])
+        rest = 3 * (begin[s + 1] - begin[s])
         height, panel, after = columns + rest, L.ctypes.data + width * offset[s], here + width * columns * k
         for i in range(columns):
             for r in range(k):
@@ -201,9 +201,9 @@ def add_gram(
         if rest > 0:
             gemm(blas, False, True, k, rest, columns, 1.0, here, k, panel + width * columns, height, 0.0, after, k)
             for q in range(begin[s + 1] - begin[s]):
-                to = unit * below[begin[s] + q]
-                for a in range(unit):
-                    line = (columns + unit * q + a) * k
+                to = 3 * below[begin[s] + q]
+                for a in range(3):
+                    line = (columns + 3 * q + a) * k
                     for r in range(k):
                         X[to + a, seen[r]] -= work[line + r]
         syrk(blas, k, columns, 1.0, here, k, after, k)

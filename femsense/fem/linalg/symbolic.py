@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import IntArray
+from femsense.core.errors import InputError
 from femsense.core.kernels import njit
 from femsense.fem.linalg.ordering import _elimination_tree, _structures
 
@@ -17,13 +19,12 @@ from femsense.fem.linalg.ordering import _elimination_tree, _structures
 class Tree(NamedTuple):
     """The supernodes of a factor and their tree: all that the compiled kernels read of an analysis.
 
-    A node has `unit` unknowns (3: a point in space). A supernode is a run of nodes with the same rows below the diagonal. Its columns
+    A node has three unknowns: a point in space. A supernode is a run of nodes with the same rows below the diagonal. Its columns
     stand as one dense panel in the factor: first its own nodes, then the nodes below. A front is the panel with the update matrix, the
     part that its elimination subtracts from the nodes below. Arrays of shape (s + 1,) hold the beginning of each supernode's list in another
     array, and the end of the last list.
     """
 
-    unit: int
     firsts: IntArray
     """First node of each supernode, shape (s + 1,)."""
     parent: IntArray
@@ -83,7 +84,7 @@ def _postorder(parent: IntArray, by_weight: IntArray) -> IntArray:
 
 
 @njit(cache=True)
-def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
+def _supernodes(count: IntArray, parent: IntArray) -> IntArray:
     """Return the first column of each supernode and the end; a small supernode is merged with its parent if few zeros result."""
     n = len(parent)
     firsts = np.empty(n + 1, np.int64)
@@ -112,7 +113,7 @@ def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
                 fill += (first - c) + height - (count[c] + 1)
             total = 0.5 * (wide + own) * (wide + own + 1) + (wide + own) * count[last]
             share = (fill + empty) / total
-            columns = unit * (wide + own)
+            columns = 3 * (wide + own)
             if not (columns <= 12 or (columns <= 36 and share < 0.2) or (columns <= 96 and share < 0.08) or share < 0.02):
                 break
             empty = fill + empty
@@ -169,7 +170,6 @@ def _targets(
     firsts: IntArray,
     begin: IntArray,
     below: IntArray,
-    unit: int,
 ) -> tuple[IntArray, npt.NDArray[np.int32], npt.NDArray[np.int32]]:
     """Return where the entries of a matrix (in its scalar CSC) go: their begin for each supernode, source, place in its panel."""
     source = np.empty(len(indices), np.int32)
@@ -179,28 +179,28 @@ def _targets(
     k = 0
     for s in range(len(firsts) - 1):
         own = firsts[s + 1] - firsts[s]
-        height = unit * (own + begin[s + 1] - begin[s])
+        height = 3 * (own + begin[s + 1] - begin[s])
         for q in range(begin[s], begin[s + 1]):
             where[below[q]] = own + q - begin[s]
         for j in range(firsts[s], firsts[s + 1]):
-            for b in range(unit):
-                column = unit * order[j] + b
-                at = (unit * (j - firsts[s]) + b) * height
+            for b in range(3):
+                column = 3 * order[j] + b
+                at = (3 * (j - firsts[s]) + b) * height
                 for p in range(indptr[column], indptr[column + 1]):
-                    node, a = divmod(indices[p], unit)
+                    node, a = divmod(indices[p], 3)
                     i = inverse[node]
                     if i < j or (i == j and a < b):
                         continue
                     line = i - firsts[s] if i < firsts[s + 1] else where[i]
                     source[k] = p
-                    target[k] = at + unit * line + a
+                    target[k] = at + 3 * line + a
                     k += 1
         entries[s + 1] = k
     return entries, source[:k].copy(), target[:k].copy()
 
 
 @njit(cache=True)
-def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]:
+def _rooms(parent: IntArray, begin: IntArray) -> tuple[IntArray, int]:
     """Return where the update matrix of each supernode lives until its parent has taken it, and how much room all of them need.
 
     Each takes the first gap that is large enough.
@@ -208,14 +208,14 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
     count = len(parent)
     room, alive, kept, most = np.zeros(count, np.int64), np.empty(count, np.int64), 0, 0
     for s in range(count):
-        height = unit * (begin[s + 1] - begin[s])
+        height = 3 * (begin[s + 1] - begin[s])
         size = height * height
         at, end = 0, 0
         while at < kept:
             other = alive[at]
             if room[other] - end >= size:
                 break
-            height = unit * (begin[other + 1] - begin[other])
+            height = 3 * (begin[other + 1] - begin[other])
             end = room[other] + height * height
             at += 1
         room[s] = end
@@ -242,55 +242,44 @@ def _layout(
     rows: IntArray,
     columns: IntArray,
     parent: IntArray,
-    unit: int,
 ) -> Tree:
     """Return the tree of supernodes of a pattern in an order of elimination: one kernel to load instead of six."""
     start, structure = _structures(rows, columns, parent)
     count = np.empty(len(parent), np.int64)
     for j in range(len(parent)):
         count[j] = start[j + 1] - start[j]
-    firsts = _supernodes(count, parent, unit)
+    firsts = _supernodes(count, parent)
     above, begin, below, place = _relations(firsts, start, structure)
     offset = np.zeros(len(firsts), np.int64)
     for s in range(len(above)):
-        own = unit * (firsts[s + 1] - firsts[s])
-        offset[s + 1] = offset[s] + own * (own + unit * (begin[s + 1] - begin[s]))
-    starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below, unit)
-    room, stack = _rooms(above, begin, unit)
-    return Tree(unit, firsts, above, begin, below, place, offset, starts, source, target, room, stack)
+        own = 3 * (firsts[s + 1] - firsts[s])
+        offset[s + 1] = offset[s] + own * (own + 3 * (begin[s + 1] - begin[s]))
+    starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below)
+    room, stack = _rooms(above, begin)
+    return Tree(firsts, above, begin, below, place, offset, starts, source, target, room, stack)
 
 
 class Pool:
-    """Arrays for reuse: fresh pages of the system take longer than the factor that is written to them.
+    """Memory that is used again: fresh pages of the system take longer than the factor that is written to them.
 
-    An array has one owner. Whoever takes it owns it, until giving it back, and keeps no view of it afterwards. A `Cholesky` owns the
-    array of its factor and gives it back when it is collected. Threads may share a pool.
+    An array of the pool is an ordinary array. Its memory returns to the pool by itself, as soon as nothing refers to the array any more;
+    a view does not count, so whoever slices it keeps the array too. Threads may share a pool.
     """
 
     def __init__(self) -> None:
         self.idle: dict[tuple[str, int], list[npt.NDArray[Any]]] = {}
-        """Arrays without an owner, by kind and number of entries."""
-        self._zeros: dict[tuple[str, int, int], npt.NDArray[Any]] = {}
+        """Memory that no array uses, by kind and number of entries."""
 
-    def take(self, kind: str, entries: int) -> npt.NDArray[Any]:
-        """Return an array of any content with so many entries."""
+    def empty(self, kind: str, entries: int) -> npt.NDArray[Any]:
+        """Return an array of any content, shape (entries,)."""
+        idle = self.idle.setdefault((kind, entries), [])
         try:
-            return self.idle.setdefault((kind, entries), []).pop()
+            memory = idle.pop()
         except IndexError:
-            return np.empty(entries, kind)
-
-    def give_back(self, array: npt.NDArray[Any]) -> None:
-        """Take over an array that its owner needs no more."""
-        self.idle[array.dtype.char, len(array)].append(array)
-
-    def take_zeros(self, kind: str, rows: int, columns: int) -> npt.NDArray[Any]:
-        """Return zeros, shape (rows, columns)."""
-        kept = self._zeros.pop((kind, rows, columns), None)
-        return np.zeros((rows, columns), kind) if kept is None else kept
-
-    def give_back_zeros(self, array: npt.NDArray[Any]) -> None:
-        """Take over an array that its owner has made zero again."""
-        self._zeros[array.dtype.char, *array.shape] = array
+            memory = np.empty(entries, kind)
+        array = memory[:]  # a second array on the same memory: when it is collected, the first one goes back
+        weakref.finalize(array, idle.append, memory)
+        return array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -317,16 +306,16 @@ class Analysis:
     def tallest(self, columns: int = 0) -> int:
         """Return the rows of the tallest front [unknowns], with at least so many nodes below each supernode."""
         tree = self.tree
-        return int(tree.unit * (np.diff(tree.firsts) + np.maximum(np.diff(tree.begin), columns)).max(initial=0))
+        return int(3 * (np.diff(tree.firsts) + np.maximum(np.diff(tree.begin), columns)).max(initial=0))
 
 
 def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     """Analyse the pattern of a symmetric matrix in CSC with sorted indices, whose unknowns are in an order of little fill."""
-    unit = 3 if _has_blocks(indptr, indices) else 1
+    _check_blocks(indptr, indices)
     heads, entries = np.asarray(indptr, np.int64), np.asarray(indices, np.int64)
-    counts = np.diff(heads)[::unit] // unit
+    counts = np.diff(heads)[::3] // 3
     rows = np.concatenate([[0], np.cumsum(counts)])
-    columns = entries[_ranges(heads[:-1:unit], counts, unit)] // unit
+    columns = entries[_ranges(heads[:-1:3], counts, 3)] // 3
     parent = _elimination_tree(rows, columns)
     order = _postorder(parent, np.argsort(np.diff(_structures(rows, columns, parent)[0])))
     inverse = np.empty_like(order)
@@ -334,11 +323,11 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     columns = inverse[columns[_ranges(rows[:-1][order], counts[order], 1)]]
     rows = np.concatenate([[0], np.cumsum(counts[order])])
     parent = np.where(parent[order] >= 0, inverse[parent[order]], -1)
-    tree = _layout(heads, entries, order, inverse, rows, columns, parent, unit)
-    unknowns = (unit * order[:, None] + np.arange(unit)).ravel()
+    tree = _layout(heads, entries, order, inverse, rows, columns, parent)
+    unknowns = (3 * order[:, None] + np.arange(3)).ravel()
     rank = np.empty_like(unknowns)
     rank[unknowns] = np.arange(len(unknowns))
-    owner = np.repeat(np.arange(len(tree.parent)), unit * np.diff(tree.firsts))
+    owner = np.repeat(np.arange(len(tree.parent)), 3 * np.diff(tree.firsts))
     return Analysis(tree, unknowns, rank, owner, Pool())
 
 
@@ -349,12 +338,10 @@ def _ranges(starts: IntArray, counts: IntArray, step: int) -> IntArray:
     return np.asarray(np.repeat(starts, counts) + step * inner)
 
 
-def _has_blocks(indptr: IntArray, indices: IntArray) -> bool:
-    """Return whether a pattern consists of full 3 × 3 blocks."""
-    if (len(indptr) - 1) % 3 or len(indices) % 9:
-        return False
-    counts = np.diff(indptr).reshape(-1, 3)
-    if (counts != counts[:, :1]).any() or (counts % 3).any():
-        return False
-    triples = np.asarray(indices).reshape(-1, 3)
-    return bool((triples[:, 0] % 3 == 0).all() and (np.diff(triples, axis=1) == 1).all())
+def _check_blocks(indptr: IntArray, indices: IntArray) -> None:
+    """Raise InputError unless a pattern consists of full 3 × 3 blocks, which the compiled kernels take for granted."""
+    counts = np.diff(indptr)[: (len(indptr) - 1) // 3 * 3].reshape(-1, 3)
+    whole = (len(indptr) - 1) % 3 == 0 and (counts == counts[:, :1]).all() and (counts % 3 == 0).all()
+    triples = np.asarray(indices).reshape(-1, 3) if whole else np.zeros((1, 3))
+    if not (whole and (triples[:, 0] % 3 == 0).all() and (np.diff(triples, axis=1) == 1).all()):
+        raise InputError("not a pattern of nodes", where="indices", found="single entries", expected="full blocks of 3 × 3")

@@ -53,14 +53,11 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
     markers = float(np.median([d for d in seen if d is not None])) if any(d is not None for d in seen) else None
     if markers is not None and not 1 / OTHER_UNIT < distance / markers < OTHER_UNIT:
         return [
-            f"{where}: clouds {distance:.4g} m away, markers {markers:.4g} m: {_likely(distance / markers)}; clouds are in metres"
+            f"{where}: clouds {distance:.4g} m away, markers {markers:.4g} m: {_likely(distance / markers)} Clouds are in metres"
         ]
     if distance > RANGES.scene_m[1]:
         return [
-            (
-                f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds "
-                f"are in metres"
-            )
+            f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)} Clouds are in metres"
         ]
     extent = max(float(np.ptp(cloud.points, axis=0).max()) for _, _, cloud in full)
     if robot is not None:

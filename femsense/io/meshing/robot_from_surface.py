@@ -197,7 +197,7 @@ def mesh_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
     lines = [
         quality_text(report["quality"]),
-        f"  {'surface error':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
+        f"  {'surface error':<19}at most {max(report['deviation_mm'], 1e-3):.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
     ]
     for title, texts in (("notes", report["done"]), ("advice", report["advice"])):
         if texts:

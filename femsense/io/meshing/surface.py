@@ -8,7 +8,6 @@ filling takes the union of their interiors.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +23,6 @@ WELD = 1e-5
 """Points of open edges closer than this, over the diagonal, are one point."""
 SMALL_HOLE = 0.1
 """A hole with a shorter border than this, over the diagonal, is closed without asking."""
-Progress = Callable[..., None]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

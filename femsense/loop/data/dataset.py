@@ -29,7 +29,7 @@ from femsense.model.as_it_is import evaluate_robot
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, state_key
-from femsense.model.recording_checks import check_against
+from femsense.model.recording_checks import camera_text, check_against
 from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot
 
@@ -248,12 +248,12 @@ def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[
     initial = first_inputs(robot, recording)
     if recording.rest is not None:
         return tuple(first_poses(robot, _bare_scene(robot, recording, frames, with_rest=True))), initial, {}
-    missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
+    missing = [camera_text(name) for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise InputError(
             "without markers, clouds need a known camera pose",
             where=recording.folder,
-            found=f"no T_robot_camera of camera {', '.join(missing)}, no markers.csv, no rest.csv",
+            found=f"no T_robot_camera of {', '.join(missing)}, no markers.csv, no rest.csv",
             expected="T_robot_camera in recording.toml (maps camera coordinates to robot coordinates; accurate to a few millimetres and degrees)",
             hint="or record three markers in one frame, or measure markers at rest (rest.csv)",
         )

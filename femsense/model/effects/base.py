@@ -214,6 +214,11 @@ class Effect:
     """Whether it is sought so; else it only is if robot.toml declares it."""
 
 
+def no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """Return no parameters: those of an effect that its seed describes completely."""
+    return ()
+
+
 def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLength] | None:
     """Return which coordinates are the components of a vector of known length, shape (p,), and that length;
     None where there is none."""

@@ -9,7 +9,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray, diagonal, freeze
 from femsense.core.errors import InputError
 from femsense.fem.mesh import element_volumes
-from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, Parameter, number, vector
+from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, Parameter, no_parameters, number, vector
 from femsense.model.robot import Robot, spread_features
 
 MODULUS_STD = 0.5
@@ -129,10 +129,6 @@ def _gent_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return (Parameter("jm", None, "1", 0.3, 0.0, 10.0, 1e-4, "reciprocal"),)
 
 
-def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return ()
-
-
 MOST_CREEP = 0.5
 """Largest fraction of the stress of a cast silicone that relaxes in one term (0.05–0.3 are usual); more indicates another effect."""
 USUAL_CREEP = 0.15
@@ -210,7 +206,7 @@ SOFT_REGION = Effect(
 HYPERELASTIC: Effect = Effect(
     "hyperelastic",
     "stiffening or softening with stretch",
-    _no_parameters,
+    no_parameters,
     _apply_law,
     _law_seeds,
     keys=("law", "jm"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.model.effects.base import Effect, Entry, Parameter, number
+from femsense.model.effects.base import Effect, Entry, Parameter, no_parameters, number
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.robot import Robot
 
@@ -35,10 +35,6 @@ def _mesh_seeds(robot: Robot) -> tuple[Entry, ...]:
     return ({"element": "tet10"}, *finer)
 
 
-def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return ()
-
-
 def _apply_mesh(robot: Robot, entry: Entry) -> Robot:
     element, refinements = entry.get("element"), entry.get("refinements", 0)
     if element is None and "refinements" not in entry:
@@ -61,7 +57,7 @@ def _apply_mesh(robot: Robot, entry: Entry) -> Robot:
 DISCRETISATION = Effect(
     "discretisation",
     "a mesh fine enough",
-    _no_parameters,
+    no_parameters,
     _apply_mesh,
     _mesh_seeds,
     keys=("element", "refinements"),

@@ -65,22 +65,6 @@ def detect_contacts(
     return _contacts(touching[groups >= 0], groups[groups >= 0])
 
 
-def map_to_features(positions: npt.ArrayLike, feature_points: npt.ArrayLike) -> IntArray:
-    """Return the index of the closest feature point of each position, shape (k,).
-
-    Arguments:
-        positions: contact points [m], shape (k, 3).
-        feature_points: points on the robot at which forces are estimated [m], shape (e, 3); the first one wins a tie.
-    Raises:
-        InputError: wrong shapes, or no feature points.
-    """
-    places, features = as_points(positions, "positions"), as_points(feature_points, "feature_points")
-    if len(features) == 0:
-        raise InputError("no feature points", where="feature_points", found="0 points", expected="at least one")
-    squared = ((places[:, None, :] - features[None, :, :]) ** 2).sum(axis=2)
-    return np.asarray(squared.argmin(axis=1), dtype=np.int64)
-
-
 def _contacts(points: FloatArray, groups: IntArray) -> Contacts:
     counts = np.bincount(groups)
     if len(counts) == 0:

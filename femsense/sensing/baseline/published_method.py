@@ -22,10 +22,9 @@ from femsense.model.robot import spread_features
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
-from femsense.qp.forces import estimate_forces
-from femsense.qp.problem import ForceOptions
 from femsense.sensing.baseline.contact_detection import detect_contacts
 from femsense.sensing.baseline.matching import MatchingOptions, match_along_normals
+from femsense.sensing.baseline.normal_forces import normal_forces
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state, loaded_state
 from femsense.sensing.touches import make_touch
@@ -157,13 +156,8 @@ def _one_step(sensor: Sensor, rows: _Matches, touches: list[Touch], state: Equil
     basis = np.array([t.patch.spread(d, n) for t, d in zip(touches, inward)])
     moves = tangent_at(sensor.robot.body, state).respond(basis)
     W = np.einsum("krc,rc->rk", moves[:, rows.at], rows.normals)
-    estimate = estimate_forces(
-        W, None, np.zeros(len(W)), rows.distance, std=rows.std, options=ForceOptions(force_lower=np.zeros(m))
-    )
-    if not np.isfinite(estimate.forces).all():
-        raise DataError(f"the force problem has no answer: {estimate.status}")
+    forces, covariance = normal_forces(W, rows.distance, rows.std)
     spread = np.zeros((3 * m, m))
     for i in range(m):
         spread[3 * i : 3 * i + 3, i] = inward[i]
-    variance = np.where(np.isfinite(estimate.covariance), estimate.covariance, 1e6)
-    return freeze(estimate.forces[:, None] * inward), freeze(spread @ variance @ spread.T)
+    return freeze(forces[:, None] * inward), freeze(spread @ covariance @ spread.T)

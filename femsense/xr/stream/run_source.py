@@ -49,12 +49,11 @@ class RunStream:
         return float(self.skin.time_s[-1])
 
 
-def open_run(folder: str | Path, *, clouds: bool = True) -> RunStream:
-    """Read a run folder; its mesh is created if it is missing.
+def open_run(folder: str | Path) -> RunStream:
+    """Read a run folder, and the clouds of its recording if these still exist; its mesh is created if it is missing.
 
     Arguments:
         folder: written by `femsense estimate`.
-        clouds: read the recording's clouds too, if they still exist.
 
     Raises:
         InputError: no readable states, or a malformed table.
@@ -77,7 +76,7 @@ def open_run(folder: str | Path, *, clouds: bool = True) -> RunStream:
         field=FieldKind(**told["field"], largest=stress.largest),
     )
     frames = tuple(_frame(*pose) for pose in zip(told["frames"], skin.bones, stress.shares))
-    return RunStream(twin, skin, frames, MeasuredClouds(_clouds_of(run, frames) if clouds else ()))
+    return RunStream(twin, skin, frames, MeasuredClouds(_clouds_of(run, frames)))
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import DATA
+from helpers import DATA, marker_grid
 
 from femsense.core.errors import InputError
 from femsense.io.importers.c3d import open_c3d
@@ -14,7 +14,6 @@ from femsense.io.importers.guess import guess_format, open_source
 from femsense.io.importers.options import Axis, Options
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
-from femsense.model.recording import marker_grid
 
 ezc3d = pytest.importorskip("ezc3d")
 GENUINE = sorted((DATA / "c3d").glob("*.c3d"))

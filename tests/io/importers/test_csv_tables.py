@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import marker_grid
 from imported import imported
 
 from femsense.core.errors import InputError
@@ -14,7 +15,6 @@ from femsense.io.importers.guess import open_source
 from femsense.io.importers.options import Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.tables.csv_tables import column_unit
-from femsense.model.recording import marker_grid
 
 TIMES = np.arange(4) * 0.25
 PLACES = np.array([[0.1, 0.2, 0.9], [0.11, 0.2, 0.9], [0.12, 0.21, 0.9], [0.13, 0.21, 0.91]])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import DATA
+from helpers import DATA, marker_grid
 
 from femsense.core.errors import InputError
 from femsense.io.importers.guess import guess_format, open_source
@@ -16,7 +16,7 @@ from femsense.io.importers.options import Axis, Options
 from femsense.io.importers.tables.actuation import read_actuation_log
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
-from femsense.model.recording import Recording, marker_grid
+from femsense.model.recording import Recording
 
 MOTIVE = """Format Version,1.23,Take Name,Take 7,Take Notes,,Capture Frame Rate,120.000000,Export Frame Rate,120.000000,Capture Start Time,2024-05-01 10.00.00.000 AM,Total Frames in Take,4,Total Exported Frames,4,Rotation Type,Quaternion,Length Units,{unit},Coordinate Space,Global
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rosbags")
+from helpers import marker_grid
 from imported import imported, without_invalid
 from ros_writers import HEIGHT, LENS, START_NS, STEP_NS, WIDTH, BagWriter, color_of, depth_of, write_camera
 
@@ -19,7 +20,6 @@ from femsense.io.clouds.images import read_png
 from femsense.io.importers.guess import open_source
 from femsense.io.importers.options import Clock, Options
 from femsense.io.importers.writer import write_recording
-from femsense.model.recording import marker_grid
 
 FRAMES = 8
 KINDS = ("1", "sqlite3", "mcap")

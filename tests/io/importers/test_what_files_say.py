@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import marker_grid
 from imported import imported
 from ros_writers import START_NS, STEP_NS, BagWriter, depth_of
 
@@ -17,7 +18,6 @@ from femsense.io.clouds.ply import read_ply_vertices
 from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.io.importers.guess import contents, guess_format, open_source
 from femsense.io.importers.options import Options
-from femsense.model.recording import marker_grid
 
 # C3D
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
-from femsense.sensing.baseline.contact_detection import detect_contacts, map_to_features
+from femsense.sensing.baseline.contact_detection import detect_contacts
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -89,19 +89,3 @@ def test_small_groups_can_be_left_out() -> None:
     assert detect_contacts(others, others, min_points=2, **options).counts.tolist() == [2]
     with pytest.raises(InputError, match="min_neighbors must be at least 1"):
         detect_contacts(others, others, search_radius_m=0.1, min_neighbors=0, cluster_distance_m=0.01)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=SEEDS)
-def test_the_nearest_feature_is_taken(seed: int) -> None:
-    places, features = scene(seed)
-    indices = map_to_features(places, features)
-    for place, index in zip(places, indices):
-        assert np.linalg.norm(features[index] - place) <= np.linalg.norm(features - place, axis=1).min() + 1e-15
-
-
-def test_features_are_needed_and_places_are_not() -> None:
-    assert map_to_features(np.zeros((0, 3)), [[0, 0, 0]]).tolist() == []
-    assert map_to_features([[0, 0, 0]], [[1, 0, 0], [-1, 0, 0]]).tolist() == [0]
-    with pytest.raises(InputError, match="no feature points"):
-        map_to_features([[0, 0, 0]], np.zeros((0, 3)))
