@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
 from femsense.core.kernels import njit
+from femsense.fem.body_parts import Chamber
 from femsense.fem.closest_point import closest_on_surface
 from femsense.fem.mesh import TetMesh, surface_triangles, triangle_normals
 
@@ -63,9 +65,13 @@ class ContactPatch:
         return np.asarray(self.weights @ values[self.nodes])
 
 
-def body_surface(mesh: TetMesh) -> BodySurface:
-    """Return the boundary of a mesh."""
+def body_surface(mesh: TetMesh, chambers: Sequence[Chamber] = ()) -> BodySurface:
+    """Return the boundary of a mesh, without the walls of chambers: nothing outside touches these."""
     triangles = surface_triangles(mesh)
+    faces = _faces(triangles, quadratic=mesh.is_quadratic)
+    if chambers:
+        is_wall = np.isin(_numbers(faces, mesh), _numbers(np.vstack([chamber.faces for chamber in chambers]), mesh))
+        triangles = triangles[np.repeat(~is_wall, len(triangles) // len(faces))]
     nodes = np.unique(triangles)
     share = np.linalg.norm(triangle_normals(mesh.nodes, triangles), axis=1) / 3.0
     per_node = np.bincount(triangles.ravel(), np.repeat(share, 3), minlength=len(mesh.nodes))
@@ -73,6 +79,12 @@ def body_surface(mesh: TetMesh) -> BodySurface:
     corners = mesh.nodes[triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
     return BodySurface(triangles, nodes, area, edge, _faces(triangles, quadratic=mesh.is_quadratic))
+
+
+def _numbers(faces: IntArray, mesh: TetMesh) -> IntArray:
+    """Return a number for the three corners of each face, shape (f,), whatever their order."""
+    corners, count = np.sort(faces[:, :3], axis=1).astype(np.int64), len(mesh.nodes)
+    return np.asarray((corners[:, 0] * count + corners[:, 1]) * count + corners[:, 2])
 
 
 def flat_nodes(surface: BodySurface, positions: FloatArray) -> IntArray:

@@ -62,7 +62,7 @@ def make_sensor(
     robot = robot.in_recording(recording.label)
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    surface = body_surface(robot.body.mesh)
+    surface = body_surface(robot.body.mesh, robot.body.chambers)
     check_on_body(robot.body.mesh, places, where="at")
     recording = _without_sensed_frames(recording, places, size)
     if not recording.has_clouds and not len(places):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hollow import hollow_bar
 
+from femsense.fem.cavities import find_chamber
 from femsense.fem.mesh import TetMesh, to_quadratic
 from femsense.model.contact_patch import body_surface, patch_at
 
@@ -65,3 +67,14 @@ def test_a_half_axis_shorter_than_the_radius_has_no_effect():
         patch_at(surface, mesh.nodes, place, 0.006, NONE, along=along) for along in (np.array([0.005, 0.0, 0.0]), None)
     )
     np.testing.assert_array_equal(short.weights, round_one.weights)
+
+
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_walls_of_a_chamber_do_not_belong_to_the_surface_that_is_touched(quadratic):
+    mesh = hollow_bar(quadratic=quadratic)
+    chamber = find_chamber(mesh, "main", np.array([0.05, 0.015, 0.015]))
+    whole, outer = body_surface(mesh), body_surface(mesh, (chamber,))
+    assert outer.area.sum() == pytest.approx(4 * 0.1 * 0.03 + 2 * 0.03**2)
+    assert whole.area.sum() > 1.2 * outer.area.sum()
+    inside = ((mesh.nodes[outer.nodes] > 1e-6) & (mesh.nodes[outer.nodes] < np.array([0.1, 0.03, 0.03]) - 1e-6)).all(axis=1)
+    assert not inside.any() and outer.faces.shape[1] == (6 if quadratic else 3)
