@@ -76,7 +76,7 @@ def moved_by_zones(model: Model, fit: Fit) -> FloatArray:
             loads += [with_longer_zone(model.sensor, contact, times).patch.spread(force, n) - own for times in (0.5, 2.0)]
     if not loads:
         return np.zeros((0, 3 * len(fit.contacts)))
-    return _compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads))) / np.sqrt(2.0)
+    return np.asarray(_compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads))) / np.sqrt(2.0))
 
 
 def _compensated(model: Model, fit: Fit, displacements: FloatArray) -> FloatArray:
