@@ -77,12 +77,23 @@ def learn(sensor: Sensor) -> Model:
 
 
 def _warn_of_none(sensor: Sensor) -> None:
-    if sensor.recording.has_clouds:
-        warnings.warn(
-            "no contact-free frame can be used: camera pose, noise and model error are those declared, and no status checks whether the model explains"
-            f" a frame; mark frames in which nothing touches the robot {how_to_free(sensor.recording)}",
-            stacklevel=2,
+    recording = sensor.recording
+    if not recording.has_clouds:
+        return
+    if free_clouds(recording):
+        what = (
+            f"in the frames that are marked as free the camera sees less than {FEWEST} points of the robot, or the body has no equilibrium; check unit and"
+            " content of the clouds, the pose, and appearance.color_rgb"
         )
+    elif recording.free is not None and recording.free.any():
+        what = "those that are marked have no cloud; mark others in which nothing touches the robot"
+    else:
+        what = f"mark frames in which nothing touches the robot {how_to_free(recording)}"
+    warnings.warn(
+        "no contact-free frame can be used: camera pose, noise and model error are those declared, and no status checks whether the model explains a"
+        f" frame; {what}",
+        stacklevel=2,
+    )
 
 
 def _lacks_states(sensor: Sensor) -> bool:

@@ -210,8 +210,12 @@ def _predicted(model: Model, k: int, previous: SensedFrame | None, clock: Clock)
     if scan is None:
         return Frame(k, case, None, None, predicted, tensions)
     if len(scan.view) < FEWEST:
+        near = len(scan.view) + len(scan.others)
+        if not near:
+            whole = "has points, but none near the robot: check unit and pose" if len(scan.far) else "is empty"
+            raise DataError(f"no point of the robot in view: the cloud {whole}")
         raise DataError(
-            f"only {len(scan.view)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
+            f"only {len(scan.view)} of {near} points near the body are the robot's: check the pose, appearance.color_rgb, and what the camera sees"
         )
     pixels = model.pixels(scan)
     if not pixels.coloured:  # most pixels show other things than the robot

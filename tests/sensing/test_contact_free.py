@@ -86,3 +86,25 @@ def test_mixed_pixels_are_counted_on_their_side(tmp_path: Path, share: float):
         write_cloud(file, replace(cloud, points=cloud.points + 3e-3 * away * (rng.random((len(away), 1)) < share)))
     model = learn(make_sensor(arm(), recording, calibrate(arm(), recording)))
     assert model.stray[0] < 3.0 and (model.stray[1] > 30.0) == (share > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("points", "why", "status"),
+    [
+        (np.full((50, 3), np.nan), "sees less than", "the cloud is empty"),
+        (np.full((50, 3), [0.0, 0.0, 9.0]), "sees less than", "none near the robot"),
+        (None, "have no cloud", ""),
+    ],
+)
+def test_clouds_that_show_no_robot_are_named(tmp_path: Path, points: np.ndarray | None, why: str, status: str):
+    recording = touched(tmp_path, np.array([0.0, 0.0, -0.15]), ball=True)
+    calibration = calibrate(arm(), recording)
+    if points is None:
+        recording = replace(recording, cloud_files=((None,),) * 3 + recording.cloud_files[3:])
+    else:
+        header = "ply\nformat ascii 1.0\nelement vertex 50\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        for k in range(3):
+            (tmp_path / f"{k:06d}.ply").write_text(header + "\n".join(" ".join(map(str, point)) for point in points) + "\n")
+    with pytest.warns(UserWarning, match=why):
+        run = estimate(arm(), recording, calibration)
+    assert status in run.frames[0].status and run.frames[3].contacts == 1
