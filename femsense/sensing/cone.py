@@ -8,26 +8,11 @@ from scipy.optimize import NonlinearConstraint, minimize
 
 from femsense.core.arrays import FloatArray
 from femsense.sensing.model import Fit
-from femsense.sensing.types import Sensor, Touch
+from femsense.sensing.types import Sensor
 
 SLACK = 1e-9
 LEAST = 1e-3
 """Normal force of the initial guess [N]."""
-
-
-def _must_push(sensor: Sensor, contact: Touch) -> bool:
-    return not contact.pulls and sensor.options.friction is not None and (contact.source != "given" or sensor.options.push)
-
-
-def clipped(sensor: Sensor, contact: Touch, force: FloatArray, axes: FloatArray) -> FloatArray:
-    """Return a force (3,) whose components are cut so that it is admissible; axes as for `within_cones`, shape (3, 3)."""
-    if not contact.pulls and not _must_push(sensor, contact):
-        return force
-    local = axes @ force
-    normal = max(-local[0], LEAST)
-    if not contact.pulls:
-        local[1:] *= min(1.0, sensor.options.friction * normal / max(float(np.linalg.norm(local[1:])), 1e-9))
-    return np.asarray(axes.T @ np.array([-normal, *local[1:]]))
 
 
 def within_cones(sensor: Sensor, fit: Fit, axes: FloatArray) -> FloatArray | None:
@@ -41,7 +26,7 @@ def within_cones(sensor: Sensor, fit: Fit, axes: FloatArray) -> FloatArray | Non
         axes: outward normal, or upward where a weight hangs, and two tangents of each contact, shape (m, 3, 3).
     """
     mu, hangs = sensor.options.friction, np.array([contact.pulls for contact in fit.contacts], dtype=np.bool_)
-    pushes = [_must_push(sensor, contact) for contact in fit.contacts]
+    pushes = [not c.pulls and mu is not None and (c.source != "given" or sensor.options.push) for c in fit.contacts]
     bound = np.flatnonzero(hangs | np.array(pushes, dtype=np.bool_))
     along, across = np.where(hangs, 1.0, mu or 0.0), np.where(hangs, 0.0, 1.0)
     local = np.einsum("mij,mj->mi", axes, fit.forces)
@@ -50,7 +35,9 @@ def within_cones(sensor: Sensor, fit: Fit, axes: FloatArray) -> FloatArray | Non
     K = np.linalg.inv(fit.covariance + 1e-12 * np.eye(len(fit.covariance)))
     x0, start = fit.forces.ravel(), fit.forces.copy()
     for i in bound:
-        start[i] = clipped(sensor, fit.contacts[i], fit.forces[i], axes[i])
+        normal = max(-local[i, 0], LEAST)
+        size = max(across[i] * float(np.linalg.norm(local[i, 1:])), 1e-9)
+        start[i] = axes[i].T @ np.array([-normal, *(local[i, 1:] * min(1.0, along[i] * normal / size))])
     scale = 1.0 / max(float(np.linalg.norm(start.ravel() - x0)) ** 2 * float(np.linalg.norm(K)), 1e-9)
 
     def room(x: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.inference.mixture import Width, first_width
 from femsense.inference.nuisance import columns, fit_nuisance
 from femsense.inference.rows import Rows, stacked
-from femsense.sensing.cone import clipped, within_cones
+from femsense.sensing.cone import within_cones
 from femsense.sensing.model import Fit, Frame, Linearised, Model
 from femsense.sensing.no_penetration import gap_rows
 from femsense.sensing.odds import odds_of
@@ -52,9 +52,7 @@ SIZINGS, SETTLED = 8, 0.02
 STEPS = 25
 """Gauss–Newton steps of a fit at most."""
 LENGTHS = (1.0, 0.3, 0.1, 0.03)
-"""Lengths of a step that are tried, relative to the longest one."""
-TRUSTED = 0.1
-"""No step moves a node by more than this share of the body's diagonal in the linear problem, which does not hold so far away."""
+"""Lengths of a step that are tried."""
 JUMP = 5.0
 """Pixels at the silhouette make Φ jump by so much. A step that failed is shortened only if the shorter one promises a larger decrease."""
 WIDEST = 30.0
@@ -125,16 +123,14 @@ def fit(
     eta = np.append(np.zeros(q) if eta is None else eta[:q], np.zeros(here.N.shape[1] - q))
     if not m:
         eta, _, _ = fit_nuisance(here.rows, here.residual, here.N, eta)
-        return _finished(model, frame, here, _displacements(model, here, linear), linear, eta, True)
+        return _finished(model, frame, here, _contact_columns(model, here, linear), linear, eta, True)
     wide = fit_nuisance(here.rows, here.residual, here.N, eta, kappa=WIDEST, steps=1)[0]
     kappa = _width(here, wide, frame, catch)
-    moves, converged = _displacements(model, here, linear), False
+    D, converged = _contact_columns(model, here, linear), False
     for _ in range(STEPS):
-        step = _step(model, here, here.rows.of(moves), eta, kappa)
+        step = _step(model, here, D, eta, kappa)
         here = replace(here, tau=step.tau)
-        far = float(np.linalg.norm(np.tensordot(step.change, moves, 1), axis=1).max())
-        longest = min(1.0, TRUSTED * model.sensor.size / max(far, 1e-12))
-        lower = _descended(model, frame, here, linear, step, kappa, longest)
+        lower = _descended(model, frame, here, linear, step, kappa)
         if isinstance(lower, End):
             if kappa.narrow:
                 converged = lower is End.MINIMUM
@@ -145,12 +141,12 @@ def fit(
         if not _near(model, linear.positions, here.state.positions):
             linear = model.linearised(here.state)
             here = _point(model, frame, here.contacts, here.forces, here.tau, here.state, linear)
-        moves = _displacements(model, here, linear)
+        D = _contact_columns(model, here, linear)
         if kappa.narrow and step.phi - lower.phi < TOLERANCE:
             converged = True
             break
         kappa = kappa.narrowed(_width(here, eta, frame, catch))
-    return _in_cones(model, frame, _finished(model, frame, here, moves, linear, eta, converged), here)
+    return _in_cones(model, frame, _finished(model, frame, here, D, linear, eta, converged), here)
 
 
 def _loaded(
@@ -269,14 +265,14 @@ def _unpulled(here: Point) -> list[int]:
     return [force_of(i).start for i, one in enumerate(here.contacts) if one.source == "cloud" and not one.undetermined]
 
 
-def _displacements(model: Model, here: Point, linear: Linearised) -> FloatArray:
-    """Return the derivatives of node positions with (force along its axes, contact point) of each contact, shape (5m, n, 3)."""
+def _contact_columns(model: Model, here: Point, linear: Linearised) -> FloatArray:
+    """Return D: derivatives of the modelled rows with (force along its axes, contact point) of each contact, shape (r, 5m)."""
     n = len(here.state.positions)
     loads = []
     for contact, force, own in zip(here.contacts, here.forces, here.axes):
         loads += [contact.patch.spread(axis, n) for axis in own]
         loads += [nodal_forces_by_shift(model.sensor, contact, way, force) for way in ways_of(contact)[0]]
-    return linear.tangent.respond(np.array(loads)) if loads else np.zeros((0, n, 3))
+    return here.rows.of(linear.tangent.respond(np.array(loads))) if loads else np.zeros((len(here.rows), 0))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -371,14 +367,12 @@ def _of_highest_evidence(here: Point, mean: FloatArray, variance: FloatArray) ->
     return tau
 
 
-def _descended(
-    model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width, longest: float
-) -> Lower | End:
-    """Return a point of lower Φ along a step, at most at the length `longest`, or why there is none."""
+def _descended(model: Model, frame: Frame, here: Point, linear: Linearised, step: Step, kappa: Width) -> Lower | End:
+    """Return a point of lower Φ along a step, or why there is none."""
     if step.decrease < TOLERANCE:
         return End.MINIMUM
     refused = False
-    for length in longest * np.array(LENGTHS):
+    for length in LENGTHS:
         if refused and length * step.decrease < JUMP:
             break
         there = _moved(model, frame, here, linear, length * step.change)
@@ -396,7 +390,7 @@ def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: Fl
     edge = model.sensor.surface.edge
     contacts, forces = [], here.forces.copy()
     for i, (contact, axes) in enumerate(zip(here.contacts, here.axes)):
-        forces[i] = clipped(model.sensor, contact, forces[i] + axes.T @ step[force_of(i)], axes)
+        forces[i] += axes.T @ step[force_of(i)]
         way = step[place_of(i)] @ ways_of(contact)[0]
         far = float(np.linalg.norm(way))
         there = moved_to(model.sensor, contact, contact.place + way * min(1.0, edge / far)) if far > FIXED else contact
@@ -409,10 +403,10 @@ def _moved(model: Model, frame: Frame, here: Point, linear: Linearised, step: Fl
 
 
 def _finished(
-    model: Model, frame: Frame, here: Point, moves: FloatArray, linear: Linearised, eta: FloatArray, converged: bool
+    model: Model, frame: Frame, here: Point, D: FloatArray, linear: Linearised, eta: FloatArray, converged: bool
 ) -> Fit:
     """Return the Laplace approximation at a point."""
-    m, D = len(here.contacts), here.rows.of(moves)
+    m = len(here.contacts)
     eta, phi, weight = fit_nuisance(here.rows, here.residual, here.N, eta)
     scale, at = whitened(model, here, trust=False)
     X = np.hstack([D * scale, here.N])
@@ -463,5 +457,5 @@ def _in_cones(model: Model, frame: Frame, found: Fit, here: Point) -> Fit:
     if state is None:
         return found
     there = _point(model, frame, found.contacts, inside, found.tau, state, found.linearised)
-    moves = _displacements(model, there, found.linearised)
-    return _finished(model, frame, there, moves, found.linearised, found.eta, found.converged)
+    D = _contact_columns(model, there, found.linearised)
+    return _finished(model, frame, there, D, found.linearised, found.eta, found.converged)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,16 +12,14 @@ from arm import T_ROBOT_CAMERA, arm, record
 from touched_arm import INPUTS, PLACE, touched
 
 from femsense.calib.calibrate import calibrate
-from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, move_pose, transform_points
-from femsense.fem.equilibrium import Equilibrium
 from femsense.model.recording import Recording
 from femsense.model.recording_parts import Tool
-from femsense.sensing.cone import clipped, within_cones
+from femsense.sensing.cone import within_cones
 from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import estimate_frame, sense
 from femsense.sensing.fit import fit, whitened
-from femsense.sensing.model import Candidates, Frame, Model
+from femsense.sensing.model import Candidates, Model
 from femsense.sensing.no_penetration import gap_rows, in_touch
 from femsense.sensing.odds import VISIBLE, odds_of
 from femsense.sensing.options import SensingOptions
@@ -30,8 +27,7 @@ from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.proposals import proposals
 from femsense.sensing.status import Status, checked, verdict
-from femsense.sensing.touches import make_touch
-from femsense.sensing.types import Refuted, Run, Touch
+from femsense.sensing.types import Refuted, Run
 
 PUSH = np.array([0.0, 0.0, -0.15])
 
@@ -235,48 +231,6 @@ def test_a_weight_does_not_pull_upwards(tmp_path: Path):
     assert within_cones(model.sensor, replace(hangs, forces=np.array([[0.05, 0.0, -0.1]])), axes) is None
     lifted = within_cones(model.sensor, replace(hangs, forces=np.array([[0.0, 0.0, 0.1]])), axes)
     assert lifted is not None and abs(lifted[0, 2]) < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("source", "pulls", "force", "admissible"),
-    [
-        ("cloud", False, [0.3, 0.4, -0.1], [0.06, 0.08, -0.1]),
-        ("cloud", False, [0.01, 0.0, -0.1], [0.01, 0.0, -0.1]),
-        ("cloud", False, [0.0, 0.0, 0.2], [0.0, 0.0, -0.001]),
-        ("shape", True, [0.3, 0.0, 0.2], [0.3, 0.0, -0.001]),
-        ("given", False, [0.3, 0.0, 0.2], [0.3, 0.0, 0.2]),
-    ],
-)
-def test_components_of_a_force_are_cut_to_the_cone(
-    tmp_path: Path, source: str, pulls: bool, force: list[float], admissible: list[float]
-):
-    recording = touched(tmp_path, PUSH, ball=False)
-    sensor = make_sensor(arm(), recording, calibrate(arm(), recording))
-    contact = replace(make_touch(sensor, np.array([0.09, 0.0, 0.01]), source=source), pulls=pulls)
-    np.testing.assert_allclose(clipped(sensor, contact, np.array(force), np.eye(3)[[2, 0, 1]]), admissible, atol=1e-12)
-
-
-class Watched(Model):
-    """Notes how far each solved state is from its start [m]."""
-
-    far: ClassVar[list[float]] = []
-
-    def solve(self, frame: Frame, contacts: Sequence[Touch], forces: FloatArray, start: Equilibrium) -> Equilibrium | None:
-        state = Model.solve(self, frame, contacts, forces, start)
-        if state is not None:
-            self.far.append(float(np.linalg.norm(state.positions - start.positions, axis=1).max()))
-        return state
-
-
-def test_the_first_step_towards_a_distant_state_goes_no_farther_than_its_linear_problem_holds(tmp_path: Path):
-    model = model_of(touched(tmp_path, np.array([0.0, 0.0, -1.0]), ball=True))
-    best = estimate_frame(model, 3, None).best
-    moved = float(np.linalg.norm(best.state.positions - best.frame.predicted.positions, axis=1).max())
-    Watched.far.clear()
-    watched = Watched(**{one.name: getattr(model, one.name) for one in fields(model)})
-    found = fit(watched, best.frame, best.contacts, np.zeros((1, 3)), best.frame.predicted, tau=best.tau)
-    assert found is not None and np.linalg.norm(found.forces[0]) == pytest.approx(np.linalg.norm(best.forces[0]), rel=0.02)
-    assert moved > 0.5 * model.sensor.size and watched.far[0] < 0.15 * model.sensor.size
 
 
 def test_an_error_that_body_and_ball_share_leaves_their_gap(tmp_path: Path):
