@@ -149,7 +149,7 @@ def _check_determined(recording: Recording, start: Calibration, fitted: Calibrat
             raise DataError(
                 f"the clouds do not determine the pose of {camera_text(recording.camera_names[v])} "
                 f"{_direction(vectors[:, -1])}: the fitted pose may be far off. Record contact-free frames in which other inputs bend the "
-                "robot in other directions, or three markers; or declare T_robot_camera"
+                "robot in other directions, or three markers that are not on one line; or declare T_robot_camera"
             )
 
 
@@ -157,5 +157,5 @@ def _direction(vector: FloatArray) -> str:
     """Return the text for a direction of (rotation, shift)."""
     turn, shift = np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])
     axis = vector[:3] / turn if turn > shift else vector[3:] / shift
-    about = ", ".join(format(a, "g") for a in np.round(axis, 1).tolist())
+    about = ", ".join(format(a, "g") for a in (np.round(axis, 1) + 0.0).tolist())  # without −0
     return f"as it turns about [{about}]" if turn > shift else f"along [{about}]"
