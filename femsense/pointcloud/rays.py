@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.pointcloud.casting import rays_through
 
 GRAZING = 0.25
@@ -80,15 +80,6 @@ class Surface:
         hits = self._hits(hit, triangle.astype(np.int64), uv, points, ray)
         return hits.pick((np.abs(hits.distance) <= reach) & (hits.cosine >= GRAZING))
 
-    def near(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
-        """Return the closest faces of measured points that face their camera; arguments as for `cast`."""
-        rays = points - origins
-        ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        _, gap, triangle, weights = self.closest_points(points)
-        hits = self._hits(np.arange(len(points)), triangle, weights[:, 1:], points, ray)
-        looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
-        return hits.pick((gap <= reach) & looking)
-
     def beside_rays(self, points: FloatArray, origin: FloatArray, *, within: float) -> tuple[FloatArray, FloatArray]:
         """Return the distance at which the rays of a camera through points (k, 3) pass the surface [m], 0 for a hit, and the distance of
         that passage behind each point [m]; both of shape (k,), inf beyond an angle `within` [rad].
@@ -141,17 +132,6 @@ class Surface:
         cosine = np.abs(np.einsum("rc,rc->r", ray[index], normal))
         weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
         return SurfaceHits(index, nodes, weights, normal, distance, cosine)
-
-
-def together(first: SurfaceHits, second: SurfaceHits) -> SurfaceHits:
-    """Return the hits of both, ordered by the points that they belong to."""
-    order = np.argsort(np.concatenate([first.index, second.index]), kind="stable")
-    return SurfaceHits(
-        *(
-            freeze(np.concatenate([getattr(first, name), getattr(second, name)])[order], getattr(first, name).dtype)
-            for name in ("index", "nodes", "weights", "normal", "distance", "cosine")
-        )
-    )
 
 
 def _tensor(values: FloatArray):  # type: ignore[no-untyped-def]

@@ -28,6 +28,7 @@ from femsense.sensing.proposals import SAME, Proposal, elsewhere, is_alike, prop
 from femsense.sensing.run_arrays import sensed
 from femsense.sensing.states import free_state
 from femsense.sensing.status import SQUEEZED, checked, stretch_under_contacts
+from femsense.sensing.touches import without_object
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import Case, FrameReport, Refuted, SensedFrame, Touch
 from femsense.sensing.undetermined import with_undetermined
@@ -273,10 +274,7 @@ def _followed(model: Model, contact: Touch, touching: Sequence[Touch]) -> Touch:
         distance = [float(np.linalg.norm(touch.place - contact.place)) for touch in touching]
         if distance and min(distance) < max(SAME * model.sensor.size, 2.0 * touching[int(np.argmin(distance))].std_m):
             return touching[int(np.argmin(distance))]
-    if contact.source == "shape":
-        return contact
-    std = float(np.sqrt(model.sensor.surface.area.sum() / (2.0 * np.pi)))
-    return replace(contact, source="shape", std_m=std, line=np.zeros(3), expected=contact.place, shape=None, pulls=False)
+    return contact if contact.source == "shape" else without_object(model.sensor, contact)
 
 
 def _at_given_places(model: Model, frame: Frame, previous: SensedFrame | None) -> Fit:

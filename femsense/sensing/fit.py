@@ -56,7 +56,7 @@ LENGTHS = (1.0, 0.3, 0.1, 0.03)
 JUMP = 5.0
 """Pixels at the silhouette make Φ jump by so much. A step that failed is shortened only if the shorter one promises a larger decrease."""
 WIDEST = 30.0
-"""κ with which the nuisance is fitted once before the residual gives κ: so many σ away, pixels still pull."""
+"""Factor κ on the noise in the first fit of the nuisance parameters, whose residuals then determine κ: pixels up to so many σ away count in it."""
 FIXED = 1e-5
 """A contact point that a step moves by less stays [m]."""
 TOLERANCE = 0.1

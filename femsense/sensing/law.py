@@ -1,4 +1,4 @@
-"""The constitutive law of the states that are fitted, and how much a force depends on it.
+"""The constitutive law of the states that are fitted, and how much a force depends on it and on the zones of line and face contacts.
 
 A robot that declares no law is corotational by the contract, which fits small strains. Under contacts strains are large, and in compression rubber stiffens
 as a neo-Hookean body does, so the fitted states are neo-Hookean with the same moduli. The true law may lie anywhere between the two: of a uniform distribution
@@ -18,7 +18,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.compliance import tangent_near
 from femsense.sensing.fit import force_of, whitened
 from femsense.sensing.model import Fit, Model
-from femsense.sensing.touches import with_longer_zone
+from femsense.sensing.touches import longer_patch
 from femsense.sensing.types import Sensor
 
 
@@ -73,7 +73,7 @@ def moved_by_zones(model: Model, fit: Fit) -> FloatArray:
     for contact, force in zip(fit.contacts, fit.forces):
         if contact.along is not None:
             own = contact.patch.spread(force, n)
-            loads += [with_longer_zone(model.sensor, contact, times).patch.spread(force, n) - own for times in (0.5, 2.0)]
+            loads += [longer_patch(model.sensor, contact, times).spread(force, n) - own for times in (0.5, 2.0)]
     if not loads:
         return np.zeros((0, 3 * len(fit.contacts)))
     return np.asarray(_compensated(model, fit, -fit.linearised.tangent.respond(np.array(loads))) / np.sqrt(2.0))

@@ -68,11 +68,16 @@ def pressed(sensor: Sensor, touch: Touch, force: FloatArray) -> Touch:
     return replace(touch, patch=_patch(sensor, touch.place, None, spread, touch.along), spread_m=spread)
 
 
-def with_longer_zone(sensor: Sensor, touch: Touch, times: float) -> Touch:
-    """Return a line or face contact whose zone has half axes of so many times the length."""
+def without_object(sensor: Sensor, touch: Touch) -> Touch:
+    """Return an inferred contact at the place of a visible one, which may be anywhere on the surface and of which no zone is known."""
+    std = float(np.sqrt(sensor.surface.area.sum() / (2.0 * np.pi)))
+    return replace(touch, source="shape", std_m=std, line=np.zeros(3), along=None, expected=touch.place, shape=None, pulls=False)
+
+
+def longer_patch(sensor: Sensor, touch: Touch, times: float) -> ContactPatch:
+    """Return the patch of a line or face contact whose zone has half axes of so many times the length."""
     assert touch.along is not None
-    spread, along = times * touch.spread_m, times * touch.along
-    return replace(touch, patch=_patch(sensor, touch.place, None, spread, along), spread_m=spread, along=along)
+    return _patch(sensor, touch.place, None, times * touch.spread_m, times * touch.along)
 
 
 def contact_radius(sensor: Sensor, radius: float, force: float) -> float:

@@ -16,7 +16,7 @@ from femsense.sensing.contact_free import learn
 from femsense.sensing.estimate_frame import sense
 from femsense.sensing.places import objects_near
 from femsense.sensing.prepare import make_sensor, scan_of
-from femsense.sensing.touches import contact_radius, make_touch, pressed
+from femsense.sensing.touches import contact_radius, make_touch, pressed, without_object
 from femsense.sensing.types import SensedFrame, Sensor
 
 FORCE = np.array([0.0, 0.0, -0.15])
@@ -43,6 +43,13 @@ def test_a_patch_is_as_wide_as_hertz_has_it(pushed: tuple[Sensor, SensedFrame]) 
     square = wide.patch.weights @ ((nodes[wide.patch.nodes] - middle) ** 2).sum(axis=1)
     assert square == pytest.approx(0.4 * a**2, rel=0.15)
     assert pressed(sensor, wide, np.array([0.0, 0.0, -41.0])) is wide
+
+
+def test_a_line_contact_whose_object_is_gone_has_neither_zone_nor_line(pushed: tuple[Sensor, SensedFrame]) -> None:
+    sensor = pushed[0]
+    touch = replace(make_touch(sensor, AWAY, source="cloud", along=np.array([0.02, 0.0, 0.0])), line=np.array([1.0, 0.0, 0.0]))
+    gone = without_object(sensor, touch)
+    assert gone.source == "shape" and gone.along is None and not gone.line.any() and gone.std_m > 0.02
 
 
 def test_what_stereo_adds_beside_the_silhouette_is_no_object_and_what_lies_in_front_of_it_is(pushed: tuple[Sensor, SensedFrame]):
