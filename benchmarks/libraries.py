@@ -1,6 +1,6 @@
 """Own sparse factors and own search for neighbours beside those of libraries, on what `estimate` and `improve` meet.
 
-    pip install cvxopt sksparse-minimal
+    pip install cvxopt sksparse-minimal pypardiso
     python benchmarks/libraries.py [--data DATA]
 
 One thread, processor time, median of the runs, all in one process in turn. The analysis is made once and kept,
@@ -30,7 +30,6 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.compliance import direction_rows
 from femsense.fem.linalg.cholesky import cholesky
-from femsense.fem.linalg.factorization import pardiso_library
 from femsense.fem.mesh import surface_triangles, to_quadratic
 from femsense.io.clouds.cloud_files import read_cloud
 from femsense.pointcloud.grid import build_grid, connected_labels, count_neighbors, count_within
@@ -140,6 +139,9 @@ class Pardiso(_WithoutGram):
     """PARDISO of the MKL, told that the matrix is positive definite; its analysis kept."""
 
     def __init__(self, body: BodyModel, matrix: sp.csc_matrix) -> None:
+        from pypardiso import PyPardisoSolver
+
+        self.library = PyPardisoSolver().libmkl.pardiso
         upper = sp.csr_matrix(sp.triu(matrix, format="csr"))
         upper.sort_indices()
         self.size, self.values = matrix.shape[0], upper.data
@@ -160,7 +162,7 @@ class Pardiso(_WithoutGram):
         count, error = 1 if right is None or right.ndim == 1 else right.shape[1], ctypes.c_int32(0)
         matrix = at(self.values), at(self.indptr), at(self.indices), at(np.zeros(1, np.int32))
         tail = integer(count), at(self.iparm), integer(0), at(right), at(answer), ctypes.byref(error)
-        pardiso_library()(at(self.pt), integer(1), integer(1), integer(2), integer(phase), integer(self.size), *matrix, *tail)
+        self.library(at(self.pt), integer(1), integer(1), integer(2), integer(phase), integer(self.size), *matrix, *tail)
         assert error.value == 0
 
     def factor(self) -> None:
@@ -180,7 +182,7 @@ def solvers(body: BodyModel, matrix: sp.csc_matrix) -> dict[str, Any]:
         found["CHOLMOD (cvxopt)"] = Cvxopt(body, matrix)
     if importlib.util.find_spec("sksparse_minimal"):
         found["CHOLMOD (sksparse-minimal)"] = Minimal(body, matrix)
-    if pardiso_library() is not None:
+    if importlib.util.find_spec("pypardiso"):
         found["PARDISO"] = Pardiso(body, matrix)
     return found
 

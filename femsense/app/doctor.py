@@ -172,12 +172,9 @@ def _solver() -> Finding:
         return good("Cholesky of femsense, with the BLAS of SciPy")
     if chosen == "iterative":
         return note("conjugate gradients", "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time")
-    if chosen not in ("pardiso", "superlu"):
-        return bad(f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
-    from femsense.fem.linalg.factorization import pardiso_library
-
-    name = f"PARDISO (pypardiso {installed_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
-    return note(name, f"FEMSENSE_SOLVER={chosen} selects it: slower than the own solver")
+    if chosen == "superlu":
+        return note("SuperLU of SciPy", "FEMSENSE_SOLVER=superlu asks for it: it is slower than the own solver")
+    return bad(f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative or superlu")
 
 
 def _viewer() -> Finding:

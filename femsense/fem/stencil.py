@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.fem.linalg.factorization import Pattern, make_pattern
+from femsense.fem.linalg.factorization import Pattern
 from femsense.fem.linalg.iterative import Level
 from femsense.fem.linalg.ordering import fill_reducing_order
 from femsense.fem.linalg.simd_lanes import LANES
@@ -202,7 +202,7 @@ def _entries(i: IntArray, j: IntArray, where: IntArray, turned: BoolArray, size:
     indices[to] = 3 * i[:, None, None] + r + 0 * c
     source[to] = where[:, None, None] + np.where(turned[:, None, None], 3 * c + r, 3 * r + c)
     indptr = np.concatenate([[0], np.cumsum(np.repeat(3 * count, 3))])
-    return make_pattern(freeze(indptr, np.int32), freeze(indices, np.int32)), freeze(source, np.int32)
+    return Pattern(freeze(indptr, np.int32), freeze(indices, np.int32)), freeze(source, np.int32)
 
 
 def block_row_numbers(stencil: Stencil) -> IntArray:

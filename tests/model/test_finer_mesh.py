@@ -48,7 +48,8 @@ def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(
 
 def test_a_finer_state_that_folds_is_sought_in_shorter_steps():
     asked = on_both_meshes([0.024, 0.0, 0.0, 0.0], "displacement", [{"name": "hyperelastic", "law": "neo_hookean"}])
-    assert finer_state(*asked, options=FinerOptions(paces=(1.0,))) is None
+    with pytest.raises(FemsenseError, match="folded flat"):
+        finer_state(*asked, options=FinerOptions(paces=(1.0,)))
     exact = beyond(asked, solve_frame(asked[1], 0).positions)
     assert (
         np.abs(beyond(asked, finer_state(*asked)) - exact).max() < 0.5 * np.abs(exact).max()

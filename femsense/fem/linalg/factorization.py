@@ -1,23 +1,18 @@
 """Factor once, solve many: the sparse symmetric systems of the body.
 
 A positive definite stiffness is factorised by `femsense.fem.linalg.cholesky`, with one analysis per sparsity pattern; an indefinite one
-by PARDISO of the MKL (pypardiso) if installed, else by SuperLU of SciPy. If the factor does not fit into memory, conjugate gradients
-replace it (see `femsense.fem.linalg.iterative`).
-FEMSENSE_SOLVER overrides the choice: `direct` or `iterative`; `pardiso` or `superlu` for all matrices.
+by SuperLU of SciPy. If the factor does not fit into memory, conjugate gradients replace it (see `femsense.fem.linalg.iterative`).
+FEMSENSE_SOLVER overrides the choice: `direct` or `iterative`; `superlu` for all matrices.
 FEMSENSE_MEMORY_GB sets the memory for factors, if the figure of the machine does not apply (a container, a shared machine).
 """
 
 from __future__ import annotations
 
-import ctypes
-import functools
 import os
-import weakref
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -41,18 +36,12 @@ LEAST_SHIFT = 1e-6
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pattern:
-    """The sparsity pattern of a symmetric matrix in CSC (which is CSR too)."""
+    """The sparsity pattern of a symmetric matrix in CSC (which is CSR too), with sorted indices."""
 
     indptr: IntArray
     """shape (f + 1,)."""
     indices: IntArray
     """shape (nnz,)."""
-    upper: IntArray
-    """Entries on and above the diagonal, in CSR, shape (nnz_upper,)."""
-    upper_indptr: npt.NDArray[np.int32]
-    upper_indices: npt.NDArray[np.int32]
-    idle: list[Any] = field(default_factory=list)
-    """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
     analyses: list[Analysis] = field(default_factory=list)
     """The analysis for Cholesky, after the first use."""
     grid: Level | None = None
@@ -78,17 +67,6 @@ class Pattern:
             assert self.grid is not None
             self.levels_made.append(make_levels(self.indptr, self.indices, self.grid))
         return self.levels_made[0]
-
-
-def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
-    """Return the pattern of a symmetric CSC matrix with sorted indices."""
-    size = len(indptr) - 1
-    rows = np.repeat(np.arange(size), np.diff(indptr))
-    upper = np.flatnonzero(indices >= rows)
-    counts = np.bincount(rows[upper], minlength=size)
-    return Pattern(
-        indptr, indices, upper, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), indices[upper].astype(np.int32)
-    )
 
 
 class Factorization(Protocol):
@@ -268,9 +246,7 @@ def _definite(pattern: Pattern, values: FloatArray, single: bool = False) -> Fac
 
 
 def _factorize_any(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    """Factorise a matrix that may be indefinite."""
-    if pardiso_library() is not None:
-        return _factorize_pardiso(pattern, values)
+    """Factorise a matrix that may be indefinite; None where it is singular."""
     matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
     try:
         return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
@@ -292,104 +268,3 @@ class _SuperLU:
 
     def gram(self, columns: sp.csc_matrix) -> FloatArray:
         return np.asarray(columns.T @ self.solve(columns.toarray()))
-
-
-@functools.cache
-def pardiso_library() -> Any:
-    """Return MKL's PARDISO as a C function, or None where it is not installed or not wanted."""
-    if _wanted() == "superlu":
-        return None
-    try:
-        from pypardiso.pardiso_wrapper import PyPardisoSolver
-
-        solver = PyPardisoSolver()
-    except (ImportError, OSError):
-        return None
-    threads = int(os.environ.get("FEMSENSE_THREADS", "1"))
-    solver.libmkl.MKL_Set_Num_Threads(threads)
-    return solver.libmkl.pardiso
-
-
-class _PardisoHandle:
-    """PARDISO's memory for one pattern: its analysis, and one factor at a time."""
-
-    def __init__(self, pattern: Pattern) -> None:
-        self.indptr, self.indices, self.size = pattern.upper_indptr, pattern.upper_indices, pattern.size
-        self.pt = np.zeros(64, dtype=np.int64)
-        self.iparm = np.zeros(64, dtype=np.int32)
-        # own settings, METIS, pivot floor 1e-8, count the factor's entries, Bunch–Kaufman, indices from 0
-        self.iparm[[0, 1, 9, 17, 20, 34]] = 1, 2, 8, -1, 1, 1
-        self.values = np.zeros(len(self.indices))
-        self.call(11)
-        self.entries = int(self.iparm[17])
-        weakref.finalize(self, _release, self.pt, self.iparm, self.size)
-
-    def call(self, phase: int, right: FloatArray | None = None, answer: FloatArray | None = None) -> int:
-        count = 1 if right is None or right.ndim == 1 else right.shape[1]
-        return _pardiso(self.pt, phase, self.size, self.values, self.indptr, self.indices, count, self.iparm, right, answer)
-
-
-def _pardiso(
-    pt: Any, phase: int, size: int, values: Any, indptr: Any, indices: Any, count: int, iparm: Any, right: Any, answer: Any
-) -> int:
-    def integer(value: int) -> Any:
-        return ctypes.byref(ctypes.c_int32(value))
-
-    def at(array: Any, kind: Any) -> Any:
-        return array.ctypes.data_as(ctypes.POINTER(kind)) if array is not None else None
-
-    error = ctypes.c_int32(0)
-    pardiso_library()(
-        at(pt, ctypes.c_int64),
-        integer(1),
-        integer(1),
-        integer(-2),
-        integer(phase),
-        integer(size),
-        at(values, ctypes.c_double),
-        at(indptr, ctypes.c_int32),
-        at(indices, ctypes.c_int32),
-        at(np.zeros(1, np.int32), ctypes.c_int32),
-        integer(count),
-        at(iparm, ctypes.c_int32),
-        integer(0),
-        at(right, ctypes.c_double),
-        at(answer, ctypes.c_double),
-        ctypes.byref(error),
-    )
-    return int(error.value)
-
-
-def _release(pt: Any, iparm: Any, size: int) -> None:
-    _pardiso(pt, -1, size, None, np.zeros(1, np.int32), np.zeros(1, np.int32), 1, iparm, None, None)
-
-
-class _Pardiso:
-    def __init__(self, handle: _PardisoHandle, pattern: Pattern) -> None:
-        self.negative = int(handle.iparm[22]) + int(handle.iparm[13])  # negative eigenvalues and perturbed pivots
-        self.size = handle.size
-        self.bytes = 8 * handle.entries
-        self._handle = handle
-        weakref.finalize(self, pattern.idle.append, handle)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        b = np.asfortranarray(right, dtype=np.float64)
-        if b.size == 0:
-            return np.zeros_like(b)
-        x = np.empty_like(b, order="F")
-        error = self._handle.call(33, b, x)
-        if error:
-            raise RuntimeError(f"PARDISO could not solve (error {error})")
-        return x
-
-    def gram(self, columns: sp.csc_matrix) -> FloatArray:
-        return np.asarray(columns.T @ self.solve(columns.toarray()))
-
-
-def _factorize_pardiso(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    handle = pattern.idle.pop() if pattern.idle else _PardisoHandle(pattern)
-    handle.values = values[pattern.upper]
-    if handle.call(22):
-        pattern.idle.append(handle)
-        return None
-    return _Pardiso(handle, pattern)
