@@ -13,7 +13,7 @@ from femsense.sensing.touches import contact_radius, touch_normal
 from femsense.sensing.types import ContactForce, SensedFrame, Sensor, Touch
 
 SAME = 0.15
-"""A contact closer than this share of the body's diagonal to one of the previous frame is the same: it slid."""
+"""A contact closer than this share of the body's diagonal to one of the previous frame, in space or on the body, is the same."""
 
 
 def contacts_of(
@@ -56,7 +56,7 @@ def contacts_of(
                 force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
             )
         )
-    return tuple(tracked(found, () if previous is None else previous.contacts, SAME * sensor.size))
+    return tuple(found) if previous is None else tuple(tracked(found, touches, previous, SAME * sensor.size))
 
 
 def place_of(sensor: Sensor, touch: Touch) -> int:
@@ -101,14 +101,28 @@ def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[C
     return result
 
 
-def tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach: float) -> list[ContactForce]:
-    """Return the contacts with the tracks of the nearest ones of the previous frame; each track is used once."""
+def tracked(contacts: list[ContactForce], touches: Sequence[Touch], previous: SensedFrame, reach: float) -> list[ContactForce]:
+    """Return the contacts with the tracks of the nearest ones of the previous frame; each track is used once.
+
+    A contact is followed where it stays on the body, which may move far between two frames, and where it stays in space, as an object
+    does along which the body slides: the smaller one of both distances counts.
+
+    Arguments:
+        touches: the contacts as they were fitted, with their places at rest.
+        reach: largest distance of a contact from its place in the previous frame [m].
+    """
     pairs = sorted(
-        (float(np.linalg.norm(c.position_m - b.position_m)), i, j) for i, c in enumerate(contacts) for j, b in enumerate(before)
+        (min(_distance(contact.position_m, old.position_m), _distance(touch.place, old_touch.place)), i, j)
+        for i, (contact, touch) in enumerate(zip(contacts, touches))
+        for j, (old, old_touch) in enumerate(zip(previous.contacts, previous.touches))
     )
     taken: set[int] = set()
     for distance, i, j in pairs:
         if distance <= reach and contacts[i].track < 0 and j not in taken:
-            contacts[i] = replace(contacts[i], track=before[j].track)
+            contacts[i] = replace(contacts[i], track=previous.contacts[j].track)
             taken.add(j)
     return contacts
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    return float(np.linalg.norm(a - b))
