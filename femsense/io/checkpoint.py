@@ -18,7 +18,6 @@ from typing import Any, BinaryIO, TypeVar
 
 from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.linalg.factorization import Pattern
 from femsense.fem.linalg.symbolic import Analysis, Pool
 from femsense.fem.stencil import FreeMap
 from femsense.io.files import PART_PREFIX, json_text, write_beside
@@ -34,7 +33,6 @@ DIGEST = 32
 NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
     Equilibrium: ("factor", lambda: None),
     Analysis: ("pool", Pool),
-    Pattern: ("idle", list),
     FreeMap: ("laplacian", list),
 }
 """Large objects that are quickly recomputed and therefore not stored: factorisations and work memory."""
