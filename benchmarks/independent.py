@@ -5,7 +5,7 @@
 
 Below OUT, each case has `robot/`, `recording/` and `truth.json`; with `--run` the installed `femsense` calibrates and estimates
 every case and a table follows. Everything that is drawn comes from the seed. Needs scikit-fem;
-with pypardiso (of the MKL) the cases of the diamond are made several times faster.
+pypardiso (of the MKL), if it is installed, factorises the large meshes of the diamond.
 """
 
 from __future__ import annotations
