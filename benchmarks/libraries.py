@@ -141,7 +141,9 @@ class Pardiso(_WithoutGram):
     def __init__(self, body: BodyModel, matrix: sp.csc_matrix) -> None:
         from pypardiso import PyPardisoSolver
 
-        self.library = PyPardisoSolver().libmkl.pardiso
+        mkl = PyPardisoSolver().libmkl
+        mkl.MKL_Set_Num_Threads(1)
+        self.library = mkl.pardiso
         upper = sp.csr_matrix(sp.triu(matrix, format="csr"))
         upper.sort_indices()
         self.size, self.values = matrix.shape[0], upper.data

@@ -168,7 +168,7 @@ def _libraries() -> Finding:
 
 def _solver() -> Finding:
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
-    if chosen in ("", "cholesky", "direct"):
+    if chosen in ("", "direct"):
         return good("Cholesky of femsense, with the BLAS of SciPy")
     if chosen == "iterative":
         return note("conjugate gradients", "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time")

@@ -83,10 +83,10 @@ def _factor_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver) -> Fac
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
     add_pressure_stiffness(body, equilibrium.positions, np.array(list(equilibrium.pressure.values())), blocks)
     factor = with_turning_plate(body, equilibrium.positions, solver(body.free_map.pattern, reduced_values(body, blocks)))
-    if factor is None and body.is_clamped():
-        raise FemsenseError("the stiffness is singular: elements are folded flat or turned inside out")
-    if factor is None or (factor.negative > 0 and not body.is_clamped()):
+    if not body.is_clamped() and (factor is None or factor.negative > 0):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
+    if factor is None:
+        raise FemsenseError("the stiffness is singular: elements are folded flat or turned inside out")
     return factor
 
 

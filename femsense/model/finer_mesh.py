@@ -74,8 +74,7 @@ def finer_state(
     """Return the equilibrium on a finer mesh [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh represents the coarse state exactly, but its refinement softens single elements, so that two to four steps with rotated
-    elements are needed. None if the steps do not converge or diverge: forces are small again far away. Raises FemsenseError where the
-    stiffness on the way is singular or not stable.
+    elements are needed. None if the steps do not converge or diverge: forces are small again far away.
 
     Rejected on the bar of `benchmarks/improve.py`: a preconditioner kept from the first step of a state costs as much in further
     iterations as it saves, one of another state several times as much, and `FinerOptions.enough` = 0.02 changes the error by a sixth.
@@ -89,6 +88,9 @@ def finer_state(
         base: the coarse state of that frame.
         ties: of the fine nodes to the coarse mesh.
         options: stopping criteria.
+
+    Raises:
+        FemsenseError: the stiffness on the way is singular or, on a fine mesh, not stable.
     """
     how = options or FinerOptions()
     for pace in how.paces:

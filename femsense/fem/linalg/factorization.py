@@ -22,6 +22,8 @@ from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.iterative import Level, Levels, UnsettledError, iterative, make_levels
 from femsense.fem.linalg.symbolic import Analysis, analyse
 
+SOLVERS = ("direct", "iterative", "superlu")
+"""Values of FEMSENSE_SOLVER."""
 ITERATIVE_FROM = 100_000
 """Number of unknowns from which on the memory of a direct factor is checked.
 Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/results/speed.md, `python benchmarks/body.py
@@ -102,7 +104,7 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
         if found is not None:
             return found
         _require_memory(pattern)
-    return (_cholesky(pattern, values) if _wanted() == "cholesky" else None) or _factorize_any(pattern, values)
+    return (_cholesky(pattern, values) if _wanted() != "superlu" else None) or _factorize_any(pattern, values)
 
 
 def factorize_definite(
@@ -149,9 +151,11 @@ def _diagonal(pattern: Pattern) -> IntArray:
 
 
 def _wanted() -> str:
-    """Return which direct solver is wanted."""
+    """Return what FEMSENSE_SOLVER says, "" where it is not set. Raises InputError for what is none of `SOLVERS`."""
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
-    return "cholesky" if chosen in ("", "direct", "iterative") else chosen
+    if chosen not in ("", *SOLVERS):
+        raise InputError("no such solver", where="FEMSENSE_SOLVER", found=chosen, expected=" or ".join(SOLVERS))
+    return chosen
 
 
 def iterates(pattern: Pattern, *, asked_from: int = ITERATIVE_FROM) -> bool:
@@ -161,7 +165,7 @@ def iterates(pattern: Pattern, *, asked_from: int = ITERATIVE_FROM) -> bool:
         pattern: the sparsity pattern.
         asked_from: number of unknowns from which on the memory is checked.
     """
-    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    chosen = _wanted()
     if pattern.grid is None or pattern.size < ITERATIVE_LEAST:
         return False
     if chosen:
@@ -239,7 +243,7 @@ def _definite(pattern: Pattern, values: FloatArray, single: bool = False) -> Fac
             return iterative(pattern.levels(), values)
         except UnsettledError:
             _require_memory(pattern)
-    if _wanted() == "cholesky":
+    if _wanted() != "superlu":
         return _cholesky(pattern, values, single)
     factor = factorize(pattern, values)
     return factor if factor is not None and factor.negative == 0 else None

@@ -20,7 +20,7 @@ from femsense.fem.linalg.factorization import Pattern, factorize, factorize_defi
 from femsense.fem.linalg.symbolic import analyse
 
 
-@pytest.fixture(params=["cholesky", "superlu"])
+@pytest.fixture(params=["direct", "superlu"])
 def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Choose the solver as a user would."""
     monkeypatch.setenv("FEMSENSE_SOLVER", request.param)
@@ -146,7 +146,14 @@ def test_single_precision_is_a_preconditioner() -> None:
 def test_an_indefinite_matrix_is_seen_as_such(solver: str, seed: int) -> None:
     A = random_symmetric(14, seed, definite=False)
     factor = factorize(pattern_of(A), A.data)
-    assert factor is None or factor.negative > 0
+    assert factor is not None and factor.negative == int((np.linalg.eigvalsh(A.toarray()) < 0).sum())
+
+
+def test_a_solver_that_does_not_exist_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FEMSENSE_SOLVER", "pardiso")
+    A = random_symmetric(3, 0, definite=True)
+    with pytest.raises(InputError, match=r"(?s)FEMSENSE_SOLVER.*pardiso.*superlu"):
+        factorize(pattern_of(A), A.data)
 
 
 def test_a_definite_matrix_in_any_order_is_seen_as_such(solver: str) -> None:
@@ -209,7 +216,7 @@ def test_memory_of_dead_factors_is_used_again() -> None:
 def test_all_solvers_find_the_same_equilibrium(monkeypatch: pytest.MonkeyPatch, quadratic: bool) -> None:
     body = bar_body(block_mesh((4, 1, 1)), quadratic=quadratic, gravity=(0, 0, -9.81))
     states = []
-    for name in ("cholesky", "superlu"):
+    for name in ("direct", "superlu"):
         monkeypatch.setenv("FEMSENSE_SOLVER", name)
         states.append(solve_equilibrium(body, tension={"top": 1.0, "side": 0.5}))
     assert all(state.converged for state in states)
